@@ -24,6 +24,8 @@ UNFINISHED = "an installation that was interrupted"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 
+COMPILE = "import compileall, sysconfig; compileall.compile_dir(sysconfig.get_path('purelib'), quiet=2, workers=0)"
+
 COMMANDS = {
     "demo": "solve, simulate and render both robots (arguments go to `lqrsim demo`)",
     "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
@@ -34,7 +36,7 @@ COMMANDS = {
 
 
 def main() -> int:
-    """Run the command that the arguments name; its exit code."""
+    """Run the command that the arguments name and return its exit code."""
     parser = argparse.ArgumentParser(
         prog="run.py",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -78,7 +80,7 @@ def main() -> int:
 
 
 def set_up_python() -> None:
-    """Make the virtual environment beside this file, and install the project in it, as far as that is not done yet."""
+    """Make the virtual environment beside this file and install the project in it, unless that is done."""
     wanted = f"{hashlib.sha256((ROOT / 'pyproject.toml').read_bytes()).hexdigest()} {VENV}"
     stamp = STAMP.read_text(encoding="utf-8") if STAMP.is_file() else ""
     usable = interpreter_works() and stamp != UNFINISHED and (not stamp or stamp.endswith(f" {VENV}"))
@@ -89,9 +91,10 @@ def set_up_python() -> None:
     STAMP.write_text(UNFINISHED, encoding="utf-8")
     say("Installing lqrsim and what it depends on into .venv (a minute or two the first time) ...")
     pip = [PYTHON, "-m", "pip", "install", "--disable-pip-version-check"]
-    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--editable", ".[dev,docs]"])
+    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--no-compile", "--editable", ".[dev,docs]"])
     if code:
         sys.exit("run.py: the installation failed for the reason above; the next run starts it again")
+    run([PYTHON, "-c", COMPILE])  # on all processors, where pip takes one; what it cannot compile it leaves
     STAMP.write_text(wanted, encoding="utf-8")
 
 
@@ -127,7 +130,7 @@ def make_environment() -> None:
 
 
 def set_up_graphics() -> None:
-    """Install the GL libraries that rendering without a display needs on Linux, if it may; otherwise say how."""
+    """Install the GL libraries that rendering without a display needs on Linux; without the rights, print how."""
     if sys.platform != "linux":
         return
     found = ctypes.util.find_library
@@ -136,7 +139,7 @@ def set_up_graphics() -> None:
 
 
 def set_up_browser() -> None:
-    """Install a browser for the tests that look at a page, if it may; otherwise say how: they are skipped."""
+    """Install a browser for the tests of pages; without the rights, print how: those tests are then skipped."""
     if sys.platform == "linux" and not any(map(shutil.which, BROWSERS)):
         install_system_packages(BROWSERS[:1], "No browser, so what the viewer's page shows is not tested")
 
@@ -156,13 +159,13 @@ def install_system_packages(packages: Sequence[str], problem: str) -> None:
 
 
 def environment() -> dict[str, str]:
-    """The environment without what would lead a Python away from its own .venv."""
+    """The environment without variables that would lead a Python away from its own .venv."""
     stray = ("PYTHONHOME", "PYTHONPATH", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__")
     return {name: value for name, value in os.environ.items() if name not in stray}
 
 
 def run(command: Sequence[str | Path]) -> int:
-    """Run a command in the project's folder; its exit code."""
+    """Run a command in the project's folder and return its exit code."""
     with subprocess.Popen([str(part) for part in command], cwd=ROOT, env=environment()) as process:
         while True:
             try:

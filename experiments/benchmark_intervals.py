@@ -1,4 +1,4 @@
-"""How often intervals hold what they are of: differences of two policies on the same trials, and rare failures.
+"""How often intervals cover the true value: differences of two policies on the same trials, and rare failures.
 
     python experiments/benchmark_intervals.py            # everything, some minutes
     python experiments/benchmark_intervals.py --quick    # bounded, and coarse
@@ -17,7 +17,7 @@ import numpy as np
 from runner import Settings, opening, run
 from scipy import stats
 
-from lqrsim.stress.multilevel_splitting import NoFailure, split
+from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
 
 TRIALS = 20, 50, 200, 500
@@ -85,7 +85,7 @@ def rare(config: Config) -> list[dict[str, Any]]:
         studies = min(config.studies, 40) if config.quick else config.studies
         for seed in range(studies):
             try:
-                one = split(
+                one = failure_probability(
                     lambda z, least=threshold: z[:, 0] - least,
                     size, particles=particles, repetitions=repetitions, seed=seed,
                 ).probability  # fmt: skip

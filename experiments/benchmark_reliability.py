@@ -1,4 +1,4 @@
-"""How reliable smooth() is: stiff systems, bad advice, a thousand random problems, and what the safeguard is good for.
+"""How reliable smooth() is: stiff systems, bad starts, a thousand random problems, and what the safeguard is worth.
 
     python experiments/benchmark_reliability.py                            # everything, some minutes
     python experiments/benchmark_reliability.py --sections stiff fragile   # some of it

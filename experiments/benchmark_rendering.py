@@ -1,4 +1,4 @@
-"""What a video costs beside the mere drawing of its frames.
+"""Time of rendering a video, relative to drawing its frames alone.
 
     python experiments/benchmark_rendering.py            # some minutes
     python experiments/benchmark_rendering.py --quick    # too few frames to trust
@@ -40,7 +40,7 @@ class Config(Settings):
 
 
 class Contest:
-    """One robot's run, for all to draw."""
+    """One robot's run, which all contestants draw."""
 
     def __init__(self, name: str, rate: float, seed: int) -> None:
         scenario = ls.scenarios.get(name)

@@ -1,4 +1,4 @@
-"""Re-planning in real time: how long it takes, what it is worth, and what others take.
+"""Re-planning in real time: how long it takes, what it gains, and how other solvers compare.
 
     python experiments/benchmark_replanning.py                           # everything
     python experiments/benchmark_replanning.py --sections times          # some of it

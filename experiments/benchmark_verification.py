@@ -1,4 +1,4 @@
-"""How well positions are told from pixels, and whether faults are found: both robots' disturbed runs, and their videos.
+"""How accurately positions are measured from pixels, and whether faults are found, on both robots' runs and videos.
 
     python experiments/benchmark_verification.py            # some minutes; the table of docs/verifying.md
     python experiments/benchmark_verification.py --quick    # small videos of fewer frames
@@ -47,7 +47,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]]:
-    """What verification finds, by what is verified."""
+    """Results of verification, by what is verified."""
     scenario = ls.scenarios.get(name)
     solution, plant = ls.smooth(scenario.problem), scenario.plant()
     tube = ls.predict_tube(scenario.problem, solution, ls.uncertainty_of(plant, scenario.disturbances))
@@ -73,7 +73,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
 
 
 def all_faults(video: Path, digest: str) -> dict[str, tuple[faults.Fault, bool]]:
-    """What makes each of the video, and whether it is then said to be of the other run, of that digest."""
+    """The function that makes each fault, and whether its file then claims to show the run of that digest."""
     views = [camera for _, camera in faults.calibrated(video_metadata.read(video))]
     made: dict[str, tuple[faults.Fault, bool]] = {
         "one frame late": (faults.late, False),
@@ -129,7 +129,7 @@ def report(result: dict[str, Any]) -> str:
 
 
 def joined(said: Iterable[str]) -> str:
-    """Once what is said of all robots, otherwise in their order."""
+    """The robots' entries in order; once, where all are equal."""
     return " / ".join(dict.fromkeys(said))
 
 

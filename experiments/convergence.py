@@ -1,4 +1,4 @@
-"""How fast smoothing and iLQR converge, and what holds where they have: Secs. V-C and VI-B.
+"""How fast smoothing and iLQR converge, and what holds at convergence: Secs. V-C and VI-B.
 
     python experiments/convergence.py            # 100 of the quadrotor's queries, and the differential drive
     python experiments/convergence.py --quick    # 2 queries
@@ -126,7 +126,7 @@ def rates(found: Sequence[Measured], case: str, solver: str) -> dict[str, Any]:
 
 
 def middle(values: Iterable[float]) -> list[float]:
-    """The median of those that are known, with its interval where there are several; empty if none is."""
+    """The median of the known values, with its interval where there are several; empty without any."""
     known = [value for value in values if np.isfinite(value)]
     return interval(bootstrap(np.median, known)) if len(known) > 1 else known
 
@@ -170,7 +170,7 @@ def settled(result: Result) -> tuple[list[float], int]:
 
 
 def worst(result: Result, stop: str, what: str, forms: Iterable[str] = ("dual", "primal")) -> float:
-    """Of all queries of both robots; infinite if one is not known."""
+    """The worst value of all queries of both robots; infinite if one is unknown."""
     values = [value for robot in result["consistency"].values() for form in forms for value in robot[form][stop][what]]
     return float("inf") if None in values else max(values)
 

@@ -1,4 +1,4 @@
-"""What the feedback is worth: the policy against its own plan without feedback, in MuJoCo, under the same disturbances.
+"""The value of feedback: the policy against its plan without feedback, in MuJoCo, under the same disturbances.
 
     python experiments/feedback.py            # 200 trials of each
     python experiments/feedback.py --quick    # 4
@@ -204,7 +204,7 @@ def report(result: Result) -> str:
 
 
 def cells(robot: dict[str, Any]) -> str:
-    """The robot's table."""
+    """Rows of the robot's table."""
     rows = []
     for strength, cell in robot["strengths"].items():
         for policy in LOOK:

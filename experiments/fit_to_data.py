@@ -31,7 +31,7 @@ FACTOR = 10.0  # how many times as much, and as little, as in the MJCF a number 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A robot whose MJCF is wrong.
+    """A robot, and how its MJCF is wrong.
 
     Attributes:
       name: of it. robot: as its MJCF has it. truth: the numbers that are others, by name. noise: standard deviation of
@@ -101,7 +101,7 @@ def library() -> Any:
 
 
 def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tuple[float, float]]:
-    """Numbers of the robot's MJCF with which it does most nearly what was measured in the first trial of a run.
+    """Fit numbers of the robot's MJCF to what was measured in the first trial of a run.
 
     The trial begins where its plan does, and counts up to a collision.
 
@@ -177,7 +177,7 @@ def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
 
 
 def outcome(plant: ls.Plant, plan: ls.Solution, noise: list[Any], trials: int, seed: int) -> dict[str, Any]:
-    """How a plan's policy does in the plant."""
+    """Results of a plan's policy in the plant."""
     runs = ls.simulate(plant, plan, disturbances=noise, frames=False, trials=trials, seed=seed)
     counted = ls.stress.outcomes(runs)
     return {
@@ -196,7 +196,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def report(result: dict[str, Any]) -> str:
-    """Two tables a robot: the numbers, and what policies that are made with them do."""
+    """Two tables per robot: the numbers, and how policies made with them perform."""
     parts = []
     for case in result["cases"]:
         rows = [

@@ -106,7 +106,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def report(result: dict[str, Any]) -> str:
-    """A table, a row an agent."""
+    """A table with a row per agent."""
     rows = [
         [
             name, f"{one['reached']} of {one['episodes']}", one["collided"],

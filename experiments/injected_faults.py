@@ -1,4 +1,4 @@
-"""Faults of a video, for whoever verifies it to find: made in its frames, or in what its file says of itself.
+"""Faults of a video that verification should find: in its frames, or in its metadata.
 
 Each reads one file and writes another; frames are decoded, changed and encoded again, one by one.
 """
@@ -38,7 +38,7 @@ def write(
     rate: Fraction | None = None,
     preset: str = "veryfast",
 ) -> None:
-    """Encodes frames as `render` does; `metadata` is what the file says of itself, whether or not it is true."""
+    """Encode frames as `render` does, with this metadata, true or not."""
     frames = iter(frames)
     first = next(frames)
     height, width, _ = first.shape
@@ -48,7 +48,7 @@ def write(
 
 
 def with_metadata(source: Path, path: Path, metadata: VideoMetadata) -> None:
-    """The same frames, to the last bit, in a file that says something else of itself."""
+    """Copy the frames, to the last bit, into a file with other metadata."""
     with av.open(str(source)) as given, av.open(str(path), "w", format="mp4") as container:
         metadata.embed(container)
         stream = container.add_stream_from_template(given.streams.video[0])
@@ -62,7 +62,7 @@ def with_metadata(source: Path, path: Path, metadata: VideoMetadata) -> None:
 
 
 def late(source: Path, path: Path) -> None:
-    """Each frame comes one later; the first stays."""
+    """Delay all frames by one; the first is repeated."""
 
     def frames() -> Iterator[Pixels]:
         before = None
@@ -74,14 +74,14 @@ def late(source: Path, path: Path) -> None:
 
 
 def dropped(source: Path, path: Path) -> None:
-    """The middle one is missing, and the file gives the number of those that are left."""
+    """Drop the middle frame; the metadata counts the frames that are left."""
     metadata = video_metadata.read(source)
     frames = (frame for number, frame in enumerate(decoded(source)) if number != metadata.frames // 2)
     write(path, frames, dataclasses.replace(metadata, frames=metadata.frames - 1))
 
 
 def swapped(source: Path, path: Path) -> None:
-    """The middle one comes after the next."""
+    """Swap the middle frame with the next."""
     metadata = video_metadata.read(source)
 
     def frames() -> Iterator[Pixels]:
@@ -98,7 +98,7 @@ def swapped(source: Path, path: Path) -> None:
 
 
 def mirrored(source: Path, path: Path) -> None:
-    """The first calibrated pane, from left to right."""
+    """Mirror the first calibrated pane."""
     metadata = video_metadata.read(source)
     pane, _ = calibrated(metadata)[0]
     rows, columns = slice(pane.top, pane.top + pane.height), slice(pane.left, pane.left + pane.width)
@@ -111,11 +111,11 @@ def mirrored(source: Path, path: Path) -> None:
     write(path, frames(), metadata)
 
 
-# -- In what the file says of itself
+# -- In the metadata
 
 
 def off(view: str, axis: int) -> Fault:
-    """The camera of that name is 2 cm from where the file says that it is."""
+    """Shift a camera in the metadata by 2 cm along an axis."""
 
     def moved(pane: Pane) -> Pane:
         if pane.camera is None or pane.camera.name != view:
@@ -131,7 +131,7 @@ def off(view: str, axis: int) -> Fault:
 
 
 def forged(digest: str) -> Fault:
-    """The file says that it shows the run of that digest."""
+    """Claim in the metadata that the file shows the run of this digest."""
 
     def fault(source: Path, path: Path) -> None:
         with_metadata(source, path, dataclasses.replace(video_metadata.read(source), runs=(digest,)))
@@ -140,5 +140,5 @@ def forged(digest: str) -> Fault:
 
 
 def calibrated(metadata: VideoMetadata) -> list[tuple[Pane, Camera]]:
-    """The panes that can be measured, and what they are seen through."""
+    """Panes with a calibrated camera, and these cameras."""
     return [(pane, pane.camera) for pane in metadata.panes if pane.camera is not None]

@@ -1,4 +1,4 @@
-"""The drive and the quadrotor as fast as their motors take them: a final time that is free.
+"""The drive and the quadrotor as fast as their motors allow: problems with a free final time.
 
     python experiments/least_time.py            # both, 10 s, and a figure in runs/least_time/figures
     python experiments/least_time.py --quick    # the drive alone
@@ -71,7 +71,7 @@ class Config(FolderSettings):
 
 
 def problem_of(case: Case) -> tuple[ls.Scenario, ls.Problem]:
-    """The scenario, and its problem with a price of time in place of its costs."""
+    """The scenario, and its problem with a weight on time in place of its costs."""
     scenario = getattr(ls.scenarios, case.scenario)()
     stated = scenario.problem
     (obstacles,) = stated.obstacle_costs

@@ -1,4 +1,4 @@
-"""Robots of MJCFs that others wrote: solved from rest without a hint, held against iLQR, and run in the same MJCF.
+"""Robots of MJCFs that others wrote: solved from rest without a guess, compared with iLQR, and run in the same MJCF.
 
     pip install 'lqrsim[models]'                    # dm_control, gymnasium and crazyflow bring the files
     python experiments/mjcf_robots.py               # all eleven, with pictures
@@ -51,7 +51,7 @@ def main(config: Config) -> Result:
 
 
 def sheet(config: Config, result: Result) -> None:
-    """All pictures on one."""
+    """One sheet with all pictures."""
     folder, names, across = config.out / FIGURES, list(result["figures"]), 3
     pictures = [Image.open(folder / name).convert("RGB").resize(TILE, Image.Resampling.LANCZOS) for name in names]
     rows = -(-len(pictures) // across)

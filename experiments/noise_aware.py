@@ -1,4 +1,4 @@
-"""Plans under noise that depends on state and control, and with a risk: what they are expected to cost, and do cost.
+"""Plans under noise that depends on state and control, and with a risk: their expected costs, and the costs of runs.
 
     python experiments/noise_aware.py                             # everything, a few minutes
     python experiments/noise_aware.py --sections prediction risk  # some of it

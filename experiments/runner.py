@@ -88,7 +88,7 @@ def run(
     config = tyro.cli(config_type, description=description)
     try:
         result = main(config)
-    except ls.InputError as error:
+    except (ls.InputError, Unavailable) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:

@@ -89,7 +89,7 @@ def main(config: Config) -> Result:
 
 
 def without_obstacles(problem: ls.Problem) -> ls.Problem:
-    """The same in an empty world, which compiles nothing."""
+    """The problem in an empty world; this compiles nothing new."""
     terms = [
         ls.ObstacleCost(ls.World(), radius=term.radius) if isinstance(term, ls.ObstacleCost) else term
         for term in terms_of(problem.stage_cost)
@@ -98,7 +98,7 @@ def without_obstacles(problem: ls.Problem) -> ls.Problem:
 
 
 def iterating(solver: str, problem: ls.Problem, *, start: ls.InitialPrior | None = None) -> Callable[[object], float]:
-    """What times an iteration, in seconds: the median of those between the first and the last."""
+    """A function that times an iteration in seconds: the median without the first and the last."""
     begin: dict[str, Any] = {} if solver == ILQR else {"start": start or problem.nominal_control}
 
     def once(_: object) -> float:
@@ -110,7 +110,7 @@ def iterating(solver: str, problem: ls.Problem, *, start: ls.InitialPrior | None
 
 
 def timed(contestants: dict[Any, Callable[[object], float]], rounds: int, name: str) -> dict[Any, Array]:
-    """Seconds (rounds,) of each, after one that compiles."""
+    """Seconds (rounds,) of each contestant, after a run that compiles."""
     for contestant in contestants.values():
         contestant(None)
     turns = take_turns(contestants, [None], rounds, name)

@@ -115,12 +115,12 @@ def theirs(solver: Callable[[ls.Problem], Answer]) -> Callable[[ls.Problem], Sol
 
 
 def straight(problem: ls.Problem) -> ls.Trajectory:
-    """The line that the others begin with."""
+    """The straight line that the other solvers start with."""
     return ls.Trajectory(*line(problem), problem.dt)
 
 
 def ratios(result: Result) -> dict[str, dict[str, list[float]]]:
-    """Smoothing as in the paper as a multiple of each other one, with bootstrap intervals over the queries."""
+    """The paper's smoothing relative to each contestant, with bootstrap intervals over the queries."""
 
     def of_means(a: Array, b: Array, axis: int) -> Array:
         return a.mean(axis) / b.mean(axis)
@@ -156,7 +156,7 @@ def arrays(result: Result) -> dict[str, dict[str, Array]]:
 
 
 def near(one: Mapping[str, Array]) -> int:
-    """How many plans are about the cheapest."""
+    """How many plans cost at most `SAME` more than the cheapest."""
     return int(np.sum(one["excess"] <= SAME))
 
 
@@ -218,7 +218,7 @@ def report(result: Result) -> str:
 
 
 def measured(found: Mapping[str, Mapping[str, Array]]) -> dict[str, dict[str, str]]:
-    """Each measure of each contestant, as it is written, so that what looks equal is."""
+    """Each measure of each contestant, rounded as printed, so that equal numbers compare equal."""
     return {
         what: {name: f"{measure(one):{spec}}" for name, one in found.items()}
         for what, (measure, spec) in MEASURES.items()
@@ -238,7 +238,7 @@ def best(found: Mapping[str, Mapping[str, Array]]) -> list[list[str]]:
 
 
 def ahead(found: Mapping[str, Mapping[str, Array]], name: str) -> str:
-    """In what the peers win against one of ours, a line a measure."""
+    """Measures in which a peer beats one of ours, one line each."""
     wins = []
     for what, values in measured(found).items():
         peers = [peer for peer in PEERS if peer in values]

@@ -56,7 +56,7 @@ def main(config: Config) -> Result:
 
 
 def finished(config: Config, asked: ls.stress.Campaign, folder: Path) -> ls.stress.Results:
-    """The campaign, run to its end."""
+    """Run the campaign to its end; its results."""
     with counting(f"{NAMES[asked.scenario]}, {folder.name}") as told:
         workers = 0 if config.quick else config.workers
         return ls.stress.run_campaign(asked, folder, workers=workers, progress=told)
@@ -135,7 +135,7 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
 
 
 def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, ls.stress.Outcomes]) -> dict[str, Any]:
-    """What the result says of a kind."""
+    """The result of one kind of disturbance, in words."""
     points = success(found)
     strengths, half = [strength for strength, _ in points], half_fail(points)
     # Half of the trials fail between two strengths that were tried; how they fail is told of the upper one.
@@ -274,12 +274,12 @@ def of_kinds(kinds: Sequence[dict[str, Any]]) -> str:
 
 
 def ends_of(modes: Sequence[Sequence[Any]]) -> dict[str, int]:
-    """How many trials failed in each way."""
+    """Number of trials by kind of failure."""
     return {outcome: sum(count for end, _, count in modes if end == outcome) for outcome in FAILURES}
 
 
 def brief(text: str) -> str:
-    """With no number of more than three digits."""
+    """The text with numbers rounded to three digits."""
     return re.sub(r"\d+\.\d{2,}", lambda number: f"{float(number[0]):.3g}", text)
 
 

@@ -1,4 +1,4 @@
-"""Small systems that benchmarks and tests state again and again: one text each, all else is numbers.
+"""Small systems that benchmarks and tests share: one formula each, with all else as numbers.
 
 What has the same text, and the same kinds of cost terms in the same order, is compiled once and kept for all processes.
 A problem that is made of `linear` and `stage_cost`, or of `scalar` and `scalar_cost`, therefore compiles nothing where

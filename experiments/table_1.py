@@ -133,7 +133,7 @@ def ratios(result: Result) -> dict[str, dict[str, Any]]:
 
 
 def pooled(result: Result, name: str, what: str) -> Array:
-    """Of all queries of all seeds."""
+    """Values of all queries of all seeds."""
     return np.concatenate([one[name][what] for one in result["seeds"].values()])
 
 
@@ -159,7 +159,7 @@ def draw(config: Config, result: Result) -> None:
 
 
 def pairs(axes: Axes, result: Result, what: str, colours: Mapping[str, str]) -> None:
-    """Query by query, smoothing over iLQR."""
+    """Ratios of smoothing to iLQR, query by query."""
     theirs = pooled(result, ILQR, what)
     for name, marker in ((SOFT, "o"), (FIXED, "x")):
         ours = pooled(result, name, what)

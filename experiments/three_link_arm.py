@@ -33,7 +33,7 @@ START, GOAL = (-1.15, 0.1, 0.1), (2.6, 0.3, -0.2)  # rad
 
 
 def places(x: Any, p: Any) -> list[list[Any]]:
-    """The middles of the balls of all links, from the shoulder on."""
+    """Centers of the balls of all links, from the shoulder on."""
     from sympy import cos, sin
 
     joint, angle, found = [0, 0, HEIGHT], 0, []
@@ -207,7 +207,7 @@ class Config(FolderSettings):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Solve it, run it, measure it; the numbers."""
+    """Solve, run and measure; the numbers."""
     robot = ThreeLinkArm()
     plant = ls.Plant(robot, load(config.out))
     check = ls.check_plant(robot, plant.scene)

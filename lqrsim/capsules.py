@@ -1,11 +1,11 @@
-"""Capsules as chains of balls: how many it takes, and where they are.
+"""Capsules as chains of balls.
 
-A capsule is what is within `radius` of a segment, as the link of an arm. Balls of the same radius, evenly along the
-segment, are inside it; between two of them, `spacing` apart, the capsule sticks out by
+A capsule is the set of points within `radius` of a segment, such as the link of an arm. Balls of the same radius,
+evenly spaced along the segment, are inside it. Between two balls, `spacing` apart, the capsule protrudes by
 
     radius - sqrt(radius^2 - spacing^2 / 4)
 
-and an obstacle that clears the balls is nearer to the capsule than to them by at most that.
+and a distance to the balls overestimates that to the capsule by at most as much.
 """
 
 import math
@@ -18,7 +18,7 @@ from lqrsim.errors import InputError, check_number, excerpt
 MOST = 10_000  # balls in a chain
 
 
-# A named tuple, for formulas that refer to one can be kept: see `codegen/fingerprint.py`.
+# A named tuple, so that formulas that refer to one can be cached: see `codegen/fingerprint.py`.
 class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     """A capsule that is covered by a chain of balls, for `CollisionSpheres`.
 
@@ -35,10 +35,10 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     Attributes:
       length: of its segment, without the round ends, in metres; 0 for a ball.
       radius: in metres, of the capsule and of each ball.
-      tolerance: by how much the capsule may stick out of the balls, in metres, more than 0.
+      tolerance: largest protrusion of the capsule from the balls, in metres, more than 0.
 
     Raises:
-      InputError: a number is out of range, or it would take more than 10 000 balls.
+      InputError: a number is out of range, or more than 10 000 balls would be needed.
     """
 
     __slots__ = ()
@@ -56,14 +56,14 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
     @property
     def _fewest(self) -> float:
-        """Balls that keep to the tolerance."""
+        """Number of balls for the tolerance, as a float."""
         sunk = min(self.tolerance, self.radius)
-        widest = 2 * math.sqrt(sunk) * math.sqrt(2 * self.radius - sunk)  # between two balls
+        widest = 2 * math.sqrt(sunk) * math.sqrt(2 * self.radius - sunk)  # largest spacing
         return self.length / widest * (1 - 1e-12) // 1 + 2 if self.length else 1
 
     @property
-    def count(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride] of tuples, which nobody counts here
-        """How many balls there are."""
+    def count(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride] of tuple, which is not needed here
+        """Number of balls."""
         return int(self._fewest)
 
     @property
@@ -73,12 +73,12 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
     @property
     def missed(self) -> float:
-        """By how much the capsule sticks out of the balls at most, in metres: what a clearance misses, too."""
+        """Largest protrusion of the capsule from the balls, in metres: the error of a clearance."""
         half = self.length / (self.count - 1) / 2 if self.count > 1 else 0.0
         return self.radius - math.sqrt(max(self.radius**2 - half**2, 0.0))
 
     def between(self, start: Sequence[Any], end: Sequence[Any]) -> list[list[Any]]:
-        """The middle of each ball, where the segment is from `start` to `end`: expressions of SymPy, or numbers.
+        """The centre of each ball on the segment from `start` to `end`: SymPy expressions or numbers.
 
         Args:
           start: one end of the segment, 2 or 3 coordinates in metres.
@@ -88,7 +88,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
           `count` lists of as many coordinates.
 
         Raises:
-          InputError: they are no two points of the same size.
+          InputError: they are not two points of the same size.
         """
         try:
             first, last = list(start), list(end)
@@ -102,6 +102,6 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
             return [
                 [((most - k) * a + k * b) / most for a, b in zip(first, last, strict=True)] for k in range(self.count)
             ]
-        except Exception as error:  # whatever is no number
+        except Exception as error:  # entries that are not numbers
             given = f"{excerpt(start)} and {excerpt(end)}"
             raise InputError(f"between: got {given} ({type(error).__name__}), want points of expressions") from None

@@ -1,8 +1,12 @@
-"""The command line. Each command reads what the one before wrote; `lqrsim COMMAND --help` documents each."""
+"""The command line; `lqrsim COMMAND --help` documents each command."""
 
+import contextlib
+import io
+import itertools
 import logging
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from lqrsim import process
 
@@ -29,12 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      arguments: what follows `lqrsim` on the command line. By default those of this process, which then is the
-        command's own: signals stop it, and let it remove what it has not finished.
+      arguments: the words after `lqrsim` on the command line. By default those of this process, which then handles
+        signals as a command does: it removes unfinished files and ends.
 
     Returns:
-      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or what is printed cannot be written;
-      130 stopped with Ctrl-C, 143 with SIGTERM; 141 nobody reads what it prints.
+      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or standard output cannot be written;
+      130 stopped by Ctrl-C, 143 by SIGTERM; 141 standard output was closed.
     """
     own = arguments is None
     if own:
@@ -55,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (BrokenPipeError, process.Unprintable) as error:
         process.discard_output()
         cause = error.__cause__ if isinstance(error, process.Unprintable) else error
-        if isinstance(cause, BrokenPipeError):  # whoever reads what is printed, such as `head`, has had enough
+        if isinstance(cause, BrokenPipeError):  # the reader, such as `head`, has closed the pipe
             return 141
         why = cause.strerror if isinstance(cause, OSError) else cause
         process.print_error(f"lqrsim: error: standard output: got {why}, want one that can be written")
@@ -70,9 +74,7 @@ def _run(arguments: list[str]) -> int:
             print(f"lqrsim {version('lqrsim')}")
         return 0
 
-    import tyro
-
-    from lqrsim.commands import COMMANDS, Command
+    from lqrsim.commands import COMMANDS
 
     if arguments in (["--help"], ["-h"]):
         lines = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
@@ -80,23 +82,47 @@ def _run(arguments: list[str]) -> int:
             print(f"usage: lqrsim COMMAND ...\n\n{DESCRIPTION.format(commands=lines)}")
         raise SystemExit(0)
     with process.printing():
-        command = tyro.cli(Command, prog="lqrsim", args=arguments)
+        command = _parse(arguments)
 
-    from lqrsim.commands import console
+    from lqrsim.commands import NAMES, console
     from lqrsim.errors import InputError
 
-    notices = logging.StreamHandler()  # on stderr: what takes its time, such as compiling for a new kind of problem
+    notices = logging.StreamHandler()  # on stderr: what takes long, such as compiling for a new kind of problem
     logger = logging.getLogger("lqrsim")
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)
     try:
+        if isinstance(command, str):
+            raise InputError(command)
         with process.interruptible():
-            return console.run(command)
+            return console.run(command, NAMES[type(command)])
     except InputError as error:
+        if "--json" in arguments:
+            name = f"lqrsim {arguments[0]}" if arguments[0] in COMMANDS else "lqrsim"
+            console.print_json({"format": name, "version": 1, "exit_code": 2, "error": str(error)})
         process.print_error(f"lqrsim: error: {error}")
         return 2
     finally:
         logger.removeHandler(notices)
+
+
+def _parse(arguments: list[str]) -> Any:
+    """Parse the arguments into a command. With `--json` a usage error is returned as a line, not printed in a box."""
+    import tyro
+
+    from lqrsim.commands import Command
+
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed) if "--json" in arguments else contextlib.nullcontext():
+            return tyro.cli(Command, prog="lqrsim", args=arguments)
+    except SystemExit as end:
+        if "--json" not in arguments or end.code != 2:
+            raise
+    # The first line is the box's title; a rule separates the hints below.
+    lines = [line.strip("│╭╮╰╯ ") for line in printed.getvalue().splitlines()]
+    text = " ".join(itertools.takewhile(lambda line: not line.startswith("──"), filter(None, lines[1:])))
+    return text or "got arguments that cannot be parsed"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What goes wrong in a run, and what a filter can estimate of it: `ls.disturbances.ControlNoise(0.05)`."""
+"""Disturbances of a run, such as `ls.disturbances.ControlNoise(0.05)`, and what a filter can estimate of them."""
 
 from lqrsim.control.uncertainty import Unknown
 from lqrsim.simulation.disturbances import (

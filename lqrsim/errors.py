@@ -1,7 +1,7 @@
-"""The one exception that bad input raises, and the checks that raise it.
+"""`InputError`, which bad input raises, and the checks that raise it.
 
-Every message is one line that names the field, what it got and what it wanted (and, where there is a
-list to choose from, the valid names). The command line prints that line and exits with 2.
+Every message is one line with the field, the value and what is wanted, and the valid names if there is a list of them.
+The command line prints that line and exits with 2.
 """
 
 import dataclasses
@@ -22,16 +22,16 @@ from lqrsim.machine import memory
 Array = npt.NDArray[np.floating]
 
 _FLOAT64 = np.dtype(np.float64)
-_LARGE = 10**7  # entries of an array from which on it is looked at whether there is memory for others of its size
+_LARGE = 10**7  # entries from which on it is checked whether memory suffices for arrays of that size
 LONGEST = 1010  # characters of a message
-LARGEST_COUNT = 10**9  # of what has no limit of its own: a loop over more does not end in a working day
+LARGEST_COUNT = 10**9  # of a count without a limit of its own: a longer loop takes more than a day
 
 
 class InputError(ValueError):
-    """Something a caller passed is wrong; the message is one line that says what and what to do."""
+    """Bad input from the caller; the message is one line that says what is wrong and what is wanted."""
 
     def __init__(self, message: str) -> None:
-        line = " ".join(message.splitlines())  # what a user's function says may have several, and be pages long
+        line = " ".join(message.splitlines())  # the message of a user's function may be pages long
         super().__init__(line if len(line) <= LONGEST else f"{line[:700]} ... {line[-300:]}")
 
 
@@ -39,8 +39,8 @@ def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...],
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
 
     Raises:
-      InputError: not real numbers (text, complex numbers and generators are none), the wrong shape, or a NaN (or,
-        unless allowed, infinite) entry.
+      InputError: the value is not real numbers (as text, complex numbers or a generator), has another shape, or has a
+        NaN entry or, unless allowed, an infinite one.
     """
     array = numbers_of(field, value, f"numbers of shape {_shape(shape)}")
     check_shape(field, array, shape)
@@ -54,14 +54,14 @@ def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...],
 
 
 def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
-    """`value` as a new C-ordered float64 array of any shape and any numbers. Raises InputError for what has none."""
+    """`value` as a new C-ordered float64 array of any shape, NaN included. Raises InputError if it is not numbers."""
     try:
         given = np.asarray(value)
         if given.size > _LARGE:
             check_memory(field, given.size, 32, "arrays made from it")
         if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
-        if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # a number that is not there
+        if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # masked entries are no numbers
             raise TypeError
         if given.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in given.flat):
             raise TypeError
@@ -70,7 +70,7 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
         raise
     except MemoryError:
         raise InputError(f"{field}: got {excerpt(value)}, which does not fit into memory, want {want}") from None
-    except Exception:  # whatever the object raises when it is asked for its numbers
+    except Exception:  # an object may raise anything in its conversion
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
 
@@ -82,25 +82,25 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
 
 
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
-    """`value` as a float64 array of any shape and any numbers; not copied if it is that already. Raises InputError."""
+    """`value` as a float64 array of any shape, NaN included; copied only if necessary. Raises InputError."""
     done = type(value) is np.ndarray and value.dtype == np.float64
     if done and value.size > _LARGE:  # pyright: ignore[reportAttributeAccessIssue]
-        # It may be there once for many places, as NumPy broadcasts, and what is made of it will not be.
+        # A broadcast array takes little memory, but arrays made from it take all.
         check_memory(field, value.size, 32, "arrays made from it")  # pyright: ignore[reportAttributeAccessIssue]
     return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
 
 
 def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """`value` as float64 of the given shape (None: any length), NaN and all; not copied if it is that already."""
+    """`value` as float64 of the given shape (None: any length), NaN included; copied only if necessary."""
     if type(value) is np.ndarray and value.dtype is _FLOAT64 and value.shape == shape and value.size <= _LARGE:
-        return value  # without making a message: what a solver returns goes this way
+        return value  # the fast path, for arrays of solvers
     array = real(field, value, f"numbers of shape {_shape(shape)}")
     check_shape(field, array, shape)
     return array
 
 
 def vectors_of(field: str, value: npt.ArrayLike, size: int) -> Array:
-    """`value` as float64 of shape (..., size), NaN and all; not copied if it is that already. Raises InputError."""
+    """`value` as float64 of shape (..., size), NaN included; copied only if necessary. Raises InputError."""
     array = real(field, value, f"numbers of shape (..., {size})")
     if array.shape[-1:] != (size,):
         raise InputError(f"{field}: got shape {_shape(array.shape)}, want (..., {size})")
@@ -116,12 +116,12 @@ def check_number(
     at_most: float | None = None,
     below: float | None = None,
 ) -> float:
-    """`value` as a finite float within the stated bounds. Raises InputError otherwise; text and True are no numbers."""
+    """`value` as a finite float within the bounds. Raises InputError otherwise, also for text and bools."""
     number = float("nan")
     try:
         if not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
             number = float(value)  # pyright: ignore[reportArgumentType]
-    except Exception:  # whatever the object raises when it is asked for its value
+    except Exception:  # an object may raise anything in its conversion
         number = float("nan")
     good = (
         math.isfinite(number)
@@ -151,21 +151,21 @@ def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = 
 
 
 def check_seed(field: str, value: object) -> int:
-    """`value` as an int that is not negative, as long as it has at most 128 bits. Raises InputError otherwise."""
+    """`value` as an int >= 0 of at most 128 bits. Raises InputError otherwise."""
     return check_count(field, value, at_least=0, at_most=2**128 - 1)
 
 
 def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:
-    """Raises InputError if `count` of what takes `each` bytes do not fit into this machine's memory."""
+    """Raises InputError if `count` items of `each` bytes do not fit into this machine's memory."""
     if count * each > (there := memory()):
         raise InputError(
             f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want at most {there // each}"
-            f" with the {_bytes(there)} that there are"
+            f" for the {_bytes(there)} of this machine"
         )
 
 
 def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: str) -> Any:
-    """`value` if it is an instance of `kind`; otherwise an InputError with what is wanted: "a Problem, such as ..."."""
+    """`value` if it is an instance of `kind`. Raises InputError with `want` otherwise."""
     if not isinstance(value, kind):
         raise InputError(f"{field}: got {excerpt(value)}, want {want}")
     return value
@@ -174,9 +174,9 @@ def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: s
 def check_function(
     field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True
 ) -> None:
-    """Raises InputError unless it can be called, with so many arguments, or is None and may be.
+    """Raises InputError unless `value` can be called with so many arguments, or is None and optional.
 
-    What it raises when it is called is its own, and is not turned into an InputError.
+    Exceptions that it raises when it is called are not turned into InputErrors.
     """
     if optional and value is None:
         return
@@ -186,18 +186,18 @@ def check_function(
         return
     try:
         inspect.signature(value).bind(*[None] * arguments)
-    except ValueError:  # a built-in tells nothing about itself
+    except ValueError:  # a built-in function without a signature
         return
     except TypeError as error:
         raise InputError(
-            f"{field}: got {excerpt(value)}, which does not take {arguments} ({error}), want {want}"
+            f"{field}: got {excerpt(value)}, which does not take {arguments} arguments ({error}), want {want}"
         ) from None
-    except Exception:  # an object that raises whatever it likes when it is looked at
+    except Exception:  # an object may raise anything when it is inspected
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
 
 def check_flag(field: str, value: object) -> bool:
-    """`value` as a bool. Raises InputError for what is neither True nor False."""
+    """`value` as a bool. Raises InputError unless it is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{field}: got {excerpt(value)}, want True or False")
     return bool(value)
@@ -207,7 +207,8 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
     """`value` if it is one printable line of text. Raises InputError otherwise.
 
     Args:
-      at_most: characters. empty: whether there may be none.
+      at_most: number of characters.
+      empty: whether the text may be empty.
     """
     if not isinstance(value, str) or not (value or empty) or not value.isprintable():
         raise InputError(f"{field}: got {excerpt(value)}, want {want}: one printable line")
@@ -217,14 +218,14 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
 
 
 def check_path(field: str, value: object, want: str = "the path of a file") -> Path:
-    """`value` as a path that a file can have: each name of at most 255 bytes. Raises InputError otherwise."""
+    """`value` as a valid path of a file, with names of at most 255 bytes. Raises InputError otherwise."""
     try:
         if not isinstance(value, (str, os.PathLike)):
             raise TypeError
         name = os.fspath(value)
         good = isinstance(name, str) and name and "\0" not in name
         good = good and all(len(part.encode()) <= 255 for part in Path(name).parts) and len(name.encode()) < 4096
-    except Exception:  # no path, or what cannot be written as bytes
+    except Exception:  # not a path, or not encodable
         good, name = False, value
     if not good:
         raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names of at most 255 bytes")
@@ -234,17 +235,17 @@ def check_path(field: str, value: object, want: str = "the path of a file") -> P
 def check_items(
     field: str, value: object, kind: type | tuple[type, ...], want: str, *, at_most: int = 1_000_000
 ) -> tuple[Any, ...]:
-    """What `value` has in it, as a tuple of instances of `kind`. Raises InputError for text, mappings, other kinds."""
+    """The items of a collection, all of `kind`, as a tuple. Raises InputError for text, mappings and other kinds."""
     try:
         if isinstance(value, (str, bytes, dict)):
             raise TypeError
         found = tuple(itertools.islice(iter(value), at_most + 1))  # pyright: ignore[reportCallIssue, reportArgumentType]
     except InputError:
         raise
-    except Exception:  # it is no collection, or raises whatever it likes as one
+    except Exception:  # not a collection, or one that raises anything
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
     if len(found) > at_most:
-        raise InputError(f"{field}: got more than {at_most} of them, want {want}")
+        raise InputError(f"{field}: got more than {at_most} items, want {want}")
     for place, one in enumerate(found):
         if not isinstance(one, kind):
             raise InputError(f"{field}: got {excerpt(one)} at {place}, want {want}")
@@ -259,7 +260,7 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
     """
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 1:
-        check_memory(field, len(raw), 16 * len(raw), "the square matrix of which")
+        check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
     matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (size, size))
     if matrix.shape[0] != matrix.shape[1] or not matrix.size:
         raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
@@ -281,7 +282,7 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
 
 
 def check_name(field: str, name: object, valid: Iterable[str]) -> str:
-    """`name` if it is one of `valid`; otherwise an InputError that lists them and guesses the meant one."""
+    """`name` if it is one of `valid`. Raises InputError with the list and the nearest name otherwise."""
     names = list(valid)
     if isinstance(name, str) and name in names:
         return name
@@ -304,7 +305,7 @@ def _bytes(count: int) -> str:
 
 
 def excerpt(value: object) -> str:
-    """A value for a message: one line, cut where it gets long, whatever its `__repr__` does."""
+    """A value as one short line for a message, whatever its `__repr__` does."""
     try:
         if isinstance(value, (str, bytes, bytearray)):
             value = value[:200]
@@ -312,16 +313,16 @@ def excerpt(value: object) -> str:
             return f"{type(value).__name__} of {len(value)}"  # pyright: ignore[reportArgumentType]
         elif isinstance(value, int) and value.bit_length() > 1000:
             return f"an int of {value.bit_length()} bits"
-        elif dataclasses.is_dataclass(value):  # some hold megabytes
+        elif dataclasses.is_dataclass(value):  # may hold megabytes
             return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
         text = " ".join(repr(value).split())
-    except Exception:  # a __repr__ that fails, or that is nested without end
+    except Exception:  # a __repr__ that fails, or recurses without end
         return f"a {type(value).__name__}"
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def told(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """What an exception says, for a message: its kind, and its text as one printable line, whatever that is."""
     try:
         text = " ".join(str(error).split())

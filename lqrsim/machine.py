@@ -1,4 +1,4 @@
-"""The machine that this runs on: how many processors there are, which kind, and what to say of it beside times."""
+"""The machine: processors, memory, and the instruction set that code is compiled for."""
 
 import contextlib
 import functools
@@ -10,23 +10,23 @@ from pathlib import Path
 
 
 def processors() -> int:
-    """How many processors this process may run on."""
+    """Number of processors that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def description() -> str:
-    """The processor, how many of it this process may use, and the system, in words."""
+    """Number and name of the processors, and the system, as text."""
     try:
         found = re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
-    except OSError:  # there is none on macOS and Windows
+    except OSError:  # not on macOS and Windows
         found = None
     processor = found[1].strip() if found else platform.processor() or platform.machine()
     return f"{processors()} x {processor}, {platform.system()}"
 
 
 def memory() -> int:
-    """Bytes of memory that this process may come to use: what the machine has, or less where a limit says so."""
+    """Bytes of memory that this process may use: those of the machine, or fewer under a limit."""
     there = [_physical()]
     with contextlib.suppress(ImportError, OSError, ValueError):  # not on Windows
         import resource
@@ -40,7 +40,7 @@ def memory() -> int:
 
 @functools.cache
 def _physical() -> int:
-    """What the machine or its container has; of Windows, which does not say it so, what programs have there."""
+    """Memory of the machine or its container in bytes; 16 GiB on Windows, where it is not determined."""
     there = [1 << 34]
     with contextlib.suppress(AttributeError, OSError, ValueError):
         there = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
@@ -52,11 +52,11 @@ def _physical() -> int:
 
 @functools.cache
 def instruction_set() -> tuple[str, str, str]:
-    """What code is compiled for: LLVM's triple, the name of the processor, and its features.
+    """The target of compiled code: LLVM's triple, the name of the processor, and its features.
 
     `LQRSIM_CPU_NAME` and `LQRSIM_CPU_FEATURES` replace the last two: with "generic" and "", machines of one
-    architecture run the same instructions. AVX-512 is left out, for LLVM makes slower loops with it:
-    `python experiments/benchmark_compiling.py --sections features` compares.
+    architecture run the same instructions. AVX-512 is left out, for LLVM's loops are slower with it;
+    `python experiments/benchmark_compiling.py --sections features` compares them.
     """
     import llvmlite.binding as llvm
 
@@ -72,10 +72,10 @@ def instruction_set() -> tuple[str, str, str]:
 
 @functools.cache
 def processor() -> str:
-    """What code is compiled for, and a hash of all that it can do; see `instruction_set`.
+    """The processor that code is compiled for, and a hash of its features; see `instruction_set`.
 
-    Where it differs, the same program gives other bits: instructions round differently, and sums are taken in another
-    order. Both the kind that is really there counts, for which NumPy and MuJoCo choose, and that which LLVM is told.
+    Where it differs, the same program gives other bits: instructions round differently, and sums have another order.
+    The hash includes the actual processor, on which NumPy and MuJoCo depend, and the target of LLVM.
     """
     import llvmlite.binding as llvm
 

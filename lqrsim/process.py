@@ -1,7 +1,7 @@
-"""A command in a process of its own: signals that stop it, and streams that it prints to.
+"""Signals and output streams of a command.
 
-A command that is stopped removes what it has not finished, whichever signal it was: Ctrl-C, `kill`, or a terminal that
-is closed. In a process that only uses lqrsim nothing of this happens: signals and streams are the program's own there.
+A command removes its unfinished files when it is stopped, by Ctrl-C, `kill` or a closed terminal. A program that only
+uses lqrsim as a library keeps its own handling of signals and streams.
 """
 
 import contextlib
@@ -15,22 +15,25 @@ from types import FrameType
 from typing import NoReturn
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-WAKE = getattr(signal, "SIGURG", signal.SIGINT)  # which nobody else uses, and is ignored where it is not expected
+WAKE = getattr(signal, "SIGURG", signal.SIGINT)  # unused otherwise, and ignored by default
 MOST_WAKES = 100
-GRACE = 2.0  # s after a signal in which another one means the same, and does not stop the tidying up
+GRACE = 2.0  # s after a signal in which a second one is ignored, so that it does not stop the tidying up
 
 
 class Unprintable(Exception):
-    """What is printed cannot be written. No OSError, which is what cannot be written of a command's results."""
+    """Standard output cannot be written. Not an OSError, which means that a result cannot be written."""
 
 
 class _Signals:
-    """What has come to this process.
+    """The signals that this process has received.
 
     Attributes:
-      stopped_by: number of the signal that stopped it, 0 for none; and when.
-      handled: how many signals. deferring: whether one is to wait, deferred: which one does.
-      last_words: are written to stderr as it is stopped.
+      handled: number of signals that were handled.
+      deferring: whether signals have to wait.
+      deferred: number of the signal that waits, 0 for none.
+      stopped_by: number of the signal that stopped the process, 0 for none.
+      when: time of that signal, in seconds.
+      last_words: text for stderr when the process is stopped.
     """
 
     handled = 0
@@ -42,14 +45,14 @@ class _Signals:
 
 
 def handle_signals(last_words: str = "") -> None:
-    """Make this process one that ends as a command does: call it once, before anything that takes time is imported.
+    """Handle signals as a command does. To be called once, before slow imports.
 
     Args:
-      last_words: what a signal has it write to stderr, a line.
+      last_words: a line for stderr when a signal stops the process.
     """
     _Signals.last_words = last_words
     _fill_streams()
-    # Those that are ignored stay so: whoever started this, such as nohup, wants it.
+    # Signals that are ignored stay so, as nohup wants it.
     for number in SIGNALS:
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _end_at_once)
@@ -58,10 +61,11 @@ def handle_signals(last_words: str = "") -> None:
 
 
 def _wake_for_signals() -> None:
-    """See to it that a signal is handled soon.
+    """Make sure that signals are handled soon.
 
-    The system may give it to any thread, of OpenBLAS say. Python handles it on the main one, which is not told then: it
-    goes on with what it does, and if that is waiting, for as long as it waits. A signal of its own wakes it.
+    The system may deliver a signal to any thread, such as one of OpenBLAS. Python handles it on the main thread, which
+    is
+    not interrupted then: if it waits, it goes on waiting. A further signal to the main thread wakes it.
     """
     arrived, arrivals = os.pipe()
     os.set_blocking(arrivals, False)
@@ -79,14 +83,14 @@ def _wake_for_signals() -> None:
                     break
                 signal.pthread_kill(main, WAKE)
                 time.sleep(0.02)
-            got = _Signals.handled  # several of a kind are handled as one
+            got = _Signals.handled  # several signals of a kind are handled as one
 
     threading.Thread(target=watch, name="signals", daemon=True).start()
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Within this block a signal raises KeyboardInterrupt, so that what is unfinished is removed."""
+    """A block in which a signal raises KeyboardInterrupt, so that unfinished files are removed."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _end_at_once]
     for number in ours:
         signal.signal(number, _raise_interrupt)
@@ -99,7 +103,7 @@ def interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """What is done in this block is done as a whole; what would stop it stops it then."""
+    """A block that is completed before a signal takes effect."""
     _Signals.deferring = True
     try:
         yield
@@ -111,7 +115,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def run_script(arguments: list[str]) -> None:
-    """Run a Python file as a program, with its arguments; what stops it lets it tidy up, and is not told of."""
+    """Run a Python file as a program with its arguments; a signal lets it tidy up, and ends it silently."""
     handle_signals()
     import runpy
 
@@ -124,33 +128,33 @@ def run_script(arguments: list[str]) -> None:
 
 
 def end_stopped() -> NoReturn:
-    """End this process, which a signal has stopped, and which has tidied up. Another signal makes no difference now."""
+    """End this process after a signal has stopped it and it has tidied up."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.flush()
     _end_at_once(_Signals.stopped_by or signal.SIGINT, None)
 
 
 def discard_output() -> None:
-    """Let what is still to be printed go nowhere: Python writes it as it ends, and would complain."""
-    with contextlib.suppress(OSError, ValueError):  # a stream that is no file
+    """Discard further output, which Python would otherwise try to write at exit, and complain."""
+    with contextlib.suppress(OSError, ValueError):  # a stream without a file descriptor
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_error(text: str) -> None:
-    """Print to stderr, if there is anyone who reads it."""
+    """Print to stderr, if it can be written."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
 
 
 def flush() -> None:
-    """Write what has been printed, while what goes wrong can still be handled. Raises Unprintable."""
+    """Flush standard output while errors can still be handled. Raises Unprintable."""
     with printing():
         sys.stdout.flush()
 
 
 @contextlib.contextmanager
 def printing() -> Iterator[None]:
-    """Within this block an OSError is one of printing. Raises Unprintable in its place."""
+    """A block in which an OSError is raised as Unprintable."""
     try:
         yield
     except OSError as error:
@@ -158,7 +162,7 @@ def printing() -> Iterator[None]:
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:
-    """At once: there is nothing to tidy up."""
+    """End the process at once, for there is nothing to tidy up."""
     if _Signals.last_words:
         with contextlib.suppress(OSError):
             os.write(2, f"{_Signals.last_words}\n".encode())
@@ -177,7 +181,7 @@ def _raise_interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _fill_streams() -> None:
-    """What was closed before this began goes nowhere; else the first file that is opened would be printed to."""
+    """Open closed standard streams on the null device; otherwise the next file to be opened would take their place."""
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         if getattr(sys, name) is None:
             opened = os.open(os.devnull, os.O_RDWR)

@@ -1,16 +1,15 @@
-"""Rotation vectors: the functions of them that are smooth at zero, for dynamics and costs written in SymPy, and the
-maps to and from the quaternions that MuJoCo's free and ball joints have.
+"""Rotation vectors for dynamics and costs in SymPy, smooth at zero; and conversions to and from MuJoCo's quaternions.
 
-A rotation vector r turns by |r| radians about its axis. What the formulas need of the angle are three ratios that are
-analytic in s = |r|^2, although written with |r| they read 0/0 at the identity:
+A rotation vector r turns by |r| radians about its axis. The formulas need three ratios that are analytic in s = |r|^2,
+although they are 0/0 at the identity when written with |r|:
 
     sine_ratio(s)      = sin|r| / |r|
     cosine_ratio(s)    = (1 - cos|r|) / |r|^2
     cotangent_ratio(s) = (1 - |r|/2 cot(|r|/2)) / |r|^2
 
-Each is a SymPy function whose derivative in s is `<name>_d1`, and of that `<name>_d2`. Compiled cores evaluate them by
-the functions of the same names in `kernels/rotation_ratios.py`, with a power series near zero. Rotation vectors of
-length 2 pi are singular.
+Each is a SymPy function with derivatives `<name>_d1` and `<name>_d2` in s. Compiled code evaluates them by the
+functions of the same names in `kernels/rotation_ratios.py`, with a power series near zero. Rotation vectors of length 2
+pi are singular.
 """
 
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
 
 
 def rotate(r: Vector, v: Vector) -> list[Any]:
-    """The vector `exp([r]) v`: v turned by the rotation vector r; three expressions of SymPy, or three numbers.
+    """The vector `exp([r]) v`, v rotated by r: three SymPy expressions, or three numbers.
 
     Args:
       r: rotation vector, 3 entries.
@@ -46,9 +45,7 @@ def rotate(r: Vector, v: Vector) -> list[Any]:
 
 
 def vector_rate(r: Vector, w: Vector) -> list[Any]:
-    """The rate of the rotation vector r of a body that turns with w rad/s, in body axes.
-
-    Three expressions of SymPy, or three numbers if r and w are numbers.
+    """The rate of the rotation vector r of a body with angular velocity w: three SymPy expressions or numbers.
 
     Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`.
 
@@ -67,7 +64,7 @@ def vector_rate(r: Vector, w: Vector) -> list[Any]:
 
 
 def quaternion(rotation_vector: npt.ArrayLike) -> Array:
-    """Unit quaternions (..., 4), scalar first as MuJoCo has them, of rotation vectors (..., 3).
+    """Unit quaternions (..., 4), scalar first as in MuJoCo, of rotation vectors (..., 3).
 
     Args:
       rotation_vector: (..., 3), in radians.
@@ -76,7 +73,7 @@ def quaternion(rotation_vector: npt.ArrayLike) -> Array:
       (..., 4).
 
     Raises:
-      InputError: not numbers of that shape.
+      InputError: the argument is not numbers of that shape.
     """
     rotation = vectors_of("rotation_vector", rotation_vector, 3)
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
@@ -94,15 +91,15 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
       (..., 3), in radians.
 
     Raises:
-      InputError: not numbers of that shape.
+      InputError: the argument is not numbers of that shape.
     """
     rows = vectors_of("quaternion", quaternion, 4)
-    # q and -q are one rotation: the one with scalar part >= 0 is its half turn or less.
+    # q and -q are the same rotation; the one with scalar part >= 0 is at most half a turn.
     scalar, x, y, z = (rows[..., i] for i in range(4))
     sine = np.sqrt(x * x + y * y + z * z)
     # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
     angle = 2 * np.arctan2(sine, np.abs(scalar))
-    # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
+    # At the identity, where angle / sine is 0/0, the ratio is 2 / scalar.
     small = np.asarray(sine < 1e-12)
     limit = np.asarray(2.0 / np.abs(scalar)) if small.any() else None
     ratio = angle / sine if limit is None else np.divide(angle, sine, out=limit, where=~small)
@@ -110,7 +107,7 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
 
 
 def _three(field: str, vector: Vector) -> tuple[Any, ...]:
-    """The vector's three entries: numbers, arrays of them, or expressions. Raises InputError for anything else."""
+    """The three entries of a vector: numbers, arrays or expressions. Raises InputError for anything else."""
     found = check_items(field, vector, object, "three expressions or numbers", at_most=3)
     if len(found) != 3 or any(isinstance(one, str) for one in found):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
@@ -120,7 +117,7 @@ def _three(field: str, vector: Vector) -> tuple[Any, ...]:
 
     try:
         expressions = [sympy.sympify(one, strict=True) for one in found]
-    except Exception:  # SympifyError, or whatever an object raises when it is asked
+    except Exception:  # SympifyError, or anything that an object raises
         expressions = [None]
     if not all(isinstance(one, sympy.Expr) for one in expressions):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
@@ -128,7 +125,7 @@ def _three(field: str, vector: Vector) -> tuple[Any, ...]:
 
 
 def _numeric(one: object) -> bool:
-    """Whether it is a number of Python or NumPy, or an array of them."""
+    """Whether it is a number of Python or NumPy, or an array of numbers."""
     if isinstance(one, np.ndarray | np.generic):
         return one.dtype.kind in "iuf"
     return isinstance(one, float | int) and not isinstance(one, bool)
@@ -143,7 +140,7 @@ def _cross(a: Vector, b: Vector) -> list[Any]:
 
 
 def _ratio(name: str, s: Any) -> Any:
-    """That ratio at s: a number at a number, numbers at an array of them, and SymPy's function of the rest."""
+    """A ratio at s: numeric for a number or an array, otherwise as a SymPy function."""
     if isinstance(s, float | int | np.number):
         return _NUMERIC[name](float(s))
     if isinstance(s, np.ndarray) and s.dtype != object:
@@ -153,7 +150,7 @@ def _ratio(name: str, s: Any) -> Any:
 
 @cache
 def _symbolic(name: str) -> Any:
-    """The SymPy function of that name; differentiating it gives the next order."""
+    """The SymPy function of that name, whose derivative is the function of the next order."""
     import sympy
 
     def fdiff(self: Any, argindex: int = 1) -> Any:

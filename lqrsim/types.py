@@ -1,8 +1,8 @@
-"""Records that other functions return or take, for annotations and for extensions."""
+"""Records that functions return or take, for annotations and extensions."""
 
 from lqrsim.control.chance_constrained import SafePlan
-from lqrsim.control.live_replanner import LiveReplanner
 from lqrsim.control.replan_rule import ReplanRecord
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.control.tubes import Tube
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm

@@ -1,4 +1,4 @@
-"""The versions, and the kind of processor, that a result's bits depend on; every saved result carries them."""
+"""The versions and the processor that the bits of a result depend on; every saved result has them."""
 
 import platform
 from collections.abc import Mapping
@@ -12,14 +12,14 @@ from lqrsim.machine import processor
 def versions() -> dict[str, str]:
     """Name -> version of lqrsim, of the libraries that its numbers depend on, and of Python; and the `processor`.
 
-    Where all of them are equal, the same program gives the same bits.
+    If all are equal, the same program gives the same bits.
     """
     installed = versions_of("lqrsim", "numpy", "llvmlite", "mujoco")
     return {"python": platform.python_version()} | installed | {"processor": processor()}
 
 
 def changed(was: Mapping[str, str]) -> str:
-    """What is another here than it was there, as `name new (was old)`; empty where the bits are the same."""
+    """The versions that have changed, as `name new (was old)`; empty if none has."""
     now = versions()
     names = [*now, *(name for name in was if name not in now)]
     return ", ".join(

@@ -6,13 +6,13 @@ import pytest
 
 import lqrsim as ls
 
-# How long an example takes is no business of the tests: machines are busy.
+# Machines may be busy, so examples have no time limit.
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
 
-# The files that take longest begin first: what a file takes is not divided among processors, and all would wait for one
-# that begins last. In this order the first three do not compile the same at the same time.
+# The slowest files start first: a file is not divided among processors, and one that starts last keeps all waiting.
+# In this order the first three files do not compile the same code at the same time.
 LONGEST = (
     "kernels", "campaign", "failure_commands", "render", "viewer", "verify", "docs", "disturbances_all", "stated",
     "process", "whole_problems",
@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c_is_heard() -> Iterator[None]:
-    """Whatever started the tests may ignore Ctrl-C, as shells have what runs in the background do."""
+    """Restore Ctrl-C: shells start background jobs with SIGINT ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -127,6 +127,7 @@ def test_quick_run_counts_what_keeps_the_constraints_at_least_cost() -> None:
     least = cheapest_double_integrator()
     assert found["double_integrator"]["cost"] == pytest.approx(least, rel=1e-5)
     counted = sum(one["to target"] <= one["theirs"] for one in found.values())
+    assert counted == 2
     assert f"or fewer: in {counted} of 2" in said["report"]
     assert all(1 < one["to target"] <= one["iterations"] for one in found.values())
     assert [one["target"] for one in found.values()] == [0.74409, 0.02455]

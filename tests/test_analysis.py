@@ -1,12 +1,15 @@
 """The answers of a stress test, on tables small enough to be worked out by hand, and on tables with known rates."""
 
+import contextlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
 import lqrsim as ls
+from lqrsim.stress import statistics
 from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
@@ -76,7 +79,7 @@ def test_policies_are_compared_on_the_same_trials() -> None:
     assert one.success.low < 0 < one.success.high
     assert one.rms is not None
     np.testing.assert_allclose((one.rms.value, one.rms.low, one.rms.high), -0.02, rtol=1e-12)
-    with pytest.raises(ls.InputError, match="want the same, in the same order"):
+    with pytest.raises(ls.InputError, match="want the same trials in the same order"):
         comparisons({first: table_of(won), second: table_of(lost, first=10)})
 
 
@@ -135,3 +138,33 @@ def test_bad_input_is_named() -> None:
         quantiles(table[Cell("smooth", "wind", 1.0)], "speed")
     with pytest.raises(ls.InputError, match="below: got 2"):
         breaks(table, below=2)
+
+
+WRONG = [None, "x", 3, -1, 1.5, np.nan, [], {}, {"a": 1}, ["a"], [[1], [2, 3]], np.zeros((2, 2)), object(), 10**400, 1j]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (success, {"cell": Cell("a", "s", 1.0), "outcomes": mixed(3, 5), "confidence": 0.9}),
+        (degradation, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}, "policy": "a", "sweep": "s", "confidence": 0.9}),
+        (breaks, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}, "below": 0.9, "confidence": 0.9}),
+        (comparisons, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}}),
+        (modes, {"outcomes": mixed(3, 5)}),
+        (quantiles, {"outcomes": mixed(3, 5), "measure": "rms", "levels": (0.1, 0.5)}),
+        (worst, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}, "count": 2}),
+        (statistics.rate, {"successes": 3, "trials": 5, "confidence": 0.9}),
+        (statistics.compare, {"first": [True, False], "second": [True, True]}),
+        (statistics.paired_difference, {"only_first": 1, "only_second": 2, "trials": 5, "confidence": 0.9}),
+        (statistics.mean, {"sample": [1.0, 2.0], "confidence": 0.9}),
+        (statistics.holm, {"p_values": [0.1, 0.2]}),
+        (lambda statistic, sample, **options: statistics.bootstrap(statistic, sample, **options),
+         {"statistic": np.mean, "sample": [1.0, 2.0, 3.0], "confidence": 0.9, "resamples": 20, "seed": 0}),
+    ],
+)  # fmt: skip
+def test_arguments_of_the_wrong_kind_raise_no_other_exception(function: Any, arguments: dict[str, Any]) -> None:
+    function(**arguments)
+    for name in arguments:
+        for wrong in WRONG:
+            with contextlib.suppress(ls.InputError):  # some of them are right for some arguments
+                function(**{**arguments, name: wrong})

@@ -14,7 +14,7 @@ from lqrsim.control.collision_chance import Surroundings
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles
 from lqrsim.errors import Array
 from lqrsim.results.goal import OF_RANGE
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 
 pytestmark = pytest.mark.long  # test_balls.py has what is quick of robots of several balls
 

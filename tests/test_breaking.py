@@ -119,7 +119,10 @@ def test_disturbances_in_physical_units(quadrotor: ls.Scenario, quadrotor_soluti
     [
         (lambda: smallest_failure(lambda z: z[:, 0], 0), "size: got 0"),
         (lambda: smallest_failure(lambda z: z[:, 0], 2, pairs=1), "pairs: got 1"),
-        (lambda: smallest_failure(lambda z: z[:, 0] - 9, 2, failures=np.ones((1, 2))), "failures: got none that fails"),
+        (
+            lambda: smallest_failure(lambda z: z[:, 0] - 9, 2, failures=np.ones((1, 2))),
+            "failures: got vectors that do not fail",
+        ),
         (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((0, 2))), "failures: got none, want"),
         (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((1, 3))), r"failures: got shape \(1, 3\)"),
     ],

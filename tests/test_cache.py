@@ -47,7 +47,7 @@ def start(tmp_path: Path, folder: Path) -> "subprocess.Popen[str]":
 
 
 def finish(process: "subprocess.Popen[str]") -> tuple[list[str], str]:
-    out, errors = process.communicate(timeout=120)
+    out, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     return out.split(), errors
 
@@ -91,7 +91,7 @@ def test_what_two_processes_have_kept_does_not_run_each_other(tmp_path: Path) ->
 
     def run(*factors: str) -> list[str]:
         command = [sys.executable, "-c", FACTORS, *factors]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=600)
         return done.stdout.splitlines()
 
     alone = [run("2"), run("3")]
@@ -106,7 +106,7 @@ def test_another_problem_of_the_same_size_compiles_only_its_own_and_has_the_same
         environment = {**os.environ, "LQRSIM_CACHE_DIR": str(tmp_path / folder)}
         (tmp_path / "system.py").write_text(system)  # formulas are traced from a file
         command = [sys.executable, str(tmp_path / "system.py")]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=600)
         cost, compiled, *_ = done.stdout.split()
         return cost, int(compiled)
 

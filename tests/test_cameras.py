@@ -123,20 +123,20 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
         read(tmp_path / "text.mp4")
     with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast") as encode:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
-    with pytest.raises(ls.InputError, match="want a video that `lqrsim render` wrote"):
+    with pytest.raises(ls.InputError, match="want a video of `lqrsim render`"):
         read(tmp_path / "other.mp4")
     good = json.loads(metadata(rollout).as_json())
     for change, message in [
         ({"version": 99}, "got version 99"),
         ({"frames": 0}, "metadata.frames: got 0"),
         ({"rate": "30/0"}, "damaged"),
-        ({"markers": []}, "contradicts itself"),
+        ({"markers": []}, "whose parts do not fit together"),
         ({"panes": [{"left": 0}]}, "damaged"),
     ]:
         with pytest.raises(ls.InputError, match=message):
             VideoMetadata.from_json(json.dumps(good | change))
     good["panes"][0]["camera"]["up"] = [0, 0, 1]
-    with pytest.raises(ls.InputError, match="want unit vectors at right angles"):
+    with pytest.raises(ls.InputError, match="want orthogonal unit vectors"):
         VideoMetadata.from_json(json.dumps(good))
 
 

@@ -187,7 +187,7 @@ def test_a_killed_driver_is_resumed(reference: Results, tmp_path: Path) -> None:
             driver.kill()
             driver.wait()
             counts.append(len(list(folder.glob("shards/[!.]*.parquet"))))
-            gone = time.monotonic() + 10
+            gone = time.monotonic() + 600
             while time.monotonic() < gone:
                 try:
                     os.killpg(driver.pid, 0)
@@ -206,7 +206,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
-    monkeypatch.setattr(trials, "work", never)
+    monkeypatch.setattr(trials.Job, "work", never)
     run_campaign(CAMPAIGN, reference.folder)
     run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
@@ -244,18 +244,18 @@ def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
 
     scheduler, worker = start("dask_scheduler", "--port", "0"), start("dask_worker", "--nthreads", "1")
     try:
-        until = time.monotonic() + 60
+        until = time.monotonic() + 600
         while not told.is_file():
             assert time.monotonic() < until
             time.sleep(0.05)
         with distributed.Client(scheduler_file=str(told)) as client:
-            client.wait_for_workers(1, timeout=60)
+            client.wait_for_workers(1, timeout=600)
             address = client.scheduler.address
 
         def lose(done: int, total: int) -> None:
             if done:
                 scheduler.send_signal(number)
-                scheduler.wait(20)
+                scheduler.wait(600)
 
         capfd.readouterr()
         with pytest.raises(InputError, match=r"scheduler: got .*run the same command again") as caught:
@@ -424,7 +424,7 @@ def test_a_script_that_its_workers_run_too_is_refused(dies: bool, got: str, tmp_
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(dies=dies), encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, script, tmp_path / "run"], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, script, tmp_path / "run"], capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == 1
     assert done.stderr.count("Traceback") == 1  # the script's own; none of a worker
@@ -532,7 +532,7 @@ def test_what_is_no_campaign_is_not_opened(tmp_path: Path, make: Callable[[Path]
     [
         ("stress quadrotr", ["scenario: got 'quadrotr'"]),
         ("stress quadrotor --sweep hurricane", ["hurricane"]),
-        ("stress quadrotor --sweep scenario:Gust", ["kind of sweep scenario: got 'Gust'", "ControlNoise"]),
+        ("stress quadrotor --sweep scenario:Gust", ["kind of disturbance in scenario: got 'Gust'", "ControlNoise"]),
         ("stress quadrotor --trials 0", ["trials: got 0"]),
         ("stress quadrotor --strengths -1", ["strengths: got -1"]),
         ("stress quadrotor --strengths 1 1", ["strengths: got (1.0, 1.0)", "each once"]),

@@ -304,7 +304,7 @@ def start(*command: str) -> subprocess.Popen[str]:
 
 def test_exit_code_and_line_reach_the_shell() -> None:
     with start("solve", "quadrotr") as process:
-        printed, error = process.communicate(timeout=60)
+        printed, error = process.communicate(timeout=600)
     assert (process.returncode, printed, error.count("\n")) == (2, "", 1)
     assert "Traceback" not in error
 
@@ -312,7 +312,7 @@ def test_exit_code_and_line_reach_the_shell() -> None:
 def test_an_opengl_that_mujoco_cannot_load_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     with start("list") as process:
-        printed, error = process.communicate(timeout=60)
+        printed, error = process.communicate(timeout=600)
     assert (process.returncode, printed, error.count("\n")) == (2, "", 1)
     assert "MUJOCO_GL: got 'nonsense'" in error
 
@@ -323,7 +323,7 @@ def test_ctrl_c_is_one_line_and_leaves_nothing(own: Path, tmp_path: Path) -> Non
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
+        _, error = process.communicate(timeout=600)
     assert (process.returncode, error) == (130, "lqrsim: stopped\n")
     assert not (tmp_path / "out").exists()
 

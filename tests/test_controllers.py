@@ -178,7 +178,7 @@ def test_one_controller_serves_two_runs_at_once(
         return ls.simulate(plant, controller=law, disturbances=NOISE, trials=2, seed=seed, frames=False, **options)
 
     wanted = [run(seed) for seed in (0, 1)]
-    meeting, found = threading.Barrier(2, timeout=120), dict[int, ls.Rollout]()
+    meeting, found = threading.Barrier(2, timeout=600), dict[int, ls.Rollout]()
 
     def beside(seed: int) -> None:
         found[seed] = run(seed, progress=lambda done, of: meeting.wait())

@@ -214,7 +214,7 @@ def test_a_scene_without_obstacles_has_none_to_displace(cage, tmp_path):
     (tmp_path / "empty.xml").write_text(spec.to_xml())
     bare = Plant(Quadrotor(), load_scene(tmp_path / "empty.xml"))
     assert len(bare.world) > 0
-    with pytest.raises(InputError, match=r"^DisplacedObstacles: got scene empty, in which nothing but planes bounds"):
+    with pytest.raises(InputError, match=r"^DisplacedObstacles: got scene empty, where robot .* has no obstacles but"):
         simulate(bare, hover(3), disturbances=[DisplacedObstacles(0.1)])
 
 

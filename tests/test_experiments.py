@@ -140,6 +140,22 @@ def test_benchmark_of_intervals() -> None:
     assert "rare failures, 95 % intervals" in script.report(result)
 
 
+def test_benchmark_of_sensors() -> None:
+    """A small part: a drawn half of a preset and four noises; what is counted is what the trials say."""
+    script = import_module("benchmark_sensors")
+    result = script.main(script.Config(only=(14,), trials=6, workers=1))
+    (row,) = result["rows"]
+    assert row["robot"] == "my_robot"
+    assert any(one.startswith("MeasurementNoise") for one in row["disturbances"])
+    assert row["reached"] == [6] * 4
+    assert result["summary"]["tests"] == 6
+    assert not result["summary"]["harm"]
+    won, lost = np.array([True] * 5 + [False]), np.zeros(6, dtype=bool)
+    assert script.p_worse(lost, won) == pytest.approx(0.5**5)
+    assert script.p_worse(won, lost) == 1.0
+    assert "by more than chance" in script.report(result)
+
+
 @pytest.mark.long
 def test_benchmark_of_reliability() -> None:
     """On few problems: bad advice breaks the bare method and not the guarded one, which changes nothing elsewhere."""

@@ -315,7 +315,7 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, A
     """Files that are whole, and have the hash that belongs to what is in them: an older or another program's."""
     rewrite(run, **changes)
     if message is None:  # without pictures, and so not to be drawn
-        with pytest.raises(ls.InputError, match=r"frames|without one finite state"):
+        with pytest.raises(ls.InputError, match=r"frames|without a finite state"):
             ls.render(ls.load(run, ls.Rollout), run.with_suffix(".mp4"))
         return
     with pytest.raises(ls.InputError, match=message) as caught:

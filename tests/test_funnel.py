@@ -15,9 +15,16 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.disturbances import ControlDelay, ControlNoise, ForceNoise, Gusts, MeasurementNoise
+from lqrsim.disturbances import (
+    ControlDelay,
+    ControlNoise,
+    ForceNoise,
+    Gusts,
+    InitialStateError,
+    MeasurementNoise,
+)
 from lqrsim.errors import InputError
-from lqrsim.simulation.begun_later import simulate_from
+from lqrsim.simulation.start_at import simulate_from
 from lqrsim.stress.funnels import points_of
 from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
 
@@ -132,9 +139,10 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
         ({"shape": np.diag([1.0, 1, 1, 0])}, "flat at knot 0"),
         ({"largest": 0.0}, "largest"),
         ({"failures": -1}, "failures"),
-        ({"rate": 0.99999, "confidence": 0.999, "failures": 100}, "take more than"),
+        ({"rate": 0.99999, "confidence": 0.999, "failures": 100}, "needs more than"),
         ({"seed": -1}, "seed"),
         ({"disturbances": [3]}, "disturbances"),
+        ({"disturbances": [InitialStateError(5.0)]}, "got InitialStateError, which changes the start of a run"),
         ({"controller": 3}, "controller"),
         ({"progress": 3}, "progress"),
         ({"plant": 3}, "plant"),
@@ -232,7 +240,7 @@ class TestLevels:
 
     def test_no_level(self) -> None:
         assert "on the plan itself" in self.find(lambda level: 0.5).reason
-        assert "however small" in self.find(lambda level: 1.0 if level == 0 else 0.5).reason
+        assert "down to the smallest" in self.find(lambda level: 1.0 if level == 0 else 0.5).reason
         capped = self.find(lambda level: 1.0, largest=7.0)
         assert (capped.level, capped.reason) == (7.0, "levels beyond 7 were not tried")
 
@@ -380,14 +388,15 @@ def test_the_safest_way(quadrotor: ls.Scenario) -> None:
         run = ls.simulate(plant, solution, disturbances=gusts, seed=3, trials=20, first_trial=first, frames=False)
         return run.outcome.count("reached")
 
-    succeeded = [counted(way.solution, 0) for way in found.ways]
-    assert succeeded == [int(way.successes.sum()) for way in found.ways]
+    succeeded = [counted(way.solution, 0) for way in found.compared]
+    assert succeeded == [int(way.successes.sum()) for way in found.compared]
     assert succeeded[0] > succeeded[-1]
     assert succeeded == sorted(succeeded, reverse=True)
-    assert found.solution is found.ways[0].solution
+    assert found.solution is found.compared[0].solution
     assert found.reached.value == counted(found.solution, 20) / 20
-    assert min(way.solution.cost for way in found.ways) == pytest.approx(ls.smooth(quadrotor.problem, starts=4).cost)
-    for one, other in zip(found.ways, found.ways[1:], strict=False):
+    cheapest = ls.smooth(quadrotor.problem, starts=4).cost
+    assert min(one.solution.cost for one in found.compared) == pytest.approx(cheapest)
+    for one, other in zip(found.compared, found.compared[1:], strict=False):
         assert np.abs(one.solution.trajectory.states - other.solution.trajectory.states).max() > 0.05
     with pytest.raises(InputError, match="trials: got 0"):
         ls.stress.smooth_safest(quadrotor.problem, plant, gusts, trials=0)

@@ -13,15 +13,15 @@ import pytest
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
-from lqrsim.commands.failures import Break, Rare
-from lqrsim.stress.trials import solve
+from lqrsim.commands.reliability import Break, Rare
+from lqrsim.stress.policies import solve
 from lqrsim.view import viewer
 
 DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))
 CAMPAIGN = ls.stress.Campaign(
     scenario=DRIVE, sweeps={"light": LIGHT}, strengths=(1.0,),
     policies=("smooth", "ilqr", "open_loop", "replan", "track", "offset_free"), replan_every=12.0, trials=4, shard=2,
-    stated=LIGHT,
+    design_disturbances=LIGHT,
 )  # fmt: skip
 FEW = ["--sweep", "scenario", "--strengths", "1", "--trials", "2", "--workers", "0"]
 
@@ -103,7 +103,7 @@ def test_the_other_commands_run_it_too(
         raise ls.InputError("viewer: none here")
 
     for kind in (Rare, Break):
-        problem = kind(scenario=DRIVE, solution=stored, policy="track")._problem()
+        problem, _ = kind(scenario=DRIVE, solution=stored, policy="track", out=tmp_path)._begin("either")
         shown.append(problem.score.solution.trajectory)
     monkeypatch.setattr(viewer, "open_viewer", opened)
     assert main(["view", DRIVE, "--solution", str(stored)]) == 2
@@ -159,7 +159,7 @@ def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
 
 
 def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution, tmp_path: Path) -> None:
-    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None, trials=1)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None, trials=1)
     solved = ls.stress.run_campaign(campaign, tmp_path / "solved", workers=0)
     assert solved.given is None
     with pytest.raises(ls.InputError, match=r"^solution: got another, want none, as .*solved was begun with"):
@@ -174,7 +174,7 @@ def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution
 
 def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tmp_path: Path) -> None:
     """Plans and policies of the same numbers are planned again in another way with another cost-to-go."""
-    campaign = dataclasses.replace(CAMPAIGN, policies=("replan",), stated=None, trials=1)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("replan",), design_disturbances=None, trials=1)
     assert left.cost_to_go is not None
     steeper = dataclasses.replace(left.cost_to_go, hessian=2 * left.cost_to_go.hessian)
     digests = {
@@ -216,7 +216,7 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
     assert main(["stress", DRIVE, *FEW, "--solution", path, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     says = f"is of another problem than that of {DRIVE} (solved as {DRIVE}); its plan is run as it is"
-    why = "replan, which solves the scenario's problem again, of which the solution is not"
+    why = "replan, which re-plans the scenario's problem, while the solution is of another problem"
     assert f"\nsmooth {says}\n" in printed
     assert f"\nleft out: {why}\n" in printed
     assert ls.stress.Results(out).campaign.policies == ("smooth", "ilqr", "open_loop")
@@ -255,13 +255,13 @@ def test_what_does_not_fit_is_refused_by_name(
             dataclasses.replace(problem, dt=0.2), max_iterations=1
         ),
         r"with the goal y = 2.4, want 2.5 \(nan: none\)": ls.smooth(goal, max_iterations=1),
-        r"whose plan is not finite \(CONVERGED\)": dataclasses.replace(
-            left, trajectory=dataclasses.replace(left.trajectory, states=broken)
+        r"whose plan is not finite \(DIVERGED\)": dataclasses.replace(
+            left, status=ls.Status.DIVERGED, trajectory=dataclasses.replace(left.trajectory, states=broken)
         ),
         "3, want a Solution": 3,
         "nothing.npz, want a file that exists": tmp_path / "nothing.npz",
     }
-    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None)
     for says, solution in unfit.items():
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
             ls.stress.run_campaign(campaign, tmp_path / "out", workers=0, solution=solution)

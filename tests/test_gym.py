@@ -107,7 +107,7 @@ def test_many_at_once_are_the_same_trials(quadrotor: ls.Scenario, quadrotor_solu
         alone = run(single, lqrsim.gym.Expert(single), seed=1, options={"trial": first + 2})
         assert rewards[2] == pytest.approx(alone[1].sum(), rel=1e-12)
     assert {"collided"} <= set(rollout.outcome)
-    with pytest.raises(InputError, match=r"^step: got episodes that have all ended"):
+    with pytest.raises(InputError, match=r"^step: all episodes have ended"):
         env.step(env.action_space.sample())
 
 
@@ -169,11 +169,11 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda env: env.step(np.zeros(4)), "environment: got one without an episode, want reset() first"),
+        (lambda env: env.step(np.zeros(4)), "no episode: call reset() first"),
         (lambda env: (env.reset(), env.step([np.nan] * 4)), "action: got array([[nan, nan, nan, nan]]), want finite"),
         (lambda env: (env.reset(), env.step([0.0])), "action: got shape (1, 1)"),
         (lambda env: env.reset(options={"wind": 1}), "options: got 'wind', want one of: disturbances, preset"),
-        (lambda env: env.reset(options={"preset": "mild"}), "sweep: got 'mild', want one of: scenario, calm"),
+        (lambda env: env.reset(options={"preset": "mild"}), "disturbances: got 'mild', want one of: scenario, calm"),
         (lambda env: env.reset(options={"strength": 2}), "options: got strength alone"),
         (lambda env: env.reset(options={"preset": "calm", "disturbances": ()}), "options: got disturbances and preset"),
     ],

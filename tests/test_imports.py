@@ -1,6 +1,7 @@
 """The architecture: no import runs up a floor, and nothing heavy is imported before it is needed."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,7 @@ def floor(module: str) -> tuple[int, int]:
     return numbers[0], len(inner)
 
 
+@functools.cache
 def imports(path: Path) -> list[str]:
     """Every module that a file imports, in functions too; those under `if TYPE_CHECKING:` excepted."""
     tree = ast.parse(path.read_text(encoding="utf-8"))

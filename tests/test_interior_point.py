@@ -384,9 +384,9 @@ def test_the_time_limit_and_the_limit_of_iterations_end_it_with_the_best_plan() 
         ends(of, solution)
         assert solution.violation <= before
         before = np.inf
-    late = ls.smooth(of, time_limit=0.3, callback=lambda iteration: time.sleep(0.1))
+    late = ls.smooth(of, time_limit=1.0, callback=lambda iteration: time.sleep(1.0))
     assert late.status is Status.TIME_LIMIT
-    assert 1 <= len(late.iterations) <= 4
+    assert len(late.iterations) == 1
     ends(of, late)
     at_once = ls.smooth(of, time_limit=1e-9)
     assert at_once.status is Status.TIME_LIMIT

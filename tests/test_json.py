@@ -104,8 +104,29 @@ def test_not_converged_and_bad_input(printed: Any, tmp_path: Path, capsys: pytes
     assert found["solution"]["remedy"]
     assert main(["solve", "no_such_robot", "--json"]) == 2
     captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
+    found = json.loads(captured.out)
+    assert (found["format"], found["exit_code"]) == ("lqrsim solve", 2)
+    assert captured.err == f"lqrsim: error: {found['error']}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("solve quadrotor --no-such-option 3", "no-such-option"),
+        ("solve quadrotor --solver newton", "newton"),
+        ("solve", "SCENARIO"),
+        ("stress quadrotor --trials many", "many"),
+        ("break quadrotor --rounds 0", "rounds: got 0"),
+        ("no_such_command", "no_such_command"),
+    ],
+)
+def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*arguments.split(), "--json"]) == 2
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert (found["version"], found["exit_code"]) == (1, 2)
+    assert says in found["error"]
+    assert captured.err == f"lqrsim: error: {found['error']}\n"
 
 
 def test_in_a_process_of_its_own_stdout_has_nothing_else(tmp_path: Path) -> None:
@@ -143,7 +164,7 @@ def test_verify(printed: Any, tmp_path: Path) -> None:
 
 def test_stress_report_and_replay(printed: Any, tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
-    asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "1"]
+    asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "0"]
     campaign = printed("stress", "differential_drive", *asked, "--out", str(folder))["campaign"]
     results = ls.stress.Results(folder)
     assert campaign["complete"] is True

@@ -3,7 +3,10 @@
 It is the compiled filter that runs, through `OffsetFree.start`. The trials are NumPy's.
 """
 
+from typing import Any
+
 import hypothesis
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -12,7 +15,7 @@ from scipy.linalg import expm
 from scipy.stats import binom, chi2
 
 import lqrsim as ls
-from lqrsim.control.kalman import kalman_filter
+from lqrsim.control.kalman import RESOLUTION, kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.disturbances import Unknown
 from lqrsim.errors import Array
@@ -45,7 +48,7 @@ def law_of(system: Linear, case: int, *, record: bool = True, **noise: float) ->
 def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tuple[Array, Array]:
     """E[z_t | y_0 .. y_t] and its covariance, of deviations: one Gaussian of all knots, conditioned by blocks."""
     size, T = model.size, t + 1
-    blocks = [model.start, *model.process_noise[:t]]
+    blocks = [model.start_root @ model.start_root.T, *model.process_noise[:t]]
     to = np.zeros((T * size, T * size))  # from the start and the process noise to all z
     known = np.zeros((T, size))
     for i in range(T):
@@ -60,7 +63,7 @@ def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tup
         noise[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks[i]
         seen = slice(i * model.sensor.size, (i + 1) * model.sensor.size)
         H[seen, i * size : i * size + model.n] = model.H[i]
-        V[seen, seen] = model.H[i] @ np.diag(model.shown_noise) @ model.H[i].T
+        V[seen, seen] = model.H[i] @ np.diag(model.shown_std**2) @ model.H[i].T
         y[seen] = model.H[i] @ (measured[i] - known[i, : model.n])
     prior = to @ noise @ to.T
     gain = np.linalg.solve(H @ prior @ H.T + V, H @ prior).T
@@ -97,6 +100,7 @@ class Truth:
     def __init__(self, law: ls.OffsetFree, system: Linear, trials: int, rng: np.random.Generator) -> None:
         self.system, self.rng, self.uncertainty = system, rng, law.model.uncertainty
         self.inexact = np.asarray(self.uncertainty.control)
+        self.mispredicted = np.asarray(self.uncertainty.model_error)
         self.x = system.plan.states[0] + NOISE["start"] * rng.normal(size=(trials, 2))
         self.reached = np.tile(system.plan.controls[0], (trials, 1))
         self.unknowns: list[Array] = []
@@ -134,6 +138,7 @@ class Truth:
             applied = commands + (1 - left) * lag / DT * (self.reached - commands)
             self.reached = commands + left * (self.reached - commands)
         self.x = self.x @ self.system.A.T + (applied + offset) @ self.system.B.T + push @ self.system.E.T
+        self.x += self.mispredicted * rng.normal(size=self.x.shape)
 
 
 @pytest.mark.parametrize("case", range(len(CASES)))
@@ -263,3 +268,64 @@ def test_what_is_recorded_has_gaps_where_nothing_came() -> None:
     unrecorded = quiet.start(2)
     assert unrecorded.estimates is None
     assert unrecorded.innovations is None
+
+
+# Exact, redundant and nearly redundant information. The reference is dense conditioning with 100 digits.
+
+HARD = {
+    "exact": ((CONSTANT, PASSING), None),
+    "the same twice": ((CONSTANT,), [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
+    "nearly the same twice": ((CONSTANT,), [[1.0, 0.5], [1.0, 0.5 + 1e-9]]),
+    "two unknowns of one effect": ((CONSTANT, Unknown("offset of u0", 0.3), Unknown("offset of u0", 0.2)), None),
+    "two unknowns of nearly one effect": ((CONSTANT, Unknown({"d0": 1.0, "offset of u0": 1e-9}, 0.5)), ("s0",)),
+}
+
+
+def precisely(model: PlanModel, least: Array, t: int) -> tuple[Any, Any]:
+    """Covariance of z_t given y_0 .. y_t, and the gain of y_t in its mean: dense, with the noise `least` besides."""
+    exact, size, count, n = mpmath.matrix, model.size, model.sensor.size, model.n
+    to, source = [mpmath.eye(size)], [exact(model.start_root)]
+    for i in range(t):
+        to = [exact(model.F[i]) * one for one in to] + [mpmath.eye(size)]
+        source.append(exact(model.process_root[i]))
+    # All measured numbers and z_t, as linear functions of the same independent standard normal numbers.
+    seen = mpmath.zeros((t + 1) * count, (t + 1) * (size + n + count))
+    last = mpmath.zeros(size, seen.cols)
+    for j in range(t + 1):
+        reached = source[j]
+        for i in range(j, t + 1):
+            if i > j:
+                reached = exact(model.F[i - 1]) * reached
+            seen[i * count : (i + 1) * count, j * size : (j + 1) * size] = exact(model.H[i]) * reached[:n, :]
+        last[:, j * size : (j + 1) * size] = reached
+        noise = (t + 1) * size + j * (n + count)
+        seen[j * count : (j + 1) * count, noise : noise + n] = exact(model.measurement_root[j])
+        seen[j * count : (j + 1) * count, noise + n : noise + n + count] = mpmath.diag(list(least[j]))
+    gain = last * seen.T * mpmath.inverse(seen * seen.T)
+    return last * last.T - gain * seen * last.T, gain[:, t * count : (t + 1) * count]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+@pytest.mark.parametrize("name", HARD)
+def test_exact_and_redundant_sensors_lose_no_digits(name: str, noise: float) -> None:
+    """Standard deviations and correlations to 1e-7; gains to 1e-6 of the spread of what they correct."""
+    unknowns, sensors = HARD[name]
+    system = linear(
+        [[0.3, 1.0], [-0.5, -0.2]], [[0.1], [1.0]], [[0.0], [0.7]], controls=np.cos(np.arange(4.0))[:, None]
+    )
+    uncertainty = ls.Uncertainty(unknowns=unknowns, start=[1.0, 1e-3], lag=0.06, measurement=noise, control=1e-2)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors)
+    bare = PlanModel.of(system.problem.dynamics, system.plan, uncertainty, law.model.sensor)
+    for model in (law.model, bare):  # with and without the least errors that OffsetFree assumes
+        found, t = kalman_filter(model), model.plan.steps
+        seen = model.H @ found.predicted[:, : model.n, : model.n] @ model.H.transpose(0, 2, 1)
+        variance = np.diagonal(seen, axis1=1, axis2=2) + (model.measurement_root**2).sum(axis=2)
+        with mpmath.workdps(60):
+            covariance, gain = (
+                np.array(one.tolist(), dtype=np.float64) for one in precisely(model, RESOLUTION * np.sqrt(variance), t)
+            )
+        std = np.sqrt(covariance.diagonal())
+        np.testing.assert_allclose(found.corrected[t] / np.outer(std, std), covariance / np.outer(std, std), atol=1e-7)
+        wrong = found.gain[t] - gain
+        spread = np.sqrt(np.einsum("zi,ij,zj->z", wrong, found.innovation[t], wrong))
+        assert (spread <= 1e-6 * np.sqrt(found.predicted[t].diagonal())).all()

@@ -23,18 +23,16 @@ from hypothesis import strategies as st
 import lqrsim as ls
 from lqrsim import kernels
 from lqrsim.codegen.compiled_module import Call, Entry
-from lqrsim.codegen.language import Pointer, Row, Rows, type_of
+from lqrsim.codegen.language import Pointer, Struct, StructArray, type_of
 from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
-from lqrsim.codegen.sources import Function, Scope, Source, source_of, text_source
-from lqrsim.control.law import turning_of
+from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source
+from lqrsim.control.controllers import turning_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     active_set,
     augmented_lagrangian,
-    ball_constraint,
-    ball_places,
     certificate,
     cost_to_come_dual,
     cost_to_come_primal,
@@ -48,15 +46,14 @@ from lqrsim.kernels import (
     mjcf_dynamics,
     mjcf_places,
     model_functions,
-    noise_matrices,
     policy_evaluation,
     projection,
     rollouts,
     rotation_ratios,
     signed_distance,
+    sphere_centers,
     state_bound,
 )
-from lqrsim.kernels import noise as noise_kernel
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
@@ -106,16 +103,17 @@ def entry({names}, out):
 """
 # Second derivatives by differences: rounding of the function is divided by the square of the step, 1.2e-4.
 DIVIDED = {
-    "lqrsim.kernels.cost_differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2,
-    "lqrsim.kernels.curvature_differences.step_curvature": 16 * 2.0**-52 / 1.2e-4**2,
-    "lqrsim.kernels.jacobian_differences.step_curvature": 16 * 2.0**-52 / 6e-6,
+    "lqrsim.kernels.differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2,
+    "lqrsim.kernels.differences.curvature_from_values": 16 * 2.0**-52 / 1.2e-4**2,
+    "lqrsim.kernels.differences.curvature_from_jacobians": 16 * 2.0**-52 / 6e-6,
 }
 
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
     "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
-    "newton_iterations", "newton_pass", "finish_at_plan", "value_functions", "optimality", "roll_out_and_keep",
+    "newton_iterations", "newton_pass", "pass_of_order", "finish_at_plan", "convex_value_functions", "optimality",
+    "roll_out_and_keep",
 )  # fmt: skip
 
 
@@ -132,7 +130,7 @@ class Recorded:
     """A call of a kernel: the types of its arguments, these before and after, and what it returned."""
 
     name: str  # with its module
-    function: Function
+    function: ScopedFunction
     types: tuple[Any, ...]
     before: Any
     after: Any
@@ -154,14 +152,14 @@ def snapshot(value: Any, known: dict[int, Any]) -> Any:
 
 
 def kind_of(value: Any) -> Any:
-    return Row(value.dtype.names or ()) if isinstance(value, np.void) else type_of(value)
+    return Struct(value.dtype.names or ()) if isinstance(value, np.void) else type_of(value)
 
 
 def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, but: tuple[str, ...] = ()) -> Any:
     """Call a kernel in plain Python, and compare every kernel that it calls, but those; returns what it returns."""
     seen: Counter[tuple[str, str]] = Counter()
 
-    def caller(function: Function, run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    def caller(function: ScopedFunction, run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
         key = function.scope.source.what, function.node.name
         seen[key] += 1
         if seen[key] > EACH or function.node.name in but:
@@ -189,7 +187,7 @@ def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, bu
         CALLERS.pop()
 
 
-def writing_out(function: Function, count: int) -> Function:
+def writing_out(function: ScopedFunction, count: int) -> ScopedFunction:
     names = ", ".join(f"a{i}" for i in range(count))
     source = text_source(WRITING_OUT.format(names=names))
     source = source.filled(kernel=(function.scope.source, function.node.name))
@@ -212,7 +210,7 @@ def compare(one: Recorded) -> None:
         digest = sha256(text)
         if digest not in LOADED:
             LOADED[digest] = Loaded(object_code(text), tuple(program.libraries))
-        laid_out = tuple(Rows(kind.fields) if isinstance(kind, Row) else kind for kind in one.types)
+        laid_out = tuple(StructArray(kind.fields) if isinstance(kind, Struct) else kind for kind in one.types)
         MADE[key] = Entry(laid_out, LOADED[digest].address("entry"), returns)
     size = max(map(size_of, arrays_of(one.before)), default=0.0)
     returned = Call(MADE[key], one.before)()
@@ -329,7 +327,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     for array in work.multipliers:
         array[0] = penalty
         array[declarations.HEADER :] = 0.5
-    source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
+    source, sizes = compiled.with_form(form), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
         model = work.model
@@ -424,7 +422,7 @@ class TestSolvers:
             trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
         options = IterationSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
-        source, sizes = compiled._with_form("dual", "entry_points"), sizes_of(one)
+        source, sizes = compiled.with_form("dual"), sizes_of(one)
         for task in (declarations.ITERATE, declarations.CERTIFY):
             given = task, 0, 3, options, compiled.arguments(one), work, np.zeros(4, LOG)
             replay(source, sizes, "ilqr", *with_rows(given))
@@ -455,7 +453,7 @@ class TestSolvers:
             SmootherGains(np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))),
             np.zeros((steps + 1, n)),
         )  # fmt: skip
-        source = compiled._with_form(form, "linear_quadratic_passes")
+        source = compiled.with_form(form)
         sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0}
         replay(source, sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
 
@@ -468,7 +466,7 @@ class Begun:
         settings = settings_of(form=form, **changed)
         self.run = SolveRun(one, settings, resolve(start, one), begin, Budget(settings.max_iterations))
         self.work, self.log = self.run.work, np.zeros(20, LOG)
-        self.source, self.sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
+        self.source, self.sizes = compiled.with_form(form), sizes_of(one)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
         given = list(self.run._arguments(first, last, self.log))
@@ -502,7 +500,7 @@ def descended(
     if factor != 1:
         work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
     trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
-    source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
+    source, sizes = compiled.with_form(form), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
@@ -617,7 +615,7 @@ class TestRareEnds:
     def test_ends_of_ilqr(self, noise: bool) -> None:
         given = {"noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.05} if noise else {}
         one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given)
-        source, sizes, log = compiled._with_form("dual", "entry_points"), sizes_of(one), np.zeros(5, LOG)
+        source, sizes, log = compiled.with_form("dual"), sizes_of(one), np.zeros(5, LOG)
         model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
         work = IlqrArrays(
             start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
@@ -715,7 +713,7 @@ class TestRareEnds:
                 SmootherGains(np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2))),
                 np.zeros((4, 3)),
             )  # fmt: skip
-            source = compiled._with_form(form, "linear_quadratic_passes")
+            source = compiled.with_form(form)
             sizes = SIZES | {"NOISY": 0}
             assert replay(source, sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work) == wanted
 
@@ -763,10 +761,9 @@ def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
 
 
 def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0) -> None:
-    data, source = compiled.numbers(term), source_of(augmented_lagrangian)
+    data, source = compiled.numbers(term), source_of(augmented_lagrangian, SHARED=term.shared)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
-    if term.balls:
-        source = source_of(ball_constraint, PLACES=3 * term.balls)
+    if term.shared:
         pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
     source, sizes = source.filled(**pairs), SIZES | {"EQUALITY": equality}
     multipliers = np.concatenate([[3.0, term.rows, 0.0, 0.01], np.linspace(0.0, 2.0, 4 * term.rows)])
@@ -808,8 +805,7 @@ class TestParts:
         points[:2, 2] = 0.05
         count = len(WORLD)
         source = source_of(signed_distance)
-        replay(source, {}, "nearest", count, 6, data, points, np.zeros(6))
-        replay(source, {}, "nearest_displaced", count, 6, 3, data, points, np.zeros((2, 3 * count)), np.zeros(6))
+        replay(source, {}, "nearest", count, 6, 3, data, points, np.zeros((2, 3 * count)), np.zeros(6))
         normals = np.zeros((6 * count, 3))
         replay(source, {}, "each_with_normal", count, 6, data, points, np.zeros(6 * count), normals)
         at = np.zeros(3), np.zeros((3, 3))
@@ -841,12 +837,12 @@ class TestParts:
 
     @staticmethod
     def places(places: SphereCenters, coordinates: int, x: Array) -> None:
-        source = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
+        source = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
         data, n = compiled.numbers(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
-        replay(source, sizes, "places_of", 2, states, data, np.zeros((2, coordinates)))
+        replay(source, sizes, "centres_of", 2, states, data, np.zeros((2, coordinates)))
         outputs = np.zeros((2, coordinates)), np.zeros((2, coordinates, n))
-        replay(source, sizes, "slopes_of", 2, states, data, *outputs)
+        replay(source, sizes, "jacobians_of", 2, states, data, *outputs)
 
     def test_constraints(self) -> None:
         of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))
@@ -856,7 +852,7 @@ class TestParts:
     @pytest.mark.parametrize("seed", range(4))
     def test_projection(self, seed: int) -> None:
         root = np.random.default_rng(seed).normal(size=(5, 5))
-        source = source_of(projection, SUPPORT=(0, 1, 3), K=3)
+        source = source_of(projection, SUPPORT=(0, 1, 3))
         replay(source, SIZES, "project", root + root.T - 2 * (seed > 1) * np.eye(5))
 
     def test_noise(self) -> None:
@@ -870,12 +866,10 @@ class TestParts:
         for noise in kinds:
             one = problem(noise=noise, steps=3)
             term = noise.bind(CART)
-            filled = {"noise_values": term.source, "noise_slopes": term.source}
             outputs = np.zeros((2, len(term.rows), 2))
-            matrices = source_of(noise_matrices).filled(noise_values=term.source)
             states, controls = np.array([X, -X]), np.array([U, -U])
-            replay(matrices, SIZES, "matrices_of", 2, states, controls, numbers_of(term), outputs)
-            source = source_of(noise_kernel, **term.filled).filled(**filled)
+            replay(term.code, SIZES, "matrices_of", 2, states, controls, numbers_of(term), outputs)
+            source = term.code
             policy, costs = Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.1)), np.zeros(2)
             draws = np.random.default_rng(0).normal(size=(6, 2))
             replay(source, SIZES, "noisy_costs", 2, 3, X.copy(), policy, compiled.arguments(one), draws, costs)

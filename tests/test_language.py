@@ -63,7 +63,7 @@ def assert_does_as_python(text: str, seed: int) -> None:
 WITHOUT_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
 
 
-@settings(max_examples=90, phases=WITHOUT_SHRINKING)
+@settings(max_examples=40, phases=WITHOUT_SHRINKING)
 @given(text=programs, seed=st.integers(0, 2**32 - 1))
 def test_programs_do_as_python_does(text: str, seed: int) -> None:
     assert_does_as_python(text, seed)
@@ -357,7 +357,7 @@ def test_texts_that_are_refused(construct: str) -> None:
     "text", ["def f(a):\n    return " + "(" * 5000 + "a" + ")" * 5000, "def f(a):\n    return a\0"]
 )
 def test_texts_that_python_does_not_read(text: str) -> None:
-    assert "which is no Python" in refusal(text, 1.5)
+    assert "which is not valid Python" in refusal(text, 1.5)
 
 
 def test_too_deep_a_nesting_is_refused() -> None:
@@ -405,7 +405,7 @@ class _Replaced(ast.NodeTransformer):
         return self.new if node is self.old else self.generic_visit(node)
 
 
-@settings(max_examples=60, phases=WITHOUT_SHRINKING)
+@settings(max_examples=30, phases=WITHOUT_SHRINKING)
 @given(text=programs, seed=st.integers(0, 2**32 - 1))
 def test_what_is_changed_at_random_compiles_or_is_refused(text: str, seed: int) -> None:
     """No other exception, and no IR that LLVM does not take."""
@@ -644,29 +644,41 @@ def test_a_call_that_was_refused_leaves_the_arguments_as_they_were(module: Compi
 
 
 WRONG = {
-    "a list": (0, [1.0, 2.0], "got list, want an array|list is no argument"),
+    "a list": (0, [1.0, 2.0], "got list, want an array"),
     "a float": (1, 1.0, "2 indices of a float|want an array"),
-    "None": (0, None, "NoneType is no argument"),
-    "ints": (0, np.array([1, 2]), "of int64, want blocks"),
-    "float32": (0, np.ones(2, dtype=np.float32), "of float32, want blocks"),
-    "the other byte order": (0, np.ones(2, dtype=">f8"), "of >f8, want blocks"),
-    "bools": (0, np.array([True, False]), "of bool, want blocks"),
-    "objects": (0, np.array([None, 1.0]), "of object, want blocks"),
-    "complex": (0, np.ones(2, dtype=complex), "of complex128, want blocks"),
+    "None": (0, None, "got NoneType, want an array"),
+    "ints": (0, np.array([1, 2]), "of int64, want C-ordered float64 blocks"),
+    "float32": (0, np.ones(2, dtype=np.float32), "of float32, want C-ordered float64 blocks"),
+    "the other byte order": (0, np.ones(2, dtype=">f8"), "of >f8, want C-ordered float64 blocks"),
+    "bools": (0, np.array([True, False]), "of bool, want C-ordered float64 blocks"),
+    "objects": (0, np.array([None, 1.0]), "of object, want C-ordered float64 blocks"),
+    "complex": (0, np.ones(2, dtype=complex), "of complex128, want C-ordered float64 blocks"),
     "no dimension": (0, np.array(1.0), "array \\(\\) of float64"),
-    "every other": (0, np.ones(4)[::2], "in C's order"),
-    "Fortran's order": (1, np.asfortranarray(np.ones((2, 2))), "in C's order"),
-    "transposed": (1, np.ones((2, 2)).T, "in C's order"),
-    "a matrix in a tuple": (2, (np.ones(2), np.ones((2, 2))), "want blocks \\(\\)"),
+    "every other": (0, np.ones(4)[::2], "want C-ordered"),
+    "Fortran's order": (1, np.asfortranarray(np.ones((2, 2))), "want C-ordered"),
+    "transposed": (1, np.ones((2, 2)).T, "want C-ordered"),
+    "a matrix in a tuple": (2, (np.ones(2), np.ones((2, 2))), "blocks \\(\\)"),
     "floats in a tuple": (2, (1.0, 2.0), "got float, want an array"),
     "ints in a tuple": (2, (np.ones(2), np.array([1, 2])), "of int64"),
-    "rows of ints": (4, np.zeros(2, dtype=[("cost", np.int64), ("gap", np.int64)]), "want rows of float64: cost, gap"),
-    "rows of float32": (4, np.zeros(2, dtype=[("cost", np.float32), ("gap", np.float64)]), "want rows of float64"),
-    "every other row": (4, np.zeros(4, dtype=[("cost", np.float64), ("gap", np.float64)])[::2], "one after the other"),
-    "one row": (4, np.zeros((), dtype=[("cost", np.float64), ("gap", np.float64)]), "want rows of float64"),
+    "rows of ints": (
+        4,
+        np.zeros(2, dtype=[("cost", np.int64), ("gap", np.int64)]),
+        "want a structured array of float64: cost, gap",
+    ),
+    "rows of float32": (
+        4,
+        np.zeros(2, dtype=[("cost", np.float32), ("gap", np.float64)]),
+        "want a structured array of float64",
+    ),
+    "every other row": (4, np.zeros(4, dtype=[("cost", np.float64), ("gap", np.float64)])[::2], "not contiguous"),
+    "one row": (
+        4,
+        np.zeros((), dtype=[("cost", np.float64), ("gap", np.float64)]),
+        "want a structured array of float64",
+    ),
     "a float for an int": (6, 2.0, "got a float, want an int"),
-    "text": (5, "text", "str is no argument"),
-    "a complex number": (5, 1j, "complex is no argument"),
+    "text": (5, "text", "got str, want an array"),
+    "a complex number": (5, 1j, "got complex, want an array"),
     "an array of one": (6, np.array([1]), "got an array of 1 dimensions, want an int"),
 }
 

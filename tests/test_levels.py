@@ -460,7 +460,7 @@ print("numba" in sys.modules)
 
 def test_only_functions_for_numba_need_it() -> None:
     command = [sys.executable, "-c", WITHOUT_NUMBA]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
     status, refused, imported = done.stdout.splitlines()
     assert (status, imported) == ("CONVERGED", "False")
     assert "level: got 'compiled', which needs numba, want pip install 'lqrsim[numba]'" in refused

@@ -56,7 +56,7 @@ def test_a_new_robot_solves_runs_renders_and_passes_by_the_printed_commands(
 
 
 NO_NAMES = ["", "my-robot", "my robot", "../robot", "MyRobot", "3d", "_robot", "class", "röbot", "a" * 61]
-TAKEN = ["numpy", "lqrsim", "any", "path", "world", "conftest"]
+TAKEN = ["numpy", "lqrsim", "any", "path", "world", "conftest", "con", "lpt1", "print", "self", "none", "valueerror"]
 
 
 @pytest.mark.parametrize("name", [*NO_NAMES, *TAKEN])

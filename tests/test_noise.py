@@ -14,9 +14,7 @@ from stochastic_lq import CONTROLS, SIZE, STATES, affine, draw, parameters_of_no
 import lqrsim as ls
 from lqrsim.codegen.compiled_module import compilations
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.sources import source_of
 from lqrsim.errors import InputError
-from lqrsim.kernels import noise as kernel
 from lqrsim.solvers.compiled import costs_of
 
 FORMS = [(True, "dual"), (False, "dual"), pytest.param(False, "primal", marks=pytest.mark.long)]
@@ -45,7 +43,6 @@ def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, 
     assert solution.cost == pytest.approx(cost, rel=1e-9)
 
 
-@pytest.mark.timeout(300)  # on a machine that has compiled nothing yet
 @pytest.mark.parametrize(("fixed", "form"), FORMS)
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3))
@@ -124,9 +121,8 @@ def test_slopes_of_what_noise_costs(risk):
     problem = problem_of(draw(rng), noise=noise)
     term = problem.noise_term
     assert term is not None
-    source = source_of(kernel, **term.filled).filled(noise_values=term.source, noise_slopes=term.source)
     sizes = {"N": STATES, "M": CONTROLS, "W": STATES + CONTROLS}
-    names = plain_functions(source, sizes, ("noise_value", "noise_quadratic"))
+    names = plain_functions(term.code, sizes, ("noise_value", "noise_quadratic"))
     root, s, jacobian, c = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(3, 5)), rng.normal(size=3)
     S, risky = root @ root.T, np.array([risk, 0.0])
 

@@ -15,14 +15,41 @@ import lqrsim as ls
 # Half of them have a plan that is hard to find: without any trailer, with one and with two, beside the road and along
 # it, some begin in an obstacle. Of the others each has none for another reason. benchmark_parking.py has two thousand.
 SAMPLE = (34, 94, 119, 201, 222, 554, 38, 42, 61, 69, 95, 133)
-pytestmark = pytest.mark.timeout(600)
+SOLVED = (34, 201, 38, 42)  # of these: with a plan and without, each of another structure
 
 
 def test_nothing_false_is_said() -> None:
     """However few are solved within so many iterations."""
-    found = [outcomes.look(one, improve=True, time_limit=None, max_iterations=80) for one in SAMPLE]
+    found = [outcomes.look(one, improve=True, time_limit=None, max_iterations=80) for one in SOLVED]
     assert [(one.number, one.verdict, one.said) for one in found if one.verdict not in ("right", "unsolved")] == []
     assert "CONVERGED" in {one.status for one in found if one.verdict == "right"}
+
+
+@pytest.mark.parametrize("number", [1, 5])
+def test_a_goal_that_is_reached_exactly_may_have_any_weight(number: int) -> None:
+    """The final cost is the same for all plans that end there, so weights from 1 to 5000 lead to one plan."""
+    task = cases.draw(number).task
+    assert task.exact
+    plans = [ls.smooth(problem_of(replace(task, weight=weight)), threads=1) for weight in (1.0, 50.0, 5000.0)]
+    assert {plan.status for plan in plans} == {ls.Status.CONVERGED}
+    np.testing.assert_allclose([plan.cost for plan in plans], plans[0].cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("number", [49, 68, 94, 178])
+def test_a_plan_that_is_hard_to_find_is_found(number: int) -> None:
+    """What is missed can be stationary, or a descent at a price end at the first plan, which costs a thousand times as
+    much.
+    """
+    found = outcomes.look(number)
+    assert (found.verdict, found.status) == ("right", "CONVERGED"), found.said
+    assert found.known is not None
+    assert found.cost < found.known
+
+
+@pytest.mark.parametrize("number", [13, 133])
+def test_what_has_no_plan_is_infeasible(number: int) -> None:
+    found = outcomes.look(number)
+    assert (found.verdict, found.status) == ("right", "INFEASIBLE"), found.said
 
 
 def test_what_is_known_is_so() -> None:

@@ -71,12 +71,12 @@ def test_the_plane_is_given_or_follows_from_the_names(names, given, plane, offse
     [
         (("x", "height"), {"plane": "xh"}, "plane: got 'xh', want one of: xy, xz, yx, yz, zx, zy"),
         (("x", "z"), {"plane": "xy"}, r"plane: got 'xy' for the position \(x, z\), want 'xz', or other names"),
-        (("north", "z"), {}, r"plane: got none for the position \(north, z\), whose names do not tell it"),
-        (("left_x", "right_x"), {}, "whose names do not tell it"),
-        (("x", "height"), {}, "whose names do not tell it"),
-        (("distance", "Height"), {}, "whose names do not tell it"),
+        (("north", "z"), {}, r"plane: got none for the position \(north, z\), whose names do not tell the plane"),
+        (("left_x", "right_x"), {}, "whose names do not tell the plane"),
+        (("x", "height"), {}, "whose names do not tell the plane"),
+        (("distance", "Height"), {}, "whose names do not tell the plane"),
         (("y", "x", "z"), {}, r"position: got \(y, x, z\), want it along x, y and z in this order: \(x, y, z\)"),
-        (("x", "y", "z"), {"plane": "xz"}, "plane: got 'xz' for the position .* want none: it is in space"),
+        (("x", "y", "z"), {"plane": "xz"}, "plane: got 'xz' for the position .* want none: the position is spatial"),
         (("x", "y", "z"), {"offset": 1.0}, "offset: got 1.0 without a plane"),
         ((), {"plane": "xz"}, "plane: got 'xz' without a position"),
         (("x", "z"), {"offset": np.nan}, "offset: got nan, want a finite number"),
@@ -255,14 +255,14 @@ def test_the_figures_show_the_cut(flown, tmp_path: Path) -> None:
 @draws
 def test_pixels_tell_where_a_planar_quadrotor_is(flown, tmp_path: Path) -> None:
     _, solution, rollout = flown
-    assert cameras.measuring(rollout) == ("side",)
+    assert cameras.measuring(rollout.plane) == ("side",)
     assert abs(cameras.side(rollout).forward[1]) == 1
     found = ls.verify_run(rollout, solution=solution)
     assert found.passed, found
     video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10, solution=solution)
     found = ls.verify_video(video, rollout, solution=solution)
     assert found.passed, found
-    with pytest.raises(ls.InputError, match="views: got top, want side to tell"):
+    with pytest.raises(ls.InputError, match="views: got top, want side to measure"):
         ls.verify_video(ls.render(rollout, tmp_path / "top.mp4", camera="top", fps=2), rollout)
 
 
@@ -409,5 +409,5 @@ def test_it_is_the_robot_that_is_measured_and_not_what_moves_before_it_in_the_fi
     video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10)
     assert ls.verify_video(video, rollout, solution=solution).passed
     assert ls.load(ls.save(rollout, tmp_path / "run.npz"), ls.Rollout).body == "drone"
-    with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want a body of its model"):
+    with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want the name of a body of the model"):
         ls.verify_run(dataclasses.replace(rollout, body="ghost"))

@@ -8,8 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim.control import law
-from lqrsim.control.controllers import Feedback
+from lqrsim.control.controllers import Feedback, evaluator, turn_to_nearest
 from lqrsim.solvers import compiled
 
 
@@ -91,7 +90,7 @@ def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fi
     solution: ls.Solution = request.getfixturevalue(fixture)
     policy, rng = solution.policy, np.random.default_rng(0)
     space, limits = policy.state_coordinates, policy.control_coordinates
-    evaluate = law.evaluator(space, limits)
+    evaluate = evaluator(space, limits)
     at_limits = []
     for step in (0, 40, policy.steps - 1):
         states = policy.nominal[step] + rng.normal(size=(50, len(space))) * rng.choice([0.01, 3.0], size=(50, 1))
@@ -106,7 +105,7 @@ def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fi
         np.testing.assert_allclose(compiled_controls, controls, rtol=0, atol=1e-12)
         at_limits.append((controls == limits.low) | (controls == limits.high))
         near = states[None].copy()
-        law.turn_to_nearest(space, near, policy.nominal[step : step + 1])
+        turn_to_nearest(space, near, policy.nominal[step : step + 1])
         np.testing.assert_allclose(near[0], space.nearest(states, policy.nominal[step]), rtol=0, atol=1e-12)
     assert 0.1 < np.mean(at_limits) < 0.9
 

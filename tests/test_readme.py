@@ -3,12 +3,11 @@
 import re
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 import lqrsim as ls
-from lqrsim.commands import Command
+from lqrsim.commands import COMMANDS
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -33,5 +32,5 @@ def test_commands_exist() -> None:
     text = README.read_text(encoding="utf-8")
     shown = set(re.findall(r"python3 run\.py (\w+)", text))
     assert {"demo", "test"} <= shown <= {"demo", "test", "check", "docs", "setup"}
-    commands = {command.__name__.lower() for command in get_args(Command)}
+    commands = set(COMMANDS)
     assert set(re.findall(r"^\$? ?lqrsim (\w+)", text, re.MULTILINE)) <= commands

@@ -21,7 +21,6 @@ from lqrsim.results.solution_parts import Status
 # Six of the eleven kinds, of each family some: each is compiled where nothing is cached, some 5 seconds, before the
 # first test ends. benchmark_reliability.py draws all of them, by the hundred.
 KINDS = ("linear_2_1", "linear_3_2", "drive", "quadrotor", "pendulum", "arm")
-pytestmark = pytest.mark.timeout(900)
 
 TOLERANCE = 1e-4  # the solvers' default, of the relative decrease that is still predicted
 # The reduced gradient, relative to the terms that cancel in it, goes with the root of the decrease: measured once to

@@ -55,29 +55,29 @@ def decode(path: Path) -> list[np.ndarray]:
 @draws
 def test_video_is_what_browsers_play(rollout: ls.Rollout, tmp_path: Path) -> None:
     calls: list[tuple[int, int]] = []
-    path = render(rollout, tmp_path / "run.mp4", size=SMALL, fps=4, progress=lambda *call: calls.append(call))
+    path = render(rollout, tmp_path / "run.mp4", size=SMALL, fps=1, progress=lambda *call: calls.append(call))
     assert path == tmp_path / "run.mp4"
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height) == SMALL
-        assert stream.average_rate == 4
+        assert stream.average_rate == 1
         times = [float(frame.time or 0.0) for frame in container.decode(video=0)]
     # Real time: the last frame shows the last moment that falls on a frame.
-    assert times == pytest.approx(np.arange(len(times)) / 4, abs=1e-6)
-    assert rollout.times[-1] - 1 / 4 < times[-1] <= rollout.times[-1] + 1e-6
+    assert times == pytest.approx(np.arange(len(times)), abs=1e-6)
+    assert rollout.times[-1] - 1 < times[-1] <= rollout.times[-1] + 1e-6
     assert calls == [(number + 1, len(times)) for number in range(len(times))]
     data = path.read_bytes()
     assert data.index(b"moov") < data.index(b"mdat"), "a player would have to load all of it first"
 
 
 @draws
-@pytest.mark.parametrize("fps", [0.7, 3])
-def test_frames_show_their_moment_at_any_rate(fps: float, drive: ls.Rollout, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rollout", "fps"), [("drive", 0.7), ("flight", 3)], indirect=["rollout"])
+def test_frames_show_their_moment_at_any_rate(rollout: ls.Rollout, fps: float, tmp_path: Path) -> None:
     look: dict = {"size": SMALL, "overlays": ("plan", "ghost", "trace")}
-    frames = decode(render(drive, tmp_path / "run.mp4", fps=fps, **look))
+    frames = decode(render(rollout, tmp_path / "run.mp4", fps=fps, **look))
     for number in (0, len(frames) // 2, len(frames) - 1):
-        path = render_still(drive, tmp_path / "still.png", time=number / fps, **look)
+        path = render_still(rollout, tmp_path / "still.png", time=number / fps, **look)
         # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
         # h264 loses there is a third or less of what one frame of motion changes.
         assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))
@@ -106,7 +106,7 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
             model.geom_rgba[:], model.geom_matid[:] = painted, material
             model.geom_matid[geoms], model.geom_rgba[geoms] = -1, (0, 0, 0, 0)
 
-        for time in np.linspace(0, rollout.times[-1], 12):
+        for time in np.linspace(0, rollout.times[-1], 8):
             hide(~robot)
             masked = segmented(segmenter, renderer.recorded, time)
             hide(np.zeros(0, dtype=int))
@@ -146,9 +146,9 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
 
 @draws
 def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) -> None:
-    files = [render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=1).read_bytes() for name in "ab"]
+    files = [render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=0.4).read_bytes() for name in "ab"]
     assert files[0] == files[1]
-    files = [render_still(rollout, tmp_path / f"{name}.png", every=1, size=SMALL).read_bytes() for name in "ab"]
+    files = [render_still(rollout, tmp_path / f"{name}.png", every=2, size=SMALL).read_bytes() for name in "ab"]
     assert files[0] == files[1]
 
 
@@ -398,7 +398,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
     states[:], frames[:] = np.nan, np.nan
-    with pytest.raises(ls.InputError, match="without one finite state"):
+    with pytest.raises(ls.InputError, match="without a finite state"):
         render_still(broken, tmp_path / "still.png", size=SMALL)
 
 

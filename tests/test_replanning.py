@@ -312,7 +312,7 @@ class TestLive:
 
         def clock() -> float:
             if threading.current_thread() is not main:
-                held.wait(60)
+                held.wait(600)
             return 0.0
 
         state = solution.trajectory.states[0]

@@ -10,9 +10,9 @@ from scipy import stats
 import lqrsim as ls
 from lqrsim.disturbances import Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.disturbances import preset
-from lqrsim.stress.multilevel_splitting import NoFailure, split
+from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import rate
-from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision, miss
+from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision_score, miss_score
 
 
 def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -59,7 +59,7 @@ def test_sizes_are_those_of_numpy() -> None:
 
 
 def test_what_can_not_be_given_is_named() -> None:
-    with pytest.raises(ls.InputError, match="got draws by poisson"):
+    with pytest.raises(ls.InputError, match="draws with poisson"):
         PrescribedDraws(np.zeros(3)).poisson(2.0)
     with pytest.raises(ls.InputError, match="numbers: got 3"):
         PrescribedDraws(np.zeros(3)).standard_normal(4)
@@ -106,7 +106,7 @@ def test_any_numbers_give_trials_of_every_preset(
     """However large: each number of a trial decides on its own part of it."""
     solution = {"quadrotor": quadrotor_solution, "differential_drive": drive_solution}[name]
     plant = ls.scenarios.get(name).plant()
-    trials = TrialScore(plant, solution, preset("light", plant), failure=miss)
+    trials = TrialScore(plant, solution, preset("light", plant), failure=miss_score)
     scores = trials([np.zeros(trials.size), np.full(trials.size, 9.0), np.full(trials.size, -9.0)])
     assert scores[0] < 0
     assert not np.isnan(scores).any()
@@ -120,8 +120,8 @@ def test_scores_are_positive_where_trials_fail(quadrotor: ls.Scenario, quadrotor
         trials=60,
         frames=False,
     )
-    np.testing.assert_array_equal(collision(rollout) > 0, rollout.collided)
-    np.testing.assert_array_equal(miss(rollout) > 0, ~rollout.reached)
+    np.testing.assert_array_equal(collision_score(rollout) > 0, rollout.collided)
+    np.testing.assert_array_equal(miss_score(rollout) > 0, ~rollout.reached)
     assert 5 < rollout.reached.sum() < 55
 
 
@@ -131,7 +131,7 @@ def test_scores_are_positive_where_trials_fail(quadrotor: ls.Scenario, quadrotor
 @pytest.mark.parametrize("size", [2, 200])
 def test_a_plane_one_in_a_million(size: int) -> None:
     """Within four standard errors, which are at most a seventh of it: 1 % of what plain Monte Carlo takes for that."""
-    found = split(along(size, 4.75), size, repetitions=20, seed=1)
+    found = failure_probability(along(size, 4.75), size, repetitions=20, seed=1)
     exact = stats.norm.sf(4.75)
     assert found.standard_error < exact / 7
     assert abs(found.probability.value - exact) < 4 * found.standard_error
@@ -143,20 +143,20 @@ def test_a_plane_one_in_a_million(size: int) -> None:
 def test_outside_of_a_ball_one_in_a_million() -> None:
     """Many directions at once, against the chi-square distribution."""
     radius = np.sqrt(stats.chi2.isf(1e-6, 20))
-    found = split(lambda z: np.linalg.norm(z, axis=1) - radius, 20, repetitions=20, seed=1)
+    found = failure_probability(lambda z: np.linalg.norm(z, axis=1) - radius, 20, repetitions=20, seed=1)
     assert abs(found.probability.value - 1e-6) < 4 * found.standard_error
     assert found.standard_error < 1e-6 / 7
 
 
 def test_two_opposite_planes_are_both_found() -> None:
-    found = split(lambda z: np.abs(z[:, 0]) - 4.0, 5, repetitions=20, seed=1)
+    found = failure_probability(lambda z: np.abs(z[:, 0]) - 4.0, 5, repetitions=20, seed=1)
     assert abs(found.probability.value - 2 * stats.norm.sf(4)) < 4 * found.standard_error
     assert 0.2 < np.mean(found.failures[:, 0] > 0) < 0.8
 
 
 def test_repetitions_have_no_bias_and_the_standard_error_is_theirs() -> None:
     """Few particles and one move, where levels from the particles themselves would be off: 2,000 repetitions."""
-    found = split(along(4, 3.5), 4, particles=40, moves=1, keep=0.25, repetitions=2000, seed=4)
+    found = failure_probability(along(4, 3.5), 4, particles=40, moves=1, keep=0.25, repetitions=2000, seed=4)
     exact = stats.norm.sf(3.5)
     assert abs(found.probability.value - exact) < 4 * found.standard_error
     assert found.standard_error < 0.05 * exact
@@ -172,7 +172,7 @@ def test_intervals_cover(particles: int, repetitions: int) -> None:
     found = []
     for seed in range(400):
         try:
-            one = split(along(3, 3.0), 3, particles=particles, repetitions=repetitions, seed=seed)
+            one = failure_probability(along(3, 3.0), 3, particles=particles, repetitions=repetitions, seed=seed)
             found.append(one.probability)
         except NoFailure:
             continue
@@ -185,7 +185,7 @@ def test_intervals_cover(particles: int, repetitions: int) -> None:
 
 def test_repetitions_that_bound_nothing_say_so() -> None:
     """Two that differ by a half: by Student's t with one degree of freedom anything above may be."""
-    found = split(along(3, 4.0), 3, particles=20, repetitions=2, seed=0)
+    found = failure_probability(along(3, 4.0), 3, particles=20, repetitions=2, seed=0)
     assert found.repetitions.min() < 0.5 * found.repetitions.max()
     assert found.probability.high == 1.0
     assert 0 < found.probability.low < found.probability.value
@@ -193,7 +193,7 @@ def test_repetitions_that_bound_nothing_say_so() -> None:
 
 def test_repetitions_that_agree_by_chance_are_not_sure() -> None:
     """So few particles that two repetitions have the same product; independent particles would differ."""
-    found = split(along(2, 2.0), 2, particles=10, keep=0.2, repetitions=2, seed=51)
+    found = failure_probability(along(2, 2.0), 2, particles=10, keep=0.2, repetitions=2, seed=51)
     assert (len(found.levels), found.standard_error) == (3, 0)
     assert found.probability.low < 0.5 * found.probability.value
     assert found.probability.high == 1
@@ -201,10 +201,12 @@ def test_repetitions_that_agree_by_chance_are_not_sure() -> None:
 
 def test_one_level_is_plain_trials() -> None:
     """Counted by hand; certain failure, too, is only so certain."""
-    found = split(along(2, 0.5), 2, repetitions=4)
+    found = failure_probability(along(2, 0.5), 2, repetitions=4)
     counted = round(float(found.repetitions.sum()) * 500)
     assert found.probability == rate(counted, 2000)
-    always = split(lambda z: np.ones(len(z)), 2, particles=10, keep=0.2, repetitions=2).probability
+    small = failure_probability(along(2, 0.5), np.int8(2), particles=np.int16(10), keep=0.2, repetitions=np.int8(2))
+    assert small.probability == failure_probability(along(2, 0.5), 2, particles=10, keep=0.2, repetitions=2).probability
+    always = failure_probability(lambda z: np.ones(len(z)), 2, particles=10, keep=0.2, repetitions=2).probability
     assert always == rate(20, 20)
     assert always.low < 0.9
 
@@ -216,7 +218,7 @@ def test_failures_are_failures_and_simulations_are_counted() -> None:
         asked.append(len(z))
         return along(6, 3.0)(z)
 
-    one, again = (split(score, 6, particles=100, repetitions=3, seed=9) for _ in range(2))
+    one, again = (failure_probability(score, 6, particles=100, repetitions=3, seed=9) for _ in range(2))
     assert (one.scores > 0).all()
     np.testing.assert_array_equal(one.scores, along(6, 3.0)(one.failures))
     assert one.simulations == again.simulations == sum(asked) / 2
@@ -227,14 +229,14 @@ def test_failures_are_failures_and_simulations_are_counted() -> None:
 
 def test_plain_trials_for_the_same_certainty() -> None:
     """By their definition: so many of a known rate have the standard error that was found."""
-    found = split(along(3, 3.0), 3, particles=200, repetitions=8)
+    found = failure_probability(along(3, 3.0), 3, particles=200, repetitions=8)
     p, n = found.probability.value, found.plain_trials
     assert np.sqrt(p * (1 - p) / n) == pytest.approx(found.standard_error)
     assert n > found.simulations
 
 
 def test_what_is_not_rare_needs_no_levels() -> None:
-    found = split(along(2, 0.5), 2, repetitions=10)
+    found = failure_probability(along(2, 0.5), 2, repetitions=10)
     assert found.levels.tolist() == [0.0]
     assert found.probability.low < stats.norm.sf(0.5) < found.probability.high
 
@@ -247,7 +249,7 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
     plain = trials(rng.standard_normal((1000, trials.size))) > 0
     expected = rate(int(plain.sum()), len(plain))
     assert 0.002 < expected.value < 0.03
-    found = split(trials, trials.size, particles=100, moves=2, keep=0.25, repetitions=4, seed=2)
+    found = failure_probability(trials, trials.size, particles=100, moves=2, keep=0.25, repetitions=4, seed=2)
     error = np.hypot(found.standard_error, np.sqrt(expected.value * (1 - expected.value) / len(plain)))
     assert abs(found.probability.value - expected.value) < 4 * error
     assert found.standard_error < expected.value
@@ -259,12 +261,15 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: split(along(2, 1), 0), "size: got 0"),
-        (lambda: split(along(2, 1), 2, particles=3), "particles: got 3"),
-        (lambda: split(along(2, 1), 2, keep=0.9), "keep: got 0.9"),
-        (lambda: split(along(2, 1), 2, repetitions=1), "repetitions: got 1"),
-        (lambda: split(lambda z: np.full(len(z), np.nan), 2), "score: got NaN returned"),
-        (lambda: split(lambda z: np.minimum(z[:, 0], 1.0) - 2.0, 2), "score: got no failure in .* levels up to -1"),
+        (lambda: failure_probability(along(2, 1), 0), "size: got 0"),
+        (lambda: failure_probability(along(2, 1), 2, particles=3), "particles: got 3"),
+        (lambda: failure_probability(along(2, 1), 2, keep=0.9), "keep: got 0.9"),
+        (lambda: failure_probability(along(2, 1), 2, repetitions=1), "repetitions: got 1"),
+        (lambda: failure_probability(lambda z: np.full(len(z), np.nan), 2), "score: got NaN returned"),
+        (
+            lambda: failure_probability(lambda z: np.minimum(z[:, 0], 1.0) - 2.0, 2),
+            "score: got no failure in .* levels up to -1",
+        ),
     ],
 )
 def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:

@@ -10,14 +10,21 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.commands.options import ControllerName, Policy
+from lqrsim.commands.options import ControllerName, PolicyName
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
 from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
 from lqrsim.stress.manifest import read_manifest
-from lqrsim.stress.specification import KINDS, POLICIES, TOLD, USUAL
-from lqrsim.stress.trials import CONTROLLERS, controller, controller_of, solve
+from lqrsim.stress.policies import (
+    CONTROLLERS,
+    DEFAULT_POLICIES,
+    DESIGNED,
+    POLICIES,
+    POLICY_KINDS,
+    make_controller,
+    make_policy,
+)
 
 LIGHT = (
     ControlNoise(0.02),
@@ -33,7 +40,7 @@ CAMPAIGN = ls.stress.Campaign(
     replan_every=12.0,
     trials=4,
     shard=2,
-    stated=LIGHT,
+    design_disturbances=LIGHT,
 )
 
 
@@ -43,7 +50,7 @@ def shards(results: ls.stress.Results) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> ls.stress.Results:
-    return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("stated") / "here", workers=0)
+    return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("design_disturbances") / "here", workers=0)
 
 
 @pytest.fixture(scope="module")
@@ -89,17 +96,17 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
 
 def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.stress.Results, tmp_path: Path) -> None:
     assert ls.stress.Campaign.from_json(json.loads(json.dumps(CAMPAIGN.as_json()))) == CAMPAIGN
-    assert results.manifest["campaign"]["stated"][2] == {
+    assert results.manifest["campaign"]["design_disturbances"][2] == {
         "kind": "AxleMismatch",
         "settings": {"std": 0.01, "factor": None},
     }
-    other = replace(CAMPAIGN, stated=(ControlNoise(0.1), MeasurementNoise(0.01)), trials=1)
-    with pytest.raises(InputError, match=r"^stated: got .*want .* or another folder"):
+    other = replace(CAMPAIGN, design_disturbances=(ControlNoise(0.1), MeasurementNoise(0.01)), trials=1)
+    with pytest.raises(InputError, match=r"^design_disturbances: got .*want .* or another folder"):
         ls.stress.run_campaign(replace(other, trials=4), results.folder, workers=0)
     small = replace(other, policies=("track",), strengths=(1.0,))
     digests = []
-    for number, stated in enumerate((None, LIGHT, other.stated)):
-        ls.stress.run_campaign(replace(small, stated=stated), tmp_path / str(number), workers=0)
+    for number, stated in enumerate((None, LIGHT, other.design_disturbances)):
+        ls.stress.run_campaign(replace(small, design_disturbances=stated), tmp_path / str(number), workers=0)
         digests.append(read_manifest(tmp_path / str(number))["digest"])
     assert len(set(digests)) == 3
 
@@ -108,11 +115,10 @@ def test_by_default_the_preset_in_the_middle_is_stated(
     differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
     moderate = ls.disturbances.preset("moderate", differential_drive.plant())
-    for policy in TOLD:
+    for policy in DESIGNED:
         digests = []
         for stated in (None, moderate):
-            solution = solve((policy,), differential_drive, stated)[policy]
-            digests.append(controller_of(policy, differential_drive, solution, stated=stated).digest)
+            digests.append(make_policy(policy, differential_drive, stated)[1].digest)
         assert digests[0] == digests[1]
 
 
@@ -122,23 +128,26 @@ class Own(ControlNoise):
 
 
 def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
-    assert list(_code(replace(CAMPAIGN, stated=(Own(0.1),)))) == ["Own"]
+    assert list(_code(replace(CAMPAIGN, design_disturbances=(Own(0.1),)))) == ["Own"]
 
 
 def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
-    assert ls.stress.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == USUAL == POLICIES[:4]
+    assert ls.stress.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == DEFAULT_POLICIES == POLICIES[:4]
     assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(POLICIES)
-    assert get_args(Policy) == POLICIES
+    assert get_args(PolicyName) == POLICIES
     assert get_args(ControllerName) == CONTROLLERS
-    assert {kind.controller for kind in KINDS.values()} <= {*CONTROLLERS}
+    assert {kind.controller for kind in POLICY_KINDS.values()} <= {*CONTROLLERS}
 
 
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({"stated": ()}, "^stated: got none, want at least one disturbance"),
-        ({"stated": "light"}, "^stated: got 'light', want a tuple of disturbances"),
-        ({"policies": ("smooth", "replan")}, "^stated: got it with smooth, replan, want it with track or offset_free"),
+        ({"design_disturbances": ()}, "^design_disturbances: got none, want at least one disturbance"),
+        ({"design_disturbances": "light"}, "^design_disturbances: got 'light', want a tuple of disturbances"),
+        (
+            {"policies": ("smooth", "replan")},
+            "^design_disturbances: got them with smooth, replan, want track or offset_free",
+        ),
         ({"policies": ("tracking",)}, "^policies: got 'tracking', want .*track"),
     ],
 )
@@ -148,17 +157,23 @@ def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], li
 
 
 def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^stated: Gusts: got robot differential_drive, which has no drag"):
-        ls.stress.run_campaign(replace(CAMPAIGN, stated=(ls.disturbances.Gusts(),)), tmp_path / "new", workers=0)
+    with pytest.raises(
+        InputError, match=r"^design_disturbances: Gusts: got robot differential_drive, which has no drag"
+    ):
+        ls.stress.run_campaign(
+            replace(CAMPAIGN, design_disturbances=(ls.disturbances.Gusts(),)), tmp_path / "new", workers=0
+        )
     assert not (tmp_path / "new").exists()
 
 
 # Searches for failures.
 
 
-@pytest.mark.parametrize("policy", TOLD)
+@pytest.mark.parametrize("policy", DESIGNED)
 def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
-    problem = ls.stress.ReliabilityProblem("differential_drive", sweep="light", policy=policy, stated="severe")
+    problem = ls.stress.ReliabilityProblem(
+        "differential_drive", sweep="light", policy=policy, design_disturbances="severe"
+    )
     severe = ls.uncertainty_of(differential_drive.plant(), ls.disturbances.preset("severe", differential_drive.plant()))
     plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
     law = (
@@ -175,10 +190,10 @@ def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, d
 
 
 def test_searches_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(InputError, match=r"^stated: got it with smooth, want it with track or offset_free"):
-        ls.stress.ReliabilityProblem("differential_drive", stated="light")
-    problem = ls.stress.ReliabilityProblem("differential_drive", policy="track", stated="gale")
-    with pytest.raises(InputError, match=r"^sweep: got 'gale', want .*light"):
+    with pytest.raises(InputError, match=r"^design_disturbances: got them with smooth, want track or offset_free"):
+        ls.stress.ReliabilityProblem("differential_drive", design_disturbances="light")
+    problem = ls.stress.ReliabilityProblem("differential_drive", policy="track", design_disturbances="gale")
+    with pytest.raises(InputError, match=r"^disturbances: got 'gale', want .*light"):
         _ = problem.score
 
 
@@ -189,7 +204,7 @@ def test_searches_that_make_no_sense_are_refused() -> None:
 def test_simulate_runs_a_controller_by_its_name(
     name: str, solved: Path, tmp_path: Path, differential_drive: ls.Scenario
 ) -> None:
-    told = ["--stated", "light"] if name in TOLD else []
+    told = ["--design-disturbances", "light"] if name in DESIGNED else []
     options = ["--disturbances", "light", "--trials", "3", "--out", str(tmp_path), "--controller", name, *told]
     assert main(["simulate", str(solved), *options]) == 0
     solution, plant = ls.load(solved, ls.Solution), differential_drive.plant()
@@ -212,17 +227,17 @@ def test_a_plan_with_a_clearance_is_tracked_but_not_planned_again_without_it(
 ) -> None:
     clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius, margin=0.05)
     solution = ls.smooth(replace(differential_drive.problem, constraints=[clear]))
-    assert controller("track", differential_drive, solution).digest
+    assert make_controller("track", differential_drive, solution).digest
     with pytest.raises(InputError, match=r"^controller: got replan for a solution of another problem"):
-        controller("replan", differential_drive, solution)
+        make_controller("replan", differential_drive, solution)
 
 
 @pytest.mark.parametrize(
     ("options", "line"),
     [
         ("--controller track --open-loop", "--open-loop: got it with --controller track, want one of them"),
-        ("--stated light", "stated: got it with feedback, want it with track or offset_free, or none"),
-        ("--controller track --stated gale", "sweep: got 'gale', want one of: scenario, calm"),
+        ("--design-disturbances light", "design_disturbances: got them with feedback, want track or offset_free"),
+        ("--controller track --design-disturbances gale", "disturbances: got 'gale', want one of: scenario, calm"),
     ],
 )
 def test_commands_that_make_no_sense_are_refused(
@@ -239,17 +254,17 @@ def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest
     solution = ls.load(solved, ls.Solution)
     ls.save(ls.simulate(ls.scenarios.differential_drive().plant(), solution), run)
     assert main(["view", run, "--controller", "track"]) == 2
-    assert "--controller, --stated: got one with" in capsys.readouterr().err
-    assert main(["view", "differential_drive", "--viewer", "browser", "--stated", "light"]) == 2
-    assert "stated: got it with feedback, want it with track or offset_free" in capsys.readouterr().err
+    assert "--controller: got track with" in capsys.readouterr().err
+    assert main(["view", "differential_drive", "--viewer", "browser", "--design-disturbances", "light"]) == 2
+    assert "design_disturbances: got them with feedback, want track or offset_free" in capsys.readouterr().err
 
 
 def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = "--policies smooth track offset_free --stated calm --strengths 1 --trials 2 --workers 0 --sweep light"
+    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2"
     assert main(["stress", "differential_drive", *options.split(), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     rows = [line for line in printed if line.startswith("light")]
     assert [line.split()[2] for line in rows] == ["smooth", "track", "offset_free"]
     assert len({len(line) for line in rows}) == 1  # in columns, though a name is longer than others
     plant = ls.scenarios.differential_drive().plant()
-    assert ls.stress.Results(tmp_path).campaign.stated == tuple(ls.disturbances.preset("calm", plant))
+    assert ls.stress.Results(tmp_path).campaign.design_disturbances == tuple(ls.disturbances.preset("calm", plant))

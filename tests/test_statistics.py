@@ -179,14 +179,14 @@ def test_bootstrap_covers() -> None:
         (lambda: rate(3, 2), "successes: got 3"),
         (lambda: rate(0, 0), "trials: got 0"),
         (lambda: rate(1, 2, confidence=1.0), "confidence: got 1.0"),
-        (lambda: compare([True], [True, False]), "second: got shape"),
-        (lambda: compare([], []), "second: got shape"),
+        (lambda: compare([True], [True, False]), "second: got 2 trials"),
+        (lambda: compare([], []), "first: got"),
         (lambda: paired_difference(0, 0, 0), "trials: got 0"),
         (lambda: paired_difference(3, 2, 4), "trials: got 4, want at least the 5"),
         (lambda: paired_difference(-1, 2, 4), "only_first: got -1"),
         (lambda: mean([1.0]), "sample: got 1 numbers"),
-        (lambda: bootstrap(np.mean, [1.0]), "samples: got shapes"),
-        (lambda: bootstrap(np.mean, [1.0, 2.0], [1.0]), "samples: got shapes"),
+        (lambda: bootstrap(np.mean, [1.0]), "samples: got lengths"),
+        (lambda: bootstrap(np.mean, [1.0, 2.0], [1.0]), "samples: got lengths"),
     ],
 )
 def test_bad_input_is_named(call: Callable[[], object], field: str) -> None:

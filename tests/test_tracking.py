@@ -1,12 +1,13 @@
 """Tracking laws against dense least squares of the same cost and a plain Riccati recursion; what is refused."""
 
+import dataclasses
 import importlib.util
 
 import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from linear_plans import DT, Linear, by_hand, linear
+from linear_plans import DT, Linear, linear
 from scipy.linalg import expm
 
 import lqrsim as ls
@@ -276,5 +277,6 @@ def test_a_solution_of_another_system_is_refused() -> None:
     with pytest.raises(ls.InputError, match="track: solution: got one of another system"):
         ls.track(system.problem, other.solution, tolerate=1.0, effort=1.0)
     lost = ls.Trajectory(np.full_like(system.plan.states, np.nan), system.plan.controls, DT)
+    ended = dataclasses.replace(system.solution, status=ls.Status.NOT_FINITE, trajectory=lost)
     with pytest.raises(ls.InputError, match="track: solution: got a plan that is not finite"):
-        ls.track(system.problem, by_hand(lost, system.solution.policy), tolerate=1.0, effort=1.0)
+        ls.track(system.problem, ended, tolerate=1.0, effort=1.0)

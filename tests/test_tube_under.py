@@ -7,7 +7,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlDelay, ControlNoise, MeasurementLatency, MeasurementNoise, Push
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 
 NOISE = ControlNoise(0.05)
 
@@ -23,7 +23,7 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
             [NOISE],
             ls.Replanner(problem, drive_solution, every=1.0),
         ),
-        "told of other disturbances": (
+        "designed for other disturbances": (
             [NOISE],
             ls.OffsetFree(problem, drive_solution, ls.uncertainty_of(plant, [ControlNoise(0.06)])),
         ),
@@ -72,7 +72,7 @@ def test_a_tube_is_added_to_runs_of_its_plan_alone(
         tube.added_to(moved)
     with pytest.raises(ls.InputError, match="rollout: got 3, want a Rollout"):
         tube.added_to(3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ls.InputError, match=r"Rollout: tube: got shape \(2, 2\), want \(151, 2, 2\)"):
+    with pytest.raises(ls.InputError, match=r"Rollout: tube: got shape \(2, 2\), want \(T\+1, p, p\) = \(151, p, p\)"):
         dataclasses.replace(run, tube=np.eye(2))
 
 

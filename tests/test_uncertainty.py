@@ -289,7 +289,7 @@ def test_only_what_a_control_does_alone_and_in_proportion_is_its_gain():
     stated = ls.uncertainty_of(Plant(Swept(), load_scene("cage")), [ThrustMismatch(0.05)])
     assert list(named(stated)) == ["gain of rotor_4"]
     (words,) = stated.left_out
-    assert words.endswith("no control is that of quadrotor_rotor_1, quadrotor_rotor_2, quadrotor_rotor_3 alone")
+    assert words.endswith("no control drives quadrotor_rotor_1, quadrotor_rotor_2, quadrotor_rotor_3 alone")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -155,7 +155,7 @@ def test_a_controllers_run_is_about_the_solutions_plan(quadrotor: ls.Scenario, q
     law = ls.track(quadrotor.problem, quadrotor_solution, tolerate={"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 1.0})
     run = ls.simulate(quadrotor.plant(), quadrotor_solution, controller=law)
     told = check_plan(run, quadrotor_solution)
-    assert (told.passed, told.detail.partition(";")[0]) == (None, "as the solution has it")
+    assert (told.passed, told.detail.partition(";")[0]) == (None, "that of the solution")
     tracked = dataclasses.replace(quadrotor_solution, policy=law)
     assert check_plan(run, tracked).passed
     other = dataclasses.replace(tracked, trajectory=quadrotor_solution.candidates[1].trajectory)
@@ -279,7 +279,7 @@ def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None
         with pytest.raises(ls.InputError, match="views: got top, want top and side"):
             ls.verify_video(path, case.run)
     faults.write(path, [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]], case.metadata)
-    with pytest.raises(ls.InputError, match="want them as lqrsim wrote them"):
+    with pytest.raises(ls.InputError, match="want the size that lqrsim wrote"):
         ls.verify_video(path, case.run)
     with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
         ls.verify_run(case.run, 1)

@@ -45,18 +45,18 @@ def picture(result: Result, name: str, caption: str) -> str:
 
 
 def as_in_the_paper(problem: ls.Problem) -> ls.Problem:
-    """Without limits of the controls, which the paper does not have."""
+    """The problem without limits of the controls, as in the paper."""
     return replace(problem, control_limits=FREE)
 
 
 def fixed(problem: ls.Problem) -> ls.Problem:
-    """The same from exactly the wished start, which is softly drawn to in the paper."""
+    """The problem from exactly the wished start, where the paper has a soft start."""
     assert problem.start is not None
     return replace(problem, initial=ls.FixedState(problem.start))
 
 
 def numbers(values: Iterable[float] | Array, digits: int = 6) -> list[float | None]:
-    """Numbers as JSON has them, to so many digits; None for what is not finite."""
+    """Numbers for JSON, rounded to so many digits; None for what is not finite."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in map(float, values)]
 
 

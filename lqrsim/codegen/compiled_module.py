@@ -1,8 +1,8 @@
-"""Kernels as machine code: compiled when they are first asked for, kept on disk by content, and called.
+"""Kernels as machine code: compiled when first used, cached on disk by content, and called.
 
-Functions that Python calls are *entries*: they are compiled for the types of what they are called with, and get it laid
-out as one block of memory, a number or an address every 8 bytes. Functions that compiled code calls are C functions
-behind the signatures below, by their addresses.
+Functions that Python calls are *entries*: they are compiled for the types of their arguments, which they get as one
+block of memory, a number or an address every 8 bytes. Functions that compiled code calls are C functions with the
+signatures below, called by their addresses.
 """
 
 import ctypes
@@ -30,8 +30,8 @@ from lqrsim.codegen.language import (
     Group,
     Pointer,
     Pointers,
-    Rows,
     Scalar,
+    StructArray,
     Type,
     scalars,
     type_of,
@@ -46,15 +46,15 @@ from lqrsim.results.hashing import sha256
 
 logger = logging.getLogger("lqrsim")
 
-# Compilations in this process; what was loaded from disk does not count.
+# What was compiled in this process, and not loaded from disk.
 compilations: list[str] = []
 compiling = threading.RLock()
 
-# The functions that take long to compile, which is worth a message.
+# Functions that take long to compile, which is announced.
 LONG = ("smoother", "ilqr")
 
-# The C functions that a model brings: what each is called with, in order. A letter is the size of an array's rows:
-# `W` that of a state and a control joined, `N` that of a state; "" is a vector, and a name a record, taken apart.
+# The arguments of the C functions of a model. A letter is the size of an array's rows, N states or W states and
+# controls; "" is a vector, and a name a record, which is passed field by field.
 _SIGNATURES: dict[str, tuple[str | Scalar, ...]] = {
     "advance": ("", "", "", FLOAT, ""),  # x, u, p, h, out
     "step_jacobian": ("", "", "", FLOAT, "", "W"),  # x, u, p, h, out, jacobian
@@ -77,21 +77,20 @@ _RECORDS = {"NextStep": ("W", "", "N", ""), "QuadraticStage": ("W", "")}
 class CompiledModule:
     """The functions of one source for one set of sizes.
 
-    Calling `module.name(...)` calls the function of that name: with arrays of float64, C-ordered, also in tuples and in
-    the named tuples of `kernels/records.py`; numbers and rows with fields as they are. The shape of an array's blocks
-    is part of its type; its first dimension is not, and nothing looks whether an index is within it.
+    `module.name(...)` calls the function of that name, with numbers, C-ordered float64 arrays, tuples and records of
+    these, and structured arrays. The shape of an array's blocks is part of its type; its first dimension is not, and
+    indices are not checked against it.
 
     Args:
-      source: the functions. sizes: name -> number, of what `kernels/declarations.py` declares.
-      what: what it is for, as the progress message and `lqrsim cache` say it.
+      source: the functions. sizes: name -> number, of the sizes in `kernels/declarations.py`.
+      what: what it is for, in progress messages and `lqrsim cache`.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int], what: str) -> None:
         self._source, self._sizes, self.what = source, dict(sizes), what
-        self._entries: dict[Any, Entry] = {}
+        self._made: dict[Any, Any] = {}  # entries and addresses
         self._last: dict[str, Entry] = {}
-        self._addresses: dict[tuple[str, ...], tuple[float, ...]] = {}
-        self._loaded: list[Loaded] = []
+        self._loaded: list[Loaded] = []  # kept alive
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -99,34 +98,27 @@ class CompiledModule:
         return lambda *arguments: self.lay_out(name, *arguments)()
 
     def lay_out(self, name: str, *arguments: Any) -> "Call":
-        """A call of the function with these arguments, to be made any number of times by one thread at a time."""
+        """Lay out a call of a function, to be made any number of times, by one thread at a time."""
         entry = self._last.get(name)
         if entry is not None:
             try:
-                return Call(entry, arguments)  # which looks at the types, too
+                return Call(entry, arguments)  # which checks the types
             except TypeError:
                 pass
-        entry = self._last[name] = self.entry(name, *arguments)
+        types = tuple(map(type_of, arguments))
+        entry = self._last[name] = self._once((name, types), lambda: self._make_entry(name, types))
         return Call(entry, arguments)
 
-    def entry(self, name: str, *arguments: Any) -> "Entry":
-        """The compiled function for arguments like these."""
-        types = tuple(map(type_of, arguments))
-        found = self._entries.get((name, types))
-        if found is None:
-            with compiling:
-                found = self._entries.get((name, types)) or self._make_entry(name, types)
-                self._entries[name, types] = found
-        return found
-
     def addresses(self, *names: str) -> tuple[float, ...]:
-        """Where the C functions of these names are, compiled together; for compiled code to call."""
-        found = self._addresses.get(names)
-        if found is None:
+        """The addresses of C functions, compiled together, for compiled code to call."""
+        return self._once(names, lambda: self._make_functions(names))
+
+    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
+        if key not in self._made:
             with compiling:
-                found = self._addresses.get(names) or self._make_functions(names)
-                self._addresses[names] = found
-        return found
+                if key not in self._made:
+                    self._made[key] = make()
+        return self._made[key]
 
     def _make_entry(self, name: str, types: tuple[Type, ...]) -> "Entry":
         def write(program: Program, scope: Scope) -> Type | None:
@@ -154,7 +146,7 @@ class CompiledModule:
     def _load(
         self, what: str, functions: str, write: Callable[[Program, Scope], Type | None], long: bool
     ) -> tuple[Loaded, Type | None]:
-        """Machine code of some of the functions, from disk or compiled now; and what the entry among them returns."""
+        """Machine code of some functions, from disk or compiled now, and the type that the entry among them returns."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
@@ -168,11 +160,11 @@ class CompiledModule:
         self, what: str, write: Callable[[Program, Scope], Type | None], long: bool, key: str
     ) -> tuple[Loaded, Type | None]:
         compilations.append(what)
-        # A warning is what a script shows that has not set up logging, and a long silence is worse.
+        # A warning, because scripts show it without setting up logging: a long silence would be worse.
         log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
         last = disk.noted(timed)
-        took = "some seconds" if last is None else f"which took {last:.0f} s the last time"
-        log(f"compiling {what}, once for this size, {took} ...")
+        took = "some seconds" if last is None else f"{last:.0f} s the last time"
+        log(f"compiling {what}, once for this size ({took}) ...")
         clock = time.perf_counter()
         program = Program()
         returns = write(program, Scope(self._source, self._sizes))
@@ -191,20 +183,20 @@ def _module_of(source: Source, sizes: tuple[tuple[str, int], ...], what: str) ->
 
 
 def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
-    """The module of a source and sizes, one in a process.
+    """The CompiledModule of a source and sizes, one per process.
 
     Args:
-      source: the functions. what: as for CompiledModule. **sizes: of what `kernels/declarations.py` declares.
+      source: the functions. what: as for CompiledModule. **sizes: of those in `kernels/declarations.py`.
     """
-    with compiling:  # not only against doing it twice: Python 3.11 cannot parse in two threads at once
+    with compiling:  # also because Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)
 
 
 class Entry:
-    """A compiled function that Python calls, laid out as a `Call`.
+    """A compiled function that Python calls.
 
     Args:
-      types: of the arguments. address: of the machine code. returns: the type of what it returns.
+      types: of the arguments. address: of the machine code. returns: the type of the result.
     """
 
     def __init__(self, types: tuple[Type, ...], address: int, returns: Type | None) -> None:
@@ -215,10 +207,10 @@ class Entry:
 
 
 class Call:
-    """A call of an entry, its arguments laid out once.
+    """A call of an entry, with its arguments laid out once.
 
-    `call()` makes it; `call(...)` makes it with other arguments, of which only those are laid out anew that are other
-    objects than before. Arrays are where they are: what is written to them counts at the next call.
+    `call()` makes it, and `call(...)` makes it with other arguments, of which only those that are other objects than
+    before are laid out again. Arrays are passed by reference.
     """
 
     def __init__(self, entry: Entry, arguments: tuple[Any, ...]) -> None:
@@ -226,15 +218,15 @@ class Call:
         self._words = (ctypes.c_int64 * max(entry.size, 1))()
         self._floats = (ctypes.c_double * max(entry.size, 1)).from_buffer(self._words)
         self._address = ctypes.addressof(self._words)
-        self._tables: dict[int, Any] = {}  # the addresses of the vectors in tuples, by their place
-        self._arguments = arguments  # kept alive by that
+        self._tables: dict[int, Any] = {}  # tables of the addresses of vectors, by their place
+        self._arguments = arguments  # kept alive
         self._lay(self._layout, arguments, 0)
 
     def __call__(self, *arguments: Any) -> Any:
         if arguments:
             try:
                 self._lay_changes(self._layout, arguments, self._arguments, 0)
-            except Exception:  # so that nothing is left of what is not kept alive
+            except Exception:  # leave no address of an array that is not kept alive
                 self._lay(self._layout, self._arguments, 0)
                 raise
             self._arguments = arguments
@@ -263,7 +255,7 @@ class Call:
             place += part.size
 
     def _lay(self, layout: "_Layout", argument: Any, place: int) -> None:
-        """Write the words of an argument from a place on."""
+        """Write the words of an argument, from a place on."""
         kind = layout.kind
         if layout.block is not None:
             self._words[place] = _address_of(argument, layout.block)
@@ -286,16 +278,18 @@ class Call:
             self._tables[place] = table
             self._words[place] = ctypes.addressof(table)
         else:
-            assert isinstance(kind, Rows)
+            assert isinstance(kind, StructArray)
             if not isinstance(argument, np.ndarray) or argument.dtype != layout.row or not argument.ndim:
-                raise TypeError(f"got {type(argument).__name__}, want rows of float64: {', '.join(kind.fields)}")
+                raise TypeError(
+                    f"got {type(argument).__name__}, want a structured array of float64: {', '.join(kind.fields)}"
+                )
             if not argument.flags.c_contiguous:
-                raise TypeError("got rows that are not one after the other")
+                raise TypeError("got a structured array that is not contiguous, want numpy.ascontiguousarray of it")
             self._words[place] = argument.ctypes.data
 
 
 class _Layout:
-    """How many words a type takes, and its parts; of an array, the shape of its blocks; of rows, what one is."""
+    """The size of a type in words, its parts, the shape of an array's blocks, and the dtype of a structured array."""
 
     def __init__(self, kind: Type) -> None:
         self.kind = kind
@@ -303,12 +297,12 @@ class _Layout:
         self.size = len(scalars(kind))
         self.block = kind.block if isinstance(kind, Pointer) else None
         self.vectors = isinstance(kind, Pointers)
-        self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, Rows) else None
+        self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, StructArray) else None
         self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
 
 
 def _same_vectors(one: Any, other: tuple[Array, ...]) -> bool:
-    """Whether a tuple has the same arrays as another one."""
+    """Whether two tuples hold the same arrays."""
     return isinstance(one, tuple) and len(one) == len(other) and all(map(operator.is_, one, other))
 
 
@@ -316,33 +310,33 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def _address_of(array: Array, block: tuple[int, ...]) -> int:
-    """Where the numbers of an array of such blocks are. Raises TypeError for what is none."""
+    """The address of an array of blocks of that shape. Raises TypeError for anything else."""
     if not isinstance(array, np.ndarray):
         raise TypeError(f"got {type(array).__name__}, want an array")
     if array.dtype != _FLOAT64 or not array.ndim or array.shape[1:] != block or not array.flags.c_contiguous:
-        raise TypeError(f"got an array {array.shape} of {array.dtype}, want blocks {block} of float64 in C's order")
-    try:  # in a quarter of the time that array.ctypes.data takes
+        raise TypeError(f"got an array {array.shape} of {array.dtype}, want C-ordered float64 blocks {block}")
+    try:  # four times as fast as array.ctypes.data
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):  # nothing in it, or read-only
+    except (TypeError, ValueError):  # empty, or read-only
         return array.ctypes.data
 
 
 def in_c_order(array: Array) -> Array:
-    """In C's order, and not read-only, as arrays from files are: compiled functions take no other."""
+    """The array, or a copy that is C-ordered float64 and writable, as compiled functions want it."""
     if array.dtype == np.float64 and array.flags.carray:
-        return array  # at once: in the loop it is most of what this takes
+        return array  # at once: np.require would take most of the time of a control step
     return np.require(array, np.float64, ["C", "W"])
 
 
 def _encoded(returns: Type | None) -> Any:
-    """The type of a result as JSON has it."""
+    """The type of a result, for JSON."""
     if returns is None:
         return None
     return [one.name for one in scalars(returns) if isinstance(one, Scalar)], isinstance(returns, Group)
 
 
 def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
-    """What was kept, in memory; None if it cannot be used: then it is compiled again."""
+    """Load a cached function; None if it cannot be used, and must be compiled again."""
     header, _, code = kept.partition(b"\n")
     try:
         known = json.loads(header)
@@ -351,19 +345,19 @@ def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
             names, several = known["returns"]
             kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
             returns = Group(kinds) if several else kinds[0]
-        if known["code"] != sha256(code):  # LLVM ends the process over what is no object file
-            raise ValueError("it has another code")
+        if known["code"] != sha256(code):  # LLVM would end the process for what is no object file
+            raise ValueError("its checksum does not fit")
         return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
-        logger.debug(f"a compiled function in the cache could not be used ({error})")
+        logger.debug(f"a cached compiled function cannot be used ({error})")
         return None
 
 
 @functools.cache
 def _toolchain() -> str:
-    """A hash of what machine code depends on besides its source: all kernels, and what prints and compiles them."""
+    """A hash of what machine code depends on besides its source: all kernels, and the compiler's own modules."""
     own = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
-    folders = [Path(str(importlib.import_module(name).__file__)) for name in own]
-    folders += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))
-    texts = (path.read_bytes() for path in folders)
+    paths = [Path(str(importlib.import_module(name).__file__)) for name in own]
+    paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))
+    texts = (path.read_bytes() for path in paths)
     return disk.key(version("llvmlite"), *texts)

@@ -1,9 +1,8 @@
-"""A hash of what a function does, without running it: the key under which what is derived from it can be kept.
+"""A hash of what a function does, without running it: the key under which what is derived from it is cached.
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
-it refers to, as deep as that goes. What belongs to NumPy, SymPy or numba counts by that package's version. A function
-that refers to anything else (an object that may change, a module of the user's own, a file) has no fingerprint, and
-nothing of it is kept.
+that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else
+(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing of it is cached.
 """
 
 import dis
@@ -22,11 +21,11 @@ from lqrsim import capsules, rotations
 from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
-# What formulas may use without being read: by version, which the hash includes.
+# What formulas may use without being covered itself: the hash includes the versions.
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
-# What reads files, other names or chance: a function that mentions these does more than can be covered. `getattr` may,
-# for what it can reach is covered, but for names like `__globals__`.
+# What reads files, other names or random numbers: a function that uses these cannot be covered. `getattr` is allowed,
+# because what it can reach is covered, except through names like `__globals__`.
 _REFUSED = {
     "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "setattr", "__import__",
     "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "frompyfunc", "vectorize",
@@ -40,7 +39,7 @@ class _NoFingerprint(Exception):
 
 
 def fingerprint(function: Any) -> str | None:
-    """The hash, the same in every process; None if there is something that it could not cover."""
+    """The hash, the same in every process; None if something cannot be covered."""
     try:
         return disk_cache.key(*_versions(), *_function(function, {}))
     except (_NoFingerprint, RecursionError):
@@ -48,7 +47,7 @@ def fingerprint(function: Any) -> str | None:
 
 
 def _version(name: str) -> str:
-    """Of a package; numba need not be there, and no function can refer to it then."""
+    """The version of a package; numba may be missing, and then no function refers to it."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -68,7 +67,7 @@ def _versions() -> tuple[str, ...]:
 
 
 def _helpers(function: Any) -> list[Any]:
-    """The numba functions that a function with a fingerprint refers to, at any depth."""
+    """The numba functions that a function with a fingerprint refers to, directly or not."""
     seen: dict[int, Any] = {}
     for _ in _function(function, seen):
         pass
@@ -79,20 +78,20 @@ _seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDiction
 
 
 def note_helpers(function: Any) -> None:
-    """Remember which helpers are not compiled yet: their globals will be what they are now."""
+    """Remember which helpers are not compiled yet: they will be compiled with their globals of now."""
     if fingerprint(function) is not None:
         fresh = (helper for helper in _helpers(function) if not helper.overloads)
         _seen_fresh.update((helper, fingerprint(helper)) for helper in fresh)
 
 
 def stale(function: Any) -> bool:
-    """Whether a helper may have been compiled when its globals were others: numba keeps them as they were."""
+    """Whether a helper may have been compiled with other values of its globals, which numba freezes."""
     return any(one.overloads and _seen_fresh.get(one, "") != fingerprint(one) for one in _helpers(function))
 
 
 def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """What a Python or numba function is made of."""
-    if id(function) in seen:  # by its number, for another one would be another function
+    """The parts of a Python or numba function."""
+    if id(function) in seen:  # its position tells it from other functions
         yield f"seen {list(seen).index(id(function))}"
         return
     seen[id(function)] = function
@@ -111,7 +110,7 @@ def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield name
         try:
             contents = cell.cell_contents
-        except ValueError:  # not assigned yet
+        except ValueError:  # not yet assigned
             raise _NoFingerprint from None
         yield from _value(contents, seen)
     for name in sorted(_names(function.__code__)):
@@ -131,7 +130,7 @@ def _code(code: types.CodeType) -> Iterator[str]:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """The global names that code reads, and that of functions inside it; refuses imports of what has no version."""
+    """The global names that code and functions inside it read. Raises for imports without a known version."""
     texts = {constant for constant in code.co_consts if isinstance(constant, str)}
     if _REFUSED & set(code.co_names) or _UNCOVERED & (texts | set(code.co_names)):
         raise _NoFingerprint
@@ -157,7 +156,7 @@ def _known(module: str) -> bool:
 
 
 def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """A value that a function refers to."""
+    """The parts of a value that a function refers to."""
     if isinstance(value, _PLAIN):
         yield f"{type(value).__name__} {value!r}"
     elif (type(value) is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
@@ -179,7 +178,7 @@ def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
 
 
 def _packaged(value: Any) -> bool:
-    """Whether a module, a function or a class is an installed package's, or Python's own."""
+    """Whether a module, function or class belongs to a known package or to Python."""
     if isinstance(value, types.ModuleType):
         return _known(value.__name__)
     if isinstance(value, types.BuiltinFunctionType):

@@ -1,39 +1,39 @@
-"""The kernels' subset of Python, written down in one place. `printer.py` prints it to LLVM IR.
+"""The kernels' subset of Python. `printer.py` prints it to LLVM IR.
 
-A kernel is a function of positional arguments. It runs as plain Python on NumPy arrays, too, with the same results to
+A kernel is a function of positional arguments. It also runs as plain Python on NumPy arrays, with the same results to
 rounding. What is not listed here is refused with file and line.
 
 Types
     float           float64. Arithmetic may be fused and reordered, but NaN and infinity keep their meaning.
     int             64 bits. An overflow is undefined.
-    bool            What comparisons give.
-    pointer         A C-ordered float64 array; the shape of its blocks a[0], a[1], ... is constant. With fewer indices
-                    than dimensions it is a pointer to a block.
+    bool            The result of comparisons.
+    pointer         A C-ordered float64 array; the shape of its blocks a[0], a[1], ... is constant. Fewer indices than
+                    dimensions give a pointer to a block.
     pointers        A tuple of vectors; its length is not part of the type.
-    rows, row       A structured array whose fields are float64, and one of its entries, as in `log[i].cost`.
+    struct array    A structured array whose fields are float64; its entries are structs, as in `log[i].cost`.
     tuple, record   Of any of these; records are the named tuples of `kernels/records.py`.
 
 Statements
-    assignments     To names, entries and fields, also several at once, chained and augmented. A name has one type; one
-                    that is an int here and a float there is a float.
-    control flow    if, for over range, while, break, continue, return, pass. A condition that is constant is decided
-                    when compiling, and the branch that is not taken is not looked at.
-    calls           Of other kernels, for what they write. No recursion, no keywords.
+    assignments     To names, entries and fields; also several at once, chained and augmented. A name has one type; one
+                    that gets ints and floats is a float.
+    control flow    if, for over range, while, break, continue, return, pass. A constant condition is decided when
+                    compiling, and the other branch is not compiled.
+    calls           Of other kernels. No recursion, no keywords.
 
 Expressions
     + - * / // %    As in Python, signs too. A division by zero gives infinity or NaN; // and % of ints give 0.
     **              Of any float; a whole exponent is best constant.
-    < <= == ...     Chained, too, where all parts are worked out; and, or, not of bools, and in conditions of ints;
-                    conditional expressions.
-    a[i, j]         Indices are ints, not negative; of a tuple, any int if its entries have one type.
+    < <= == ...     Chained, too; all parts are evaluated. and, or, not of bools, and of ints in conditions.
+                    Conditional expressions.
+    a[i, j]         Indices are nonnegative ints; of a tuple, any int if its entries have one type.
     min, max        Of two or more. abs, int, float, len of a tuple.
     math            The functions in `UNARY`, `BINARY` and `TESTS`, of which floor, ceil and trunc return floats; and
                     inf, nan, pi, e.
 
-Beside these there are the functions of `kernels/declarations.py`: `stack` for work arrays of constant shape, `call` and
-`call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, words that threads share,
-and `power_of_two`. An address is an int or a float64, which has all integers up to 2^53, beyond any address of a
-process. The decorators `inline`, `outline` and `exact` say how a kernel is compiled.
+Kernels may also use the functions of `kernels/declarations.py`: `stack` and `zeros` for work arrays of constant shape,
+`call` and `call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, atomic access to
+words that threads share, and `power_of_two`. An address is an int or a float64, which represents all integers up to
+2^53, beyond any address of a process. The decorators `inline`, `outline` and `exact` say how a kernel is compiled.
 """
 
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ MATH = (*UNARY, *BINARY, *SCALES, *TESTS, *CONSTANTS)
 
 
 class SubsetError(InputError):
-    """What is outside of the subset, with the place where it stands."""
+    """Code outside of the subset, and where it is."""
 
 
 @dataclass(frozen=True)
@@ -72,55 +72,55 @@ class Scalar:
 
 
 FLOAT, INT, BOOL = Scalar("float", "double"), Scalar("int", "i64"), Scalar("bool", "i1")
-INT32 = Scalar("32-bit int", "i32")  # only to call C functions with
+INT32 = Scalar("32-bit int", "i32")  # only for arguments of C functions
 
 
 @dataclass(frozen=True)
 class Pointer:
-    """To float64 blocks of the shape `block`: `()` for a vector, `(W,)` for a matrix with rows of W."""
+    """A pointer to float64 blocks of the shape `block`: `()` for a vector, `(W,)` for a matrix with rows of W."""
 
     block: tuple[int, ...] = ()
 
     def strides(self) -> list[int]:
-        """In entries, an index at a time."""
+        """The stride of each index, in entries."""
         return [int(np.prod(self.block[i:], dtype=int)) for i in range(len(self.block) + 1)]
 
 
 @dataclass(frozen=True)
 class Pointers:
-    """To the addresses of vectors."""
+    """A table of addresses of vectors."""
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Of a structured array."""
+class StructArray:
+    """A pointer to the structs of a structured array."""
 
     fields: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Row:
-    """One of these."""
+class Struct:
+    """An entry of a structured array."""
 
     fields: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Group:
-    """A tuple, or with names a record."""
+    """A tuple; a record if it has names."""
 
     members: tuple["Type", ...]
     record: str = ""
     fields: tuple[str, ...] = ()
 
 
-Type = Scalar | Pointer | Pointers | Rows | Row | Group
+Type = Scalar | Pointer | Pointers | StructArray | Struct | Group
 
 VECTOR = Pointer()
 
 
 def describe(kind: Type | None) -> str:
-    """As messages call a type."""
+    """How messages call a type."""
     match kind:
         case None:
             return "nothing"
@@ -130,30 +130,30 @@ def describe(kind: Type | None) -> str:
             return f"an array of {len(block) + 1} dimensions"
         case Pointers():
             return "a tuple of vectors"
-        case Rows():
-            return "rows"
-        case Row():
-            return "a row"
+        case StructArray():
+            return "a structured array"
+        case Struct():
+            return "a struct"
         case Group(record=record):
             return f"a {record}" if record else "a tuple"
 
 
-def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | Rows | Row]:
-    """A type with its tuples and records taken apart."""
+def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | StructArray | Struct]:
+    """The parts of a type that are no tuples or records."""
     if isinstance(kind, Group):
         return [one for member in kind.members for one in scalars(member)]
     return [kind]
 
 
 def llvm_type(kind: Type) -> str:
-    """What LLVM calls it."""
+    """LLVM's name of a type."""
     if isinstance(kind, Group):
         return "{" + ", ".join(llvm_type(member) for member in kind.members) + "}"
     return kind.llvm if isinstance(kind, Scalar) else "ptr"
 
 
 def join(one: Type, other: Type) -> Type | None:
-    """The type that both fit; None if there is none."""
+    """The type that holds values of both; None if there is none."""
     if one == other:
         return one
     if isinstance(one, Scalar) and isinstance(other, Scalar) and INT32 not in (one, other):
@@ -167,14 +167,10 @@ def join(one: Type, other: Type) -> Type | None:
 
 
 def type_of(argument: Any) -> Type:
-    """The type of what Python calls a kernel with.
-
-    Raises:
-      TypeError: it has none.
-    """
+    """The type of an argument from Python. Raises TypeError if it has none."""
     if isinstance(argument, np.ndarray):
         if argument.dtype.names:
-            return Rows(argument.dtype.names)
+            return StructArray(argument.dtype.names)
         return Pointer(argument.shape[1:])
     if isinstance(argument, (bool, np.bool_)):
         return BOOL
@@ -187,4 +183,4 @@ def type_of(argument: Any) -> Type:
         if hasattr(argument, "_fields"):
             return Group(members, type(argument).__name__, argument._fields)  # pyright: ignore[reportAttributeAccessIssue]
         return Pointers()
-    raise TypeError(f"{type(argument).__name__} is no argument of a kernel")
+    raise TypeError(f"got {type(argument).__name__}, want an array, a number or a tuple of these")

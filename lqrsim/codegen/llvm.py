@@ -1,4 +1,4 @@
-"""LLVM: from IR to machine code of this processor, and machine code into memory."""
+"""LLVM: compile IR to machine code for this processor, and load machine code into memory."""
 
 import ctypes
 import ctypes.util
@@ -9,7 +9,7 @@ from typing import Any
 
 from lqrsim.machine import instruction_set
 
-# What LLVM may make of loops over arrays and of its own functions, beside what kernels call.
+# Functions that LLVM may call for loops over arrays and for its intrinsics, besides those that kernels call.
 _IMPLIED = (
     "sin", "cos", "sincos", "exp", "exp2", "log", "log2", "log10", "pow", "fmod", "floor", "ceil", "trunc", "rint",
     "memcpy", "memset", "memmove",
@@ -37,12 +37,16 @@ def _machine() -> Any:
 
 
 def object_code(text: str) -> bytes:
-    """Machine code, as an object file, of IR."""
+    """Compile IR to an object file."""
     return _emitted(_binding().parse_assembly(text))
 
 
 def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[str]]:
-    """That of IR in which only the function `name` is seen from outside, as `symbol`; and what it needs of others."""
+    """Compile IR to an object file that exports only the function `name`, as `symbol`.
+
+    Returns:
+      The object file, and the names that it needs from elsewhere.
+    """
     module = _binding().parse_assembly(text)
     needed = []
     for part in (*module.functions, *module.global_variables):
@@ -56,7 +60,7 @@ def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[s
 
 
 def are_there(names: list[str]) -> bool:
-    """Whether functions and variables of these names can be found."""
+    """Whether LLVM finds functions or variables of all these names."""
     llvm = _binding()
     return all(llvm.address_of_symbol(name) for name in names)
 
@@ -73,13 +77,13 @@ def _emitted(module: Any) -> bytes:
 
 
 class Loaded:
-    """An object file in memory; it must be kept alive as long as its functions are called.
+    """An object file in memory; keep it alive as long as its functions are called.
 
     Args:
-      contents: the object file. libraries: the functions of C libraries that it calls.
+      contents: the object file. libraries: names of the C library functions that it calls.
 
     Raises:
-      RuntimeError: it is no object file of this processor, or a function is nowhere.
+      RuntimeError: it is no object file for this processor, or a function is not found.
     """
 
     def __init__(self, contents: bytes, libraries: tuple[str, ...]) -> None:
@@ -92,16 +96,16 @@ class Loaded:
             self._engine.finalize_object()
 
     def address(self, symbol: str) -> int:
-        """Where a function is. Raises RuntimeError if there is none of that name."""
+        """The address of a function. Raises RuntimeError if there is none of that name."""
         found = self._engine.get_function_address(symbol)
         if not found:
-            raise RuntimeError(f"{symbol} is not in the object file")
+            raise RuntimeError(f"the object file has no {symbol}")
         return found
 
 
 @cache
 def _provide(name: str) -> None:
-    """Have LLVM find a function of a C library, where it does not by itself."""
+    """Register a C library function with LLVM, unless LLVM finds it itself."""
     llvm = _binding()
     if llvm.address_of_symbol(name):
         return

@@ -1,8 +1,8 @@
-"""A numba function behind C's calling convention, kept on disk where its fingerprint tells what it does.
+"""A numba function as a C function, cached on disk if it has a fingerprint.
 
-numba compiles it once, to LLVM's IR. What is run, now and by later processes, is an object file of that in which all
-but the function itself is internal: numba counts its functions up within a process and names them by that, so that what
-two processes kept would have functions of the same name that do something else.
+numba compiles it once, to LLVM IR. An object file of that is cached, in which everything except the function itself is
+internal: numba numbers its functions within a process, so that files of two processes would have different functions of
+the same name.
 """
 
 import json
@@ -27,18 +27,22 @@ logger = logging.getLogger("lqrsim")
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _SYMBOL = "function"
 
-# What was loaded in this process, by what it does.
+# What was loaded in this process, by its key.
 _loaded: dict[str, tuple[Any, int]] = {}
 
 
 def compiled(
     function: Callable[..., Any], adapter: str, names: dict[str, Any], pointers: int, what: str
 ) -> tuple[Any, int]:
-    """What must be kept alive, and the address of a C function of so many pointers to float64.
+    """Compile a function to a C function of so many pointers to float64.
 
     Args:
-      function: numba's, or one that numba can compile. adapter: source of `adapter`, which calls it by the name
-        `function`. names: others that it uses, among them the named tuple `Parameters`. what: as messages call it.
+      function: a numba function, or one that numba can compile.
+      adapter: source of `adapter`, which calls it by the name `function`.
+      names: others that the adapter uses, among them the named tuple `Parameters`. what: how messages call it.
+
+    Returns:
+      What must be kept alive, and the address.
 
     Raises:
       InputError: numba is missing, or cannot compile it.
@@ -59,23 +63,23 @@ def compiled(
     found = _unpacked(kept) if kept is not None else None
     if found is None:
         note_helpers(function)
-        # Functions that it calls are as they were when numba first saw them: what was made of them is not kept then.
+        # numba compiled helpers with their globals of then: if these have changed, the result is not cached.
         lasting = bool(key) and not stale(function)
         compilations.append(what)
         logger.debug(f"compiling {what} ...")
         pointer = numba.types.CPointer(numba.types.float64)
         try:
-            # Compiled anew, for numba keeps the globals of a function as they were when it was first compiled.
+            # Compiled again, because numba freezes the globals of a function when it first compiles it.
             plain = getattr(function, "py_func", function)
             again = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
             namespace = names | _numba_names() | {"function": again, "nan": float("nan")}
             exec(compile(adapter, "<lqrsim>", "exec"), namespace)
             made: Any = numba.cfunc(numba.types.void(*[pointer] * pointers), **_OPTIONS)(namespace["adapter"])
-        except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
+        except Exception as error:  # mostly NumbaError, but numba raises others, too
             raise InputError(f"{what}: got code that numba cannot compile, want {_reason(error)}") from error
         found = made, made.address
         text = made.inspect_llvm()
-        if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address of this process
+        if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
             code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
             header = {"needed": needed, "code": sha256(code)}
             packed = json.dumps(header).encode() + b"\n" + code
@@ -87,25 +91,25 @@ def compiled(
 
 
 def _unpacked(kept: bytes) -> tuple[Any, int] | None:
-    """What was kept, in memory; None if it cannot be used."""
+    """Load a cached function; None if it cannot be used."""
     from numba.core import registry
 
     header, _, code = kept.partition(b"\n")
     try:
         known = json.loads(header)
-        # numba provides what its functions need of it when there is a target.
+        # Creating numba's target registers the functions of its runtime.
         if known["code"] != sha256(code) or not (registry.cpu_target.target_context and are_there(known["needed"])):
-            raise ValueError("it is not what was kept, or needs what is not there")
+            raise ValueError("its checksum does not fit, or it needs a function that is missing")
         loaded = Loaded(code, ())
         return loaded, loaded.address(_SYMBOL)
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
-        logger.debug(f"a compiled function in the cache could not be used ({error})")
+        logger.debug(f"a cached compiled function cannot be used ({error})")
         return None
 
 
 @cache
 def _numba_names() -> dict[str, Any]:
-    """What an adapter uses: `carray`, and `readonly`, which gives an array a type that refuses to be written to."""
+    """Functions that an adapter uses: `carray`, and `readonly`, which makes an array read-only."""
     from numba import carray  # pyright: ignore[reportPrivateImportUsage]
     from numba.extending import intrinsic
 
@@ -120,7 +124,7 @@ def _numba_names() -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """The line of numba's pages of explanation that says what is wrong."""
+    """The lines of numba's long error message that say what is wrong."""
     if isinstance(error, AttributeError) and "NoneType" in str(error):
         return "a function that returns on every path, and does not change x and u"
     if "readonly" in str(error) and "setitem" in str(error):

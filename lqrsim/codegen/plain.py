@@ -1,4 +1,4 @@
-"""Kernels as plain Python on NumPy arrays: for single evaluations, and to hold compiled code against."""
+"""Kernels as plain Python on NumPy arrays: for single evaluations, and as the reference for compiled code."""
 
 import ast
 import ctypes
@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.sources import PYTHON, Function, Record, Scope, Source, Word
+from lqrsim.codegen.sources import PYTHON, Record, Scope, ScopedFunction, Source, Word
 from lqrsim.errors import Array
 from lqrsim.kernels import records
 
-_LONG = 1 << 24  # entries that memory at an address is taken to have
+_LONG = 1 << 24  # assumed length of the memory at an address, in entries
 
-# Called with the name of each kernel, the kernel, and what it is given.
-Caller = Callable[[Function, Callable[..., Any], tuple[Any, ...]], Any]
+# Called with each kernel, its Python function, and its arguments.
+Caller = Callable[[ScopedFunction, Callable[..., Any], tuple[Any, ...]], Any]
 
 
 def plain_functions(
@@ -25,21 +25,24 @@ def plain_functions(
     functions: Sequence[Callable[..., None]] = (),
     caller: Caller | None = None,
 ) -> dict[str, Callable[..., Any]]:
-    """Functions of a source, run as plain Python, by name.
+    """Functions of a source as plain Python functions.
 
     Args:
       source: the kernels. sizes: as for a `Scope`. names: the functions.
-      functions: Python's own, which a kernel calls by their place here in place of an address.
-      caller: calls each kernel, if given: `caller(kernel, run, arguments)`.
+      functions: Python functions that kernels call by their index here, in place of an address.
+      caller: if given, calls each kernel: `caller(kernel, run, arguments)`.
+
+    Returns:
+      Name -> function.
     """
     scope, made = Scope(source, sizes), {}
     return {name: _run(scope.function(name), _words(functions), made, caller) for name in names}
 
 
 def _run(
-    function: Function, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
+    function: ScopedFunction, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
 ) -> Callable[..., Any]:
-    """The function of Python; `made` has those that there are already."""
+    """The Python function of a kernel; `made` has those that exist already."""
     key = id(function.scope), function.node.name
     if key in made:
         return made[key]
@@ -53,7 +56,7 @@ def _run(
         match function.scope.find(name):
             case None:
                 continue
-            case Function() as other:
+            case ScopedFunction() as other:
                 given[name] = _run(other, words, made, caller)
             case Record():
                 given[name] = getattr(records, name)
@@ -66,7 +69,7 @@ def _run(
 
 
 class _Plain(ast.NodeTransformer):
-    """Drops decorators and annotations, whose names are not at hand."""
+    """Removes decorators and annotations, whose names are not defined."""
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
         node.decorator_list, node.returns = [], None
@@ -76,8 +79,9 @@ class _Plain(ast.NodeTransformer):
 
 
 def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
-    """What the language has beside Python's own: NumPy's functions, and not those of math, which raise where compiled
-    code goes on with NaN or infinity.
+    """Words of the language that Python does not have.
+
+    Functions of math are NumPy's, because those of `math` raise where compiled code goes on with NaN or infinity.
     """
 
     def call(address: float, *arguments: Any) -> None:
@@ -97,7 +101,8 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
     words |= {"atan2": np.arctan2, "pow": np.power}
     words |= {name: _quietly(getattr(math, name)) for name in ("erf", "erfc", "gamma", "lgamma")}
     return words | {
-        "stack": lambda *shape: np.empty(shape), "call": call, "call_for_value": call_for_value,
+        "stack": lambda *shape: np.empty(shape), "zeros": lambda *shape: np.zeros(shape),
+        "call": call, "call_for_value": call_for_value,
         "at": lambda address: _memory(address, ctypes.c_double),
         "rows_at": lambda at, width: _memory(at, ctypes.c_double)[: _LONG // width * width].reshape(-1, width),
         "power_of_two": lambda exponent: np.exp2(min(max(exponent, -1022.0), 1023.0)),

@@ -1,10 +1,11 @@
-"""Kernels to LLVM IR: the subset that `language.py` writes down, printed function by function.
+"""Print kernels as LLVM IR; `language.py` defines their subset of Python.
 
-A function is printed once for each combination of types that it is called with. Records and tuples are taken apart, so
-that LLVM sees numbers and addresses; variables are slots on the stack, which it turns into registers.
+A function is printed once for each combination of argument types. Records and tuples are passed as their parts, so that
+LLVM sees numbers and addresses; variables are slots on the stack, which LLVM turns into registers.
 """
 
 import ast
+import itertools
 import math
 import operator
 import struct
@@ -25,8 +26,8 @@ from lqrsim.codegen.language import (
     Group,
     Pointer,
     Pointers,
-    Row,
-    Rows,
+    Struct,
+    StructArray,
     SubsetError,
     Type,
     describe,
@@ -34,16 +35,21 @@ from lqrsim.codegen.language import (
     llvm_type,
     scalars,
 )
-from lqrsim.codegen.sources import Constant, Function, Record, Scope, Word
+from lqrsim.codegen.sources import Constant, Record, Scope, ScopedFunction, Word
 
 FAST = "reassoc nsz arcp contract"  # lets LLVM fuse and reorder sums, but keeps NaN and infinity meaningful
-MOST_FACTORS = 64  # of a power with a constant exponent, which becomes a product
-MOST_ON_STACK = 1 << 20  # numbers in one work array: 8 MiB, which is all that a thread has
+MOST_FACTORS = 64  # largest constant exponent of a power that becomes a product
+MOST_ON_STACK = 1 << 20  # numbers in one work array: 8 MiB, the whole stack of a thread
 
 _COMPARISONS = {
     ast.Lt: ("lt", operator.lt), ast.LtE: ("le", operator.le), ast.Gt: ("gt", operator.gt),
     ast.GtE: ("ge", operator.ge), ast.Eq: ("eq", operator.eq), ast.NotEq: ("ne", operator.ne),
 }  # fmt: skip
+# Numbers of arguments of words that do not have one; those of `_MANY` are the least.
+_COUNTS = {
+    "min": 2, "max": 2, "rows_at": 2, "claim": 2, "load": 2, "store": 3, "fetch_add": 3, "stack": 1, "zeros": 1,
+}  # fmt: skip
+_MANY = ("min", "max", "stack", "zeros", "call", "call_for_value")
 _OPERATORS: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),
     ast.Div: ("div", operator.truediv), ast.FloorDiv: ("floordiv", operator.floordiv),
@@ -53,7 +59,7 @@ _OPERATORS: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
 
 @dataclass(frozen=True)
 class Value:
-    """What an expression gives: its type, and LLVM's name of it, or its parts; and what it is if that is constant."""
+    """The value of an expression: its type, LLVM's name of it or its parts, and the constant that it is, if it is."""
 
     type: Type
     name: str = ""
@@ -71,13 +77,13 @@ class Block:
 
 
 class _Retyped(Exception):
-    """A name, or what is returned, has turned out to be a float: the function is printed anew."""
+    """A variable or the result turned out to be a float: the function must be printed again."""
 
 
 class Program:
-    """LLVM IR of kernels with all that they call.
+    """LLVM IR of kernels and everything that they call.
 
-    `export` and `entry` add functions; `text` is the IR of all.
+    `export` and `entry` add functions; `text` is the IR.
     """
 
     def __init__(self) -> None:
@@ -95,18 +101,18 @@ class Program:
 
     @property
     def libraries(self) -> list[str]:
-        """The functions of C libraries that are called."""
+        """Names of the C library functions that are called."""
         return [name for name in self._declared if not name.startswith("llvm.")]
 
-    def instance(self, function: Function, types: tuple[Type, ...]) -> tuple[str, Type | None]:
-        """LLVM's name of a function for arguments of these types, and the type of what it returns."""
+    def instance(self, function: ScopedFunction, types: tuple[Type, ...]) -> tuple[str, Type | None]:
+        """LLVM's name of a function for arguments of these types, and the type of its result."""
         key = id(function.scope), function.node.name, types
         if key not in self._instances:
             if any(running[:2] == key[:2] for running in self._running):
                 raise SubsetError(f"{where(function, function.node)}: got a function that calls itself, want a loop")
             self._running.append(key)
             plain = function.node.name if function.node.name.isascii() else "function"
-            name = f"@{plain}.{len(self._instances) + len(self._running)}"  # as many as were begun
+            name = f"@{plain}.{len(self._instances) + len(self._running)}"  # unique: the number of functions begun
             try:
                 text, result = _print(self, function, types, name)
             except RecursionError:
@@ -117,30 +123,32 @@ class Program:
         return self._instances[key]
 
     def library(self, name: str, count: int) -> str:
-        """LLVM's name of a function of so many floats, of LLVM's own or of a C library."""
-        self._declared.setdefault(name, f"declare double @{name}({', '.join(['double'] * count)}) #0")
+        """LLVM's name of an intrinsic or a C library function of so many floats."""
+        return self.declare(name, "double", ", ".join(["double"] * count))
+
+    def declare(self, name: str, returns: str, arguments: str) -> str:
+        """Declare a function with LLVM's types; return LLVM's name of it."""
+        self._declared.setdefault(name, f"declare {returns} @{name}({arguments}) #0")
         return f"@{name}"
 
-    def export(self, function: Function, types: tuple[Type, ...], symbol: str) -> None:
-        """A C function of numbers and addresses under that name; records are taken apart."""
-        name, result = self.instance(function, types)
-        leaves = [one for kind in types for one in scalars(kind)]
-        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(leaves)]
-        kind = "void" if result is None else llvm_type(result)
-        call = f"call {kind} {name}({', '.join(given)})"
-        body = [f"  {call}", "  ret void"] if result is None else [f"  %r = {call}", f"  ret {kind} %r"]
+    def export(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> None:
+        """Add a C function of that name; records are passed as their parts."""
+        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(types))]
+        kind, call, _ = self._call_of(function, types)
+        body = [f"  {call}", "  ret void"] if kind == "void" else [f"  %r = {call}", f"  ret {kind} %r"]
         self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(given)}) #0 {{", *body, "}"]))
 
-    def entry(self, function: Function, types: tuple[Type, ...], symbol: str) -> Type | None:
-        """A C function of one address, at which are 8 bytes for each number and address among the arguments.
+    def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:
+        """Add a C function of one address, at which there are 8 bytes for each number and address of the arguments.
 
-        What it returns is written after these. Returns the type of that.
+        It writes its result after them. Returns the type of that.
         """
-        name, result = self.instance(function, types)
-        if result is not None and not {FLOAT, INT, BOOL}.issuperset(scalars(result)):
+        kind, call, result = self._call_of(function, types)
+        returned = scalars(result) if result is not None else []
+        if not {FLOAT, INT, BOOL}.issuperset(returned):
             raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
-        lines, given, place = [], [], 0
-        for one in (one for kind in types for one in scalars(kind)):
+        lines, parts = [], _parts_of(types)
+        for place, one in enumerate(parts):
             loaded = "i64" if one is BOOL else llvm_type(one)
             lines += [
                 f"  %p{place} = getelementptr inbounds i64, ptr %words, i64 {place}",
@@ -148,12 +156,8 @@ class Program:
             ]
             if one is BOOL:
                 lines.append(f"  %a{place} = trunc i64 %w{place} to i1")
-            given.append(f"{llvm_type(one)} %a{place}")
-            place += 1
-        kind = "void" if result is None else llvm_type(result)
-        call = f"call {kind} {name}({', '.join(given)})"
         lines.append(f"  {call}" if result is None else f"  %r = {call}")
-        for i, one in enumerate(scalars(result) if result is not None else ()):
+        for i, one in enumerate(returned):
             part = "%r"
             if isinstance(result, Group):
                 lines.append(f"  %o{i} = extractvalue {kind} %r, {i}")
@@ -161,21 +165,27 @@ class Program:
             if one is BOOL:
                 lines.append(f"  %z{i} = zext i1 {part} to i64")
                 part = f"%z{i}"
-            stored = "i64" if one is BOOL else llvm_type(one)
             lines += [
-                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}",
-                f"  store {stored} {part}, ptr %q{i}",
+                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {len(parts) + i}",
+                f"  store {'i64' if one is BOOL else llvm_type(one)} {part}, ptr %q{i}",
             ]
         self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
         return result
 
+    def _call_of(self, function: ScopedFunction, types: tuple[Type, ...]) -> tuple[str, str, Type | None]:
+        """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
+        name, result = self.instance(function, types)
+        kind = "void" if result is None else llvm_type(result)
+        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(types)))
+        return kind, f"call {kind} {name}({given})", result
 
-def where(function: Function, node: ast.AST) -> str:
-    """The place of a node, for messages."""
+
+def where(function: ScopedFunction, node: ast.AST) -> str:
+    """Where a node is, for messages."""
     return f"{function.scope.source.what}: {function.node.name}, line {getattr(node, 'lineno', 0)}"
 
 
-def _print(program: Program, function: Function, types: tuple[Type, ...], name: str) -> tuple[str, Type | None]:
+def _print(program: Program, function: ScopedFunction, types: tuple[Type, ...], name: str) -> tuple[str, Type | None]:
     widened: dict[str, Type] = {}
     result: Type | None = None
     while True:
@@ -191,11 +201,12 @@ def _print(program: Program, function: Function, types: tuple[Type, ...], name: 
 class _Body:
     """One function, printed for arguments of certain types.
 
-    `widened` has the types that names turned out to have; `result` the type that is returned, as far as it is known.
+    Args:
+      widened: names that turned out to be floats, and their types. result: the type of the result, as far as known.
     """
 
     def __init__(
-        self, program: Program, function: Function, types: tuple[Type, ...], widened: dict[str, Type],
+        self, program: Program, function: ScopedFunction, types: tuple[Type, ...], widened: dict[str, Type],
         result: Type | None,
     ) -> None:  # fmt: skip
         self.program, self.function, self.widened, self.result = program, function, widened, result
@@ -205,15 +216,16 @@ class _Body:
         self._slots: list[str] = []
         self._names: dict[str, tuple[Type, Any]] = {}
         self._loops: list[tuple[str, str]] = []
-        self._left: set[str] = set()  # the ends of loops that a break leads to
-        self._own: set[str] = set()  # the names of what may be, or have, work arrays of its own
-        self._local = {one.arg for one in function.node.args.args}  # names, whatever they mean elsewhere
+        self._left: set[str] = set()  # ends of loops that a break reaches
+        self._own: set[str] = set()  # variables that may be or hold work arrays of this function
+        self._local = {one.arg for one in function.node.args.args}  # local names
         for one in ast.walk(function.node):
             if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store):
                 self._local.add(one.id)
-        self._blocks: list[Block] = [Block("body", [])]
+        self._now = Block("body", [])  # the block that is printed
+        self._blocks = [self._now]
         self._fast = "contract" if "exact" in function.decorators else FAST
-        self._empty = False  # whether it returns nothing somewhere
+        self._empty = False  # whether some path returns nothing
 
     # Lines and blocks.
 
@@ -226,11 +238,9 @@ class _Body:
             self._refuse(self.function.node, "arguments with defaults, * or **", "positional ones")
         if len(arguments.args) != len(self.types):
             self._refuse(self.function.node, f"{len(self.types)} arguments", str(len(arguments.args)))
-        place = 0
+        names = (f"%a{i}" for i in itertools.count())
         for one, kind in zip(arguments.args, self.types, strict=True):
-            parts = scalars(kind)
-            self._store(one.arg, _assemble(kind, iter([f"%a{place + i}" for i in range(len(parts))])), one)
-            place += len(parts)
+            self._store(one.arg, _assemble(kind, names), one)
         self._block(self.function.node.body)
         if not self._now.ended:
             if self.result is not None:
@@ -241,8 +251,7 @@ class _Body:
 
     def text(self, name: str) -> str:
         """The IR."""
-        leaves = [one for kind in self.types for one in scalars(kind)]
-        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(leaves))
+        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(self.types)))
         kind = "void" if self.result is None else llvm_type(self.result)
         decorators = self.function.decorators
         attributes = "#1" if "inline" in decorators else "#2" if "outline" in decorators else "#0"
@@ -250,10 +259,6 @@ class _Body:
         for block in self._blocks:
             lines += [f"{block.label}:", *block.lines]
         return "\n".join([*lines, "}"])
-
-    @property
-    def _now(self) -> Block:
-        return self._blocks[-1]
 
     def _fresh(self) -> str:
         self._count += 1
@@ -277,7 +282,8 @@ class _Body:
             self._now.ended = True
 
     def _begin(self, label: str) -> None:
-        self._blocks.append(Block(label, []))
+        self._now = Block(label, [])
+        self._blocks.append(self._now)
 
     def _branch(self, condition: Value, yes: str, no: str) -> None:
         self._end(f"br i1 {condition.name}, label %{yes}, label %{no}")
@@ -390,9 +396,9 @@ class _Body:
             self._assign(target, value)
 
     def _has_own(self, value: Value, node: ast.expr) -> bool:
-        """Whether a value may be, or have, a work array of this function, which is no more when it returns."""
+        """Whether a value may be or hold a work array of this function, which ends when the function returns."""
         names = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
-        return ("stack" in names or bool(names & self._own)) and any(
+        return bool(names & ({"stack", "zeros"} | self._own)) and any(
             isinstance(one, Pointer | Pointers) for one in scalars(value.type)
         )
 
@@ -424,22 +430,22 @@ class _Body:
                 address = self._address(target)
                 self._do(f"store double {self._float(value, target)}, ptr {address}")
             case _:
-                self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a row")
+                self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a struct")
 
     def _address(self, target: ast.expr) -> str:
-        """Where an entry of an array or a field of a row is."""
+        """The address of an entry of an array or a field of a struct."""
         if isinstance(target, ast.Subscript):
             found = self._entry(self._expression(target.value), target)
             if isinstance(found, str):
                 return found
         elif isinstance(target, ast.Attribute):
             row = self._expression(target.value)
-            if isinstance(row.type, Row) and target.attr in row.type.fields:
+            if isinstance(row.type, Struct) and target.attr in row.type.fields:
                 return self._field(row, row.type.fields.index(target.attr))
-        self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a row")
+        self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a struct")
 
     def _field(self, row: Value, place: int) -> str:
-        """Where a field of a row is."""
+        """The address of a field of a struct."""
         return self._emit(f"getelementptr inbounds double, ptr {row.name}, i64 {place}")
 
     def _statement_Return(self, node: ast.Return) -> None:
@@ -549,7 +555,7 @@ class _Body:
         self._end(f"br label %{self._loop(node)[0]}")
 
     def _loop(self, node: ast.stmt) -> tuple[str, str]:
-        """Where the loop around a statement goes on, and where it ends."""
+        """The labels where the loop around a statement continues, and where it ends."""
         if not self._loops:
             self._refuse(node, f"`{ast.unparse(node)}` outside of a loop", "a loop around it")
         return self._loops[-1]
@@ -577,10 +583,10 @@ class _Body:
             return self._get(*self._names[node.id])
         found = self.scope.find(node.id)
         if node.id in self._local:
-            self._refuse(node, f"the name {node.id}, which has no value yet", "one that has")
+            self._refuse(node, f"the name {node.id}, which has no value yet", "a value assigned before")
         if found is None:
-            self._refuse(node, f"the name {node.id}, which nothing has", "one that is defined")
-        if isinstance(found, Function | Word | Record):
+            self._refuse(node, f"the name {node.id}, which is not defined", "a defined one")
+        if isinstance(found, ScopedFunction | Word | Record):
             self._refuse(node, f"the function {node.id} as a value", "a call of it")
         return _constant(found)
 
@@ -589,11 +595,11 @@ class _Body:
 
     def _expression_Attribute(self, node: ast.Attribute) -> Value:
         value = self._expression(node.value)
-        fields = value.type.fields if isinstance(value.type, Group | Row) else ()
+        fields = value.type.fields if isinstance(value.type, Group | Struct) else ()
         if node.attr not in fields:
             self._refuse(node, f".{node.attr} of {describe(value.type)}", f"one of: {', '.join(fields) or '(none)'}")
         place = fields.index(node.attr)
-        if isinstance(value.type, Row):
+        if isinstance(value.type, Struct):
             return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
         return value.parts[place]
 
@@ -602,7 +608,7 @@ class _Body:
         return Value(FLOAT, self._emit(f"load double, ptr {found}")) if isinstance(found, str) else found
 
     def _entry(self, base: Value, node: ast.Subscript) -> Value | str:
-        """The part of a value at an index; of an array's entry, where it is."""
+        """The part of a value at an index; the address of an array's entry."""
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         values = [self._expression(one) for one in indices]
         if any(isinstance(one.constant, int) and one.constant < 0 for one in values):
@@ -621,9 +627,9 @@ class _Body:
             case Pointers() if len(values) == 1:
                 address = self._emit(f"getelementptr inbounds ptr, ptr {base.name}, i64 {self._int(values[0], node)}")
                 return Value(VECTOR, self._emit(f"load ptr, ptr {address}"))
-            case Rows(fields=fields) if len(values) == 1:
+            case StructArray(fields=fields) if len(values) == 1:
                 place = self._emit(f"mul nsw i64 {self._int(values[0], node)}, {len(fields)}")
-                return Value(Row(fields), self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {place}"))
+                return Value(Struct(fields), self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {place}"))
             case Group() if len(values) == 1:
                 return self._member(base, values[0], node)
         self._refuse(node, f"{len(values)} indices of {describe(base.type)}", "as many as it has")
@@ -632,7 +638,7 @@ class _Body:
         """The entry of a tuple."""
         if isinstance(index.constant, int):
             if index.constant >= len(group.parts):
-                self._refuse(node, f"entry {index.constant} of {len(group.parts)}", "one that there is")
+                self._refuse(node, f"entry {index.constant} of {len(group.parts)}", "a smaller one")
             return group.parts[index.constant]
         kinds = {part.type for part in group.parts}
         if len(kinds) != 1 or isinstance((kind := kinds.pop()), Group):
@@ -675,7 +681,7 @@ class _Body:
         if _is_number(left.constant) and _is_number(right.constant) and not large:
             try:
                 return self._number(plainly(left.constant, right.constant), node)
-            except (ArithmeticError, TypeError):  # a division by zero and the like: as the processor does it
+            except (ArithmeticError, TypeError):  # a division by zero and the like: left to the processor
                 pass
         if name == "pow":
             return self._power(left, right, node)
@@ -700,7 +706,7 @@ class _Body:
         """Arithmetic of ints."""
         if name in ("add", "sub", "mul"):
             return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
-        none = self._emit(f"icmp eq i64 {b}, 0")  # which would end the process
+        none = self._emit(f"icmp eq i64 {b}, 0")  # a division by zero would end the process
         a, b = self._emit(f"select i1 {none}, i64 0, i64 {a}"), self._emit(f"select i1 {none}, i64 1, i64 {b}")
         quotient, rest = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
         # Python rounds down, the processor towards zero.
@@ -760,7 +766,7 @@ class _Body:
         return self._decide(node, of_bools=True)
 
     def _decide(self, node: ast.BoolOp, of_bools: bool = False) -> Value:
-        """One after the other, until one decides. As a value, rather than a condition, that is a bool only of bools."""
+        """Evaluate operands until one decides; `of_bools` refuses others, which are conditions but no values."""
         decides = isinstance(node.op, ast.Or)
         end, slot, pending = self._label(), "", False
         for i, one in enumerate(node.values):
@@ -793,18 +799,14 @@ class _Body:
         found = []
         for label, branch in ((yes, node.body), (no, node.orelse)):
             self._begin(label)
-            found.append((self._expression(branch), len(self._blocks) - 1))
+            found.append((self._expression(branch), self._now))
         kind = join(found[0][0].type, found[1][0].type)
         if kind is None:
             self._refuse(node, f"{describe(found[0][0].type)} or {describe(found[1][0].type)}", "one type")
         slots = self._slots_of(kind)
-        last = self._blocks[found[0][1] + 1 :]  # the second branch waits, for its blocks come after the first one's end
-        del self._blocks[found[0][1] + 1 :]
-        self._put(slots, self._cast(found[0][0], kind, node))
-        self._end(f"br label %{end}")
-        self._blocks += last
-        self._put(slots, self._cast(found[1][0], kind, node))
-        self._end(f"br label %{end}")
+        for value, self._now in found:  # the type that both fit is known only now
+            self._put(slots, self._cast(value, kind, node))
+            self._end(f"br label %{end}")
         self._begin(end)
         return self._get(kind, slots)
 
@@ -823,7 +825,7 @@ class _Body:
         found = self.scope.find(name) if name not in self._local else None
         given = [self._expression(one) for one in node.args]
         match found:
-            case Function():
+            case ScopedFunction():
                 return self._call_kernel(found, given, node)
             case Record(name=record, fields=fields):
                 if len(given) != len(fields):
@@ -831,9 +833,9 @@ class _Body:
                 return Value(Group(tuple(one.type for one in given), record, fields), parts=tuple(given))
             case Word():
                 return self._call_word(found.name, given, node)
-        self._refuse(node, f"a call of {name}", "a kernel, a record, or what `codegen/language.py` lists")
+        self._refuse(node, f"a call of {name}", "a kernel, a record or a word of `codegen/language.py`")
 
-    def _call_kernel(self, function: Function, given: list[Value], node: ast.Call) -> Value | None:
+    def _call_kernel(self, function: ScopedFunction, given: list[Value], node: ast.Call) -> Value | None:
         count = len(function.node.args.args)
         if len(given) != count:
             self._refuse(node, f"{len(given)} arguments for {function.node.name}", str(count))
@@ -850,37 +852,31 @@ class _Body:
         return _assemble(result, iter(parts))
 
     def _call_word(self, name: str, given: list[Value], node: ast.Call) -> Value | None:
-        method = getattr(self, f"_word_{name}", None)
+        method, count = getattr(self, f"_word_{name}", None), _COUNTS.get(name, 2 if name in BINARY else 1)
+        if name in _MANY and len(given) < count:
+            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", f"{count} or more")
+        if name not in _MANY and len(given) != count:
+            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", str(count))
         if method is not None:
             return method(given, node)
         if name in UNARY or name in BINARY:
-            count = 1 if name in UNARY else 2
-            self._expect(given, count, count, node)
             library = UNARY.get(name) or BINARY[name]
             function = self.program.library(library, count)
             numbers = ", ".join(f"double {self._float(one, node)}" for one in given)
             fast = f" {self._fast}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
             return Value(FLOAT, self._emit(f"call{fast} double {function}({numbers})"))
         if name in SCALES:
-            self._expect(given, 1, 1, node)
             return self._arithmetic(ast.Mult(), given[0], _constant(float(SCALES[name])), node)
         if name in TESTS:
-            self._expect(given, 1, 1, node)
             number = self._float(given[0], node)
             if name == "isnan":
                 return Value(BOOL, self._emit(f"fcmp uno double {number}, {number}"))
             size = self._emit(f"call double {self.program.library('llvm.fabs.f64', 1)}(double {number})")
             test = "oeq" if name == "isinf" else "olt"
             return Value(BOOL, self._emit(f"fcmp {test} double {size}, {_hex(float('inf'))}"))
-        self._refuse(node, f"a call of {name}", "what `codegen/language.py` lists")
-
-    def _expect(self, given: list[Value], least: int, most: int, node: ast.AST) -> None:
-        if not least <= len(given) <= most:
-            wanted = str(least) if least == most else f"{least} or more"
-            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", wanted)
+        self._refuse(node, f"a call of {name}", "a word of `codegen/language.py`")
 
     def _extreme(self, given: list[Value], node: ast.AST, op: ast.cmpop, plainly: Callable[..., Any]) -> Value:
-        self._expect(given, 2, 1000, node)
         total = given[0]
         for other in given[1:]:
             if _is_number(total.constant) and _is_number(other.constant):
@@ -902,7 +898,6 @@ class _Body:
         return self._extreme(given, node, ast.Gt(), max)
 
     def _word_abs(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         if given[0].type in (INT, BOOL):
             number = self._int(given[0], node)
             negative = self._emit(f"icmp slt i64 {number}, 0")
@@ -912,17 +907,14 @@ class _Body:
         return Value(FLOAT, self._emit(f"call double {function}(double {self._float(given[0], node)})"))
 
     def _word_int(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         if given[0].type is FLOAT:
             return Value(INT, self._emit(f"fptosi double {given[0].name} to i64"))
         return Value(INT, self._int(given[0], node))
 
     def _word_float(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         return Value(FLOAT, self._float(given[0], node))
 
     def _word_len(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         if not isinstance(given[0].type, Group):
             self._refuse(node, f"the length of {describe(given[0].type)}", "that of a tuple")
         return _constant(len(given[0].parts))
@@ -936,6 +928,13 @@ class _Body:
             self._refuse(node, f"`{ast.unparse(node)}`", f"at most {MOST_ON_STACK} numbers")
         return Value(Pointer(tuple(shape[1:])), self._slot(f"[{max(total, 1)} x double]", 64))
 
+    def _word_zeros(self, given: list[Value], node: ast.Call) -> Value:
+        value = self._word_stack(given, node)
+        size = 8 * math.prod(one.constant for one in given)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        memset = self.program.declare("llvm.memset.p0.i64", "void", "ptr, i8, i64, i1")
+        self._do(f"call void {memset}(ptr align 64 {value.name}, i8 0, i64 {size}, i1 false)")
+        return value
+
     def _pointer(self, address: Value, node: ast.AST) -> str:
         if address.type not in (FLOAT, INT):
             self._refuse(node, describe(address.type), "an address")
@@ -945,28 +944,23 @@ class _Body:
         return self._emit(f"inttoptr i64 {number} to ptr")
 
     def _word_at(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         return Value(VECTOR, self._pointer(given[0], node))
 
     def _word_rows_at(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 2, 2, node)
         if not isinstance(given[1].constant, int) or given[1].constant < 1:
             self._refuse(node, "a width that is not constant", "a constant one, of at least 1")
         return Value(Pointer((given[1].constant,)), self._pointer(given[0], node))
 
     def _word_int32(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
         return Value(INT32, self._emit(f"trunc i64 {self._int(given[0], node)} to i32"))
 
     def _word_power_of_two(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 1, 1, node)
-        # Added to 1.5 2^52, it stands in the last bits of the sum; moved up by 52 bits, it is the exponent.
+        # Added to 1.5 2^52, the exponent is in the lowest bits of the sum; shifted by 52 bits, it is in its place.
         biased = self._emit(f"fadd double {self._float(given[0], node)}, {_hex(1.5 * 2.0**52 + 1023)}")
         bits = self._emit(f"shl i64 {self._emit(f'bitcast double {biased} to i64')}, 52")
         return Value(FLOAT, self._emit(f"bitcast i64 {bits} to double"))
 
     def _c_call(self, kind: str, given: list[Value], node: ast.AST) -> str:
-        self._expect(given, 1, 1000, node)
         function = self._pointer(given[0], node)
         parts = [part for one in given[1:] for part in _leaves(one)]
         parts = [self._cast(part, INT, node) if part.type is BOOL else part for part in parts]
@@ -979,33 +973,29 @@ class _Body:
         return Value(FLOAT, self._emit(self._c_call("double", given, node)))
 
     def _shared(self, given: list[Value], node: ast.AST) -> str:
-        """The address of one of the int64 that threads share."""
+        """The address of an int64 that threads share."""
         words, index = self._pointer(given[0], node), self._int(given[1], node)
         return self._emit(f"getelementptr inbounds i64, ptr {words}, i64 {index}")
 
     def _word_claim(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 2, 2, node)
         outcome = self._emit(f"cmpxchg ptr {self._shared(given, node)}, i64 0, i64 1 acq_rel acquire")
         won = self._emit(f"extractvalue {{i64, i1}} {outcome}, 1")
         return Value(INT, self._emit(f"zext i1 {won} to i64"))
 
     def _word_load(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 2, 2, node)
         return Value(INT, self._emit(f"load atomic i64, ptr {self._shared(given, node)} acquire, align 8"))
 
     def _word_store(self, given: list[Value], node: ast.AST) -> None:
-        self._expect(given, 3, 3, node)
         number = self._int(given[2], node)
         self._do(f"store atomic i64 {number}, ptr {self._shared(given, node)} release, align 8")
 
     def _word_fetch_add(self, given: list[Value], node: ast.AST) -> Value:
-        self._expect(given, 3, 3, node)
         number = self._int(given[2], node)
         return Value(INT, self._emit(f"atomicrmw add ptr {self._shared(given, node)}, i64 {number} acq_rel"))
 
 
 def _hex(number: float) -> str:
-    """A float64 as LLVM reads it, to the last bit."""
+    """A float64 as an exact literal of LLVM."""
     return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
 
 
@@ -1029,6 +1019,10 @@ def _group(parts: list[Value]) -> Value:
     return Value(Group(tuple(part.type for part in parts)), parts=tuple(parts), constant=constant)
 
 
+def _parts_of(types: tuple[Type, ...]) -> list[Type]:
+    return [one for kind in types for one in scalars(kind)]
+
+
 def _leaves(value: Value) -> list[Value]:
     if isinstance(value.type, Group):
         return [leaf for part in value.parts for leaf in _leaves(part)]
@@ -1036,7 +1030,7 @@ def _leaves(value: Value) -> list[Value]:
 
 
 def _assemble(kind: Type, names: Any) -> Value:
-    """A value of that type, of LLVM's names of its scalars."""
+    """A value of a type, from LLVM's names of its parts."""
     if isinstance(kind, Group):
         return Value(kind, parts=tuple(_assemble(member, names) for member in kind.members))
     return Value(kind, next(names))

@@ -1,8 +1,8 @@
 """Functions in the kernels' subset, and what the names in them mean.
 
-A `Source` is a module of `lqrsim/kernels` or a text. What it leaves open is filled in by name: constants, such as which
-states are the position, and functions, such as the places of balls. Nothing is joined or renamed: a `Scope` tells of
-each name in a source what it is, to who prints it (`printer.py`) and to who runs it as plain Python (`plain.py`).
+A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as which states are
+the position, and functions, such as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
+a source, for the printer to LLVM IR (`printer.py`) and for plain Python (`plain.py`).
 """
 
 import ast
@@ -21,9 +21,9 @@ from lqrsim.errors import InputError, check_kind, excerpt
 from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
 from lqrsim.results.hashing import sha256
 
-# What kernels declare and the language has.
+# Words of the language, as `declarations.py` declares them.
 WORDS = (
-    "stack", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
+    "stack", "zeros", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
     "power_of_two", "inline", "outline", "exact",
 )  # fmt: skip
 PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
@@ -36,10 +36,10 @@ class Source:
     """Functions in the kernels' subset; `source_of` and `text_source` make it.
 
     Attributes:
-      module: the name of a module in `lqrsim/kernels`; empty for a text. text: what is defined beside that.
-      constants: name -> number or tuple of numbers, for what the module declares.
-      fills: (name, source, name there) of functions that are only declared.
-      what: as messages call it.
+      module: name of a module in `lqrsim/kernels`; empty for a text. text: defines functions.
+      constants: (name, number or tuple of numbers), which replace the module's.
+      fills: (name, source, name there) of functions that the module or its imports declare, or that replace theirs.
+      what: how messages call it.
     """
 
     module: str = ""
@@ -57,13 +57,13 @@ class Source:
 
     @functools.cached_property
     def digest(self) -> str:
-        """A hash of all that it is made of."""
+        """A hash of everything that defines it."""
         filled = (f"{name}={source.digest}.{there}" for name, source, there in self.fills)
         own = _module_text(self.module) if self.module else ""
         return sha256(self.module, own, self.text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
-        """The same with functions for what it leaves open, from sources that have them by that or another name."""
+        """This source with functions filled in: name -> source, or (source, name there)."""
         pairs = {name: one if isinstance(one, tuple) else (one, name) for name, one in fills.items()}
         kept = tuple(fill for fill in self.fills if fill[0] not in pairs)
         return Source(
@@ -71,8 +71,8 @@ class Source:
         )
 
     def has(self, name: str) -> bool:
-        """Whether it has a function of that name, of its own or filled in."""
-        return isinstance(Scope(self, {}).find(name), Function)
+        """Whether it has a function of that name, its own or filled in."""
+        return isinstance(Scope(self, {}).find(name), ScopedFunction)
 
 
 def source_of(module: ModuleType, **constants: Constant) -> Source:
@@ -80,7 +80,7 @@ def source_of(module: ModuleType, **constants: Constant) -> Source:
 
     Args:
       module: of the kernels.
-      **constants: numbers and tuples of numbers for names that the module declares.
+      **constants: numbers and tuples of numbers, in place of the module's.
 
     Raises:
       AttributeError: the module declares no such constant.
@@ -91,14 +91,20 @@ def source_of(module: ModuleType, **constants: Constant) -> Source:
 
 
 def text_source(text: str, what: str = "source") -> Source:
-    """A text that defines functions: a formula's, or a user's own."""
+    """The functions that a text defines: a traced formula, or a user's own."""
     return Source(text=text, what=what)
 
 
 def check_source(field: str, source: object, functions: Mapping[str, int]) -> Source:
-    """The Source, of a text or as it is. Raises InputError unless it defines these functions, of so many arguments.
+    """The Source of a text, or the one given.
 
-    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
+    Functions of math are named without a module in it: cos, not math.cos or np.cos.
+
+    Args:
+      field: how messages call it. source: text or Source. functions: name -> number of arguments, which it must define.
+
+    Raises:
+      InputError: it is neither, or does not define the functions.
     """
     if isinstance(source, Source):
         return source
@@ -110,44 +116,44 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
     return text_source(str(source), f"{field}: source")
 
 
-@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+@functools.lru_cache(maxsize=256)  # a problem that is stated repeatedly has the same sources
 def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
-    """What is wrong with a source; see `check_source`."""
+    """What is wrong with a text, as a message; empty if nothing is."""
     try:
         tree = ast.parse(source)
-    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
-        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
+    except Exception as error:  # SyntaxError, or others for deep nesting, null characters and the like
+        return f"got {excerpt(source)}, which is not valid Python ({error}), want function definitions"
     defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     for name, count in functions:
         found = defined.get(name)
         if found is None:
-            return f"got {excerpt(source)}, want it to define {name}(...)"
+            return f"got {excerpt(source)}, which does not define {name}(...), want it to"
         if len(found.args.args) != count:
-            return f"got {name} of {len(found.args.args)} arguments, want {count}"
+            return f"got {name}(...) with {len(found.args.args)} arguments, want {count}"
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
+            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like need none"
         if isinstance(node, ast.Attribute):
-            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
+            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}, without a module"
     return ""
 
 
 @dataclass(frozen=True)
-class Function:
-    """A function, and the scope in which its names mean something."""
+class ScopedFunction:
+    """A function, and the scope that resolves its names."""
 
     scope: "Scope"
     node: ast.FunctionDef
 
     @property
     def decorators(self) -> set[str]:
-        """Among them `inline`, for what is to become part of its callers, or `outline`, for what is not to."""
+        """Their names: `inline`, `outline`, `exact`."""
         return {one.id for one in self.node.decorator_list if isinstance(one, ast.Name)}
 
 
 @dataclass(frozen=True)
 class Word:
-    """What the language itself has by that name: of `declarations.py`, of `math`, or of Python."""
+    """A word of the language: of `declarations.py`, `math` or Python."""
 
     name: str
 
@@ -160,22 +166,22 @@ class Record:
     fields: tuple[str, ...]
 
 
-Meaning = Function | Word | Record | Constant
+Meaning = ScopedFunction | Word | Record | Constant
 
 
 @dataclass(frozen=True)
 class _Parsed:
-    """A module or a text, read."""
+    """A parsed module or text."""
 
     functions: dict[str, ast.FunctionDef]
     imports: dict[str, tuple[str, str]]  # name here -> module, name there
 
 
 class Scope:
-    """What the names in one source mean, for one set of sizes.
+    """The meaning of each name in a source, for one set of sizes.
 
     Args:
-      source: the functions. sizes: name -> number, of what `declarations.py` declares: N, M, W and so on.
+      source: the functions. sizes: name -> number, of the sizes in `declarations.py`: N, M, W and so on.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
@@ -188,7 +194,7 @@ class Scope:
         self._found: dict[str, Meaning] = {}
 
     def find(self, name: str) -> Meaning | None:
-        """What a name means; None if nothing."""
+        """The meaning of a name; None if it is not defined."""
         if name not in self._found:
             found = self._find(name)
             if found is None:
@@ -196,11 +202,11 @@ class Scope:
             self._found[name] = found
         return self._found[name]
 
-    def function(self, name: str) -> Function:
+    def function(self, name: str) -> ScopedFunction:
         """The function of that name. Raises SubsetError if there is none."""
         found = self.find(name)
-        if not isinstance(found, Function):
-            raise SubsetError(f"{self.source.what}: got no function {name}, want one")
+        if not isinstance(found, ScopedFunction):
+            raise SubsetError(f"{self.source.what}: got no function {name}, want it defined")
         return found
 
     def _find(self, name: str) -> Meaning | None:
@@ -210,7 +216,7 @@ class Scope:
             source, there = self._fills[name]
             return self._scope_of(source).function(there)
         if name in self._functions:
-            return Function(self, self._functions[name])
+            return ScopedFunction(self, self._functions[name])
         if name in self._imports:
             return self._imported(*self._imports[name])
         if self.source.module:
@@ -231,7 +237,7 @@ class Scope:
         return self._module(module).find(name) if module.startswith(f"{kernels.__name__}.") else None
 
     def _declared(self, name: str) -> Meaning | None:
-        """What `declarations.py` declares: a size, a number with a name, a word of the language, or what is filled."""
+        """The meaning of a name in `declarations.py`: a size, a word, a function filled in, or a constant."""
         if name in self.sizes:
             return self.sizes[name]
         if name in WORDS:
@@ -243,7 +249,7 @@ class Scope:
         return value if _is_constant(value) else None
 
     def _at_hand(self, name: str) -> Meaning | None:
-        """What a text can use without importing it."""
+        """The meaning of a name that a text can use without importing it."""
         if name in MATH:
             return self._imported("math", name)
         for module in (rotation_ratios, signed_distance, linear_algebra):
@@ -252,14 +258,14 @@ class Scope:
         return self._declared(name)
 
     def _module(self, module: str) -> "Scope":
-        """Another module of the kernels; what is filled in here is filled in there, as far as it is asked for."""
+        """The scope of another module of the kernels, with this source's fills as far as it leaves their names open."""
         fills = tuple(fill for fill in self.source.fills if fill[0] in _left_open(module))
         return self._scope_of(Source(module, fills=fills, what=module))
 
     def _scope_of(self, source: Source) -> "Scope":
         if source not in self._scopes:
             made = Scope(source, self.sizes)
-            made._scopes = self._scopes  # one scope a source in all of a program
+            made._scopes = self._scopes  # one scope per source in a program
             self._scopes[source] = made
         return self._scopes[source]
 
@@ -292,7 +298,7 @@ def _parsed_text(text: str) -> _Parsed:
 
 @functools.cache
 def _left_open(module: str) -> frozenset[str]:
-    """The names that may be filled in for a module: what it and those that it imports declare, and its functions."""
+    """The names that can be filled in for a module: its functions, and the declarations that it and its imports use."""
     parsed = _parsed_module(module)
     declared = {name for home, name in parsed.imports.values() if home == declarations.__name__}
     others = {home for home, _ in parsed.imports.values() if home not in _WITHOUT_FUNCTIONS}
@@ -306,8 +312,13 @@ def _parse(text: str) -> _Parsed:
     functions, imports = {}, {}
     try:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # of nesting, null characters and the like
-        raise SubsetError(f"got {excerpt(text)}, which is no Python ({error}), want functions") from None
+    except (
+        SyntaxError,
+        ValueError,
+        RecursionError,
+        MemoryError,
+    ) as error:  # deep nesting, null characters and the like
+        raise SubsetError(f"got {excerpt(text)}, which is not valid Python ({error}), want functions") from None
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node

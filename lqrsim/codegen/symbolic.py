@@ -1,4 +1,4 @@
-"""From a plain Python function of symbols to the source of a compiled one. SymPy is imported only when this runs."""
+"""Trace Python functions of symbols, and write the source of compiled ones. SymPy is imported only when needed."""
 
 import contextlib
 import functools
@@ -15,11 +15,11 @@ from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.errors import InputError, check_kind, check_number, excerpt
 from lqrsim.rotations import RATIOS
 
-MOST = 1000  # parameters of a function
+MOST = 1000  # parameters of a function, at most
 
 
 class Parameters(SimpleNamespace):
-    """The `p` of `f(x, u, p)`: one attribute a parameter; an unknown name is refused with the valid ones."""
+    """The `p` of `f(x, u, p)`, with an attribute for each parameter; an unknown name raises, with the valid ones."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -39,7 +39,7 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
             raise InputError(
                 f"parameters: got the name {excerpt(name)}, want a Python name without a leading underscore, for p.name"
             )
-    # Python reads p.µ by the normal form of the name.
+    # Python normalises the name in p.µ.
     normal = {unicodedata.normalize("NFKC", name): value for name, value in parameters.items()}
     return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
 
@@ -47,13 +47,13 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(
     function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
 ) -> dict[str, Any]:
-    """What `make` derives from a user's function, from the cache if it is there: then SymPy need not be imported.
+    """What `make` derives from a user's function, or the same from the cache, without importing SymPy.
 
-    What cannot be told from other functions by its fingerprint is derived anew, and errors are not kept.
+    A function without a fingerprint is not cached.
 
     Args:
-      function: the user's. details: what else it depends on. make: returns names and values, as JSON has them.
-      **kinds: the types of these.
+      function: the user's. details: what else the result depends on. make: returns names and JSON values.
+      **kinds: the types of the values.
     """
     print_of_it = fingerprint(function)
     if print_of_it is None:
@@ -73,7 +73,7 @@ def kept(
 
 @functools.cache
 def _writers() -> str:
-    """The code that writes what is kept: with other code, something else may be right."""
+    """The source of the modules that write what is cached, which it depends on."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
     files += [
@@ -94,21 +94,21 @@ def trace(
     """Call `function(x, u, p)` with symbols.
 
     Args:
-      controls: how many; None for a `function(x, p)`.
-      constants: further attributes of p, which are numbers and not symbols.
+      function: the user's. states: size of x. controls: size of u; None for a `function(x, p)`.
+      parameters: names in p. constants: further attributes of p, with numbers in place of symbols.
 
     Returns:
-      The expressions it returned (one, or a list of them), the symbols x[0], x[1], ..., and the symbols u[0], ....
+      The expressions that it returned, the symbols of x, and the symbols of u.
 
     Raises:
-      InputError: it failed on symbols, or returned something that is no expression.
+      InputError: it failed on symbols, or returned something other than expressions.
     """
     import sympy
 
     x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
     u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls or 0)]
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
-    for constant, value in (constants or {}).items():  # a whole number as one, so that x + 0 and 1 * x are x
+    for constant, value in (constants or {}).items():  # Integers, so that x + 0 and 1 * x simplify to x
         setattr(p, constant, sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(value))
     given = (tuple(x), p) if controls is None else (tuple(x), tuple(u), p)
     of, counted = ("x", "") if controls is None else ("x, u", f" and {controls} in u")
@@ -156,10 +156,13 @@ def write_function(
     """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
 
     Args:
-      arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x, u and w are those named so.
+      name, arguments: its signature. data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
-      of: what messages call the user's function.
-      returns: the target, among `assignments`, that is returned instead of stored.
+      of: how messages call the user's function.
+      returns: the target, among `assignments`, whose value is returned.
+
+    Raises:
+      InputError: an expression cannot be printed.
     """
     import sympy
     from sympy.printing.codeprinter import PrintMethodNotImplementedError
@@ -181,7 +184,7 @@ def write_function(
             return super()._print_Pow(expr, rational=rational)
 
     def smooth_almost_everywhere(expression: Any) -> Any:
-        """A kink or a jump has no derivative there, and where it has one its delta is zero."""
+        """Replace distributions: they are zero except at kinks and jumps, where there is no derivative."""
         expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
         for kind in (sympy.sign, sympy.Heaviside):
             expression = expression.replace(
@@ -210,9 +213,12 @@ def write_function(
 
 
 def write_chain(states: int, slopes: Iterable[str]) -> str:
-    """Source of `chain` of `kernels/runge_kutta.py` for a Jacobian that is zero but for these (`fx[0, 3]`, ...).
+    """Source of `chain` of `kernels/runge_kutta.py` for a sparse Jacobian.
 
-    Knowing the zeros beforehand makes an iteration faster than finding them while running.
+    Known zeros make an iteration faster than zeros that are found at run time.
+
+    Args:
+      states: N. slopes: the entries that are not zero, `fx[0, 3]`, `fu[1, 0]`, ....
     """
     entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
     inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]

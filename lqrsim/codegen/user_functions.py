@@ -1,8 +1,7 @@
-"""A user's own function, numba's or plain Python's, at an address that compiled code can call.
+"""A user's own numba or plain Python function, at an address that compiled code can call.
 
-Compiled code knows only that there is a function, so it serves all functions of the same sizes. A numba function is
-compiled behind C's calling convention (see `numba_functions.py`); a plain one is called back through Python,
-microseconds a call.
+Compiled code knows only the address, so it serves all functions of the same sizes. A numba function is compiled to a C
+function (see `numba_functions.py`); a plain one is called back through Python, at microseconds per call.
 """
 
 import collections
@@ -25,7 +24,7 @@ LEVELS = ("symbolic", "compiled", "plain")
 
 
 def level_of(function: Any, asked: str | None) -> str:
-    """The level at which a function is stated: as asked, else compiled for a numba function and symbolic for others."""
+    """The level of a function: as asked, or by default compiled for a numba function and symbolic for others."""
     if not callable(function):
         raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
@@ -39,7 +38,7 @@ def level_of(function: Any, asked: str | None) -> str:
 
 
 def name_of(function: Any) -> str:
-    """What messages call a function."""
+    """How messages call a function."""
     plain = getattr(function, "py_func", function)
     name = getattr(plain, "__qualname__", None)
     return name if isinstance(name, str) and name else type(plain).__name__
@@ -47,7 +46,7 @@ def name_of(function: Any) -> str:
 
 @cache
 def parameters_class(names: tuple[str, ...]) -> Any:
-    """The class of `p`: a named tuple, which numba knows, too, so that helpers of numba's can be given p."""
+    """The class of `p`: a named tuple, which numba knows, so that p can be passed to numba helpers."""
 
     def unknown(self: Any, name: str) -> Any:
         if name.startswith("_"):
@@ -61,19 +60,20 @@ def parameters_class(names: tuple[str, ...]) -> Any:
 class UserFunction:
     """One function, and how it is called.
 
-    With `values`, `function(x, u, p)` returns that many numbers (one: the number itself); with `writes`,
-    `function(x, u, p, a, b)` writes to arrays of those shapes, one or two, which are zero when it is called.
+    With `values`, `function(x, u, p)` returns that many numbers; with `writes`, `function(x, u, p, a, b)` writes to one
+    or two arrays of those shapes, which it gets as zeros.
 
     Attributes:
       level: compiled or plain.
-      states, controls: sizes of x and u. parameters: the names in p, whose values come after `offset` other numbers.
-      unused: the entries of (x, u), and their names, that the value is said not to depend on.
-      held: once it has an address, what must be kept alive for that, and the address.
-      stopped: set it to end the solves that call back, in whatever thread they are.
-      entries: what each returned value is for, as messages name it; without, the value is returned bare.
-      columns: the values are returned as rows of so many, or, with 0, one after the other.
-      with_control: whether it is called with u at all; without, it is `function(x, p)`.
-      is_memory: whether the address is that of numbers, and no function's.
+      states, controls: sizes of x and u.
+      parameters: names in p; their values follow `offset` other numbers in the data.
+      unused: (index, name) of the entries of (x, u) that the value is stated not to depend on.
+      held: what must be kept alive, and the address, once it has one.
+      stopped: set it to end the solves that call back, in any thread.
+      entries: what each returned value is for, in messages; empty where a single number is returned.
+      columns: size of the rows in which the values are returned; 0 for a flat list.
+      with_control: False for a `function(x, p)`.
+      is_memory: whether the address is that of numbers, not of a function.
     """
 
     function: Callable[..., Any]
@@ -94,34 +94,37 @@ class UserFunction:
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Without its address, which another process has no use for."""
+        """Pickle it without its address, which is of no use to another process."""
         stated = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
         return partial(UserFunction, **stated), ()
 
     @property
     def name(self) -> str:
-        """As messages have it."""
+        """Its name in messages."""
         of = "x, u, p" if self.with_control else "x, p"
         return f"{name_of(self.function)}({of}{', ...' if self.writes else ''})"
 
     @cached_property
     def identity(self) -> str:
-        """What tells it from other functions, in the digest of a problem: its fingerprint, or else its code."""
+        """Its part of a problem's digest: its fingerprint, or else its byte code."""
         code = getattr(getattr(self.function, "py_func", self.function), "__code__", None)
         return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
 
     def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
-        """Call it in plain Python: the returned values as one vector, or the arrays that it wrote.
+        """Call it in plain Python.
+
+        Returns:
+          The returned values as one vector, or the arrays that it wrote.
 
         Raises:
-          InputError: it fails, or does not return what it should.
+          InputError: it fails, or returns something else than it should.
         """
         plain = getattr(self.function, "py_func", self.function)
-        if not self.held:  # before the first call compiles them
+        if not self.held:  # before the first call compiles its helpers
             note_helpers(self.function)
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
-            with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
+            with np.errstate(all="ignore"):  # callers handle NaN and infinity
                 given = (x.copy(), u.copy()) if self.with_control else (x.copy(),)
                 returned = plain(*given, parameters_class(tuple(p))(*p.values()), *written)
                 if self.writes and returned is not None:
@@ -158,7 +161,7 @@ class UserFunction:
     def called_back(self) -> tuple[Any, int]:
         """A C function that calls this one through Python: what must be kept alive, and its address.
 
-        `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
+        It is `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
         """
         count = 3 + (len(self.writes) or 1)
         prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * count)
@@ -177,14 +180,14 @@ class UserFunction:
                 given = (_view(x, self.states).copy(), _view(u, self.controls).copy())[: 1 + self.with_control]
                 with np.errstate(all="ignore"):
                     if self.writes:
-                        # Not the memory itself, which is gone when this returns; the user's function may keep them.
+                        # Copies, because the function may keep them beyond the call.
                         written = [np.zeros(shape) for shape in self.writes]
                         self.function(*given, p, *written)
                         for array, values_written in zip(arrays, written, strict=True):
                             array[:] = values_written.reshape(-1)
                     else:
                         arrays[0][:] = self._vector(self.function(*given, p))
-            except BaseException as error:  # Ctrl-C, too: C code cannot pass it on, so the solver asks for it
+            except BaseException as error:  # Ctrl-C, too: C code cannot pass it on, so the solver checks `raised`
                 self._thread.raised = error
                 for array in arrays:
                     array[:] = np.nan
@@ -196,15 +199,15 @@ class UserFunction:
 
     @property
     def raised(self) -> BaseException | None:
-        """What it raised in this thread, when it was called back; it is not called again until `forget`."""
+        """What it raised in this thread when called back; it is not called again before `forget`."""
         return getattr(self._thread, "raised", None)
 
     def forget(self) -> None:
-        """Start anew after an exception."""
+        """Forget the exception, so that it is called again."""
         self._thread.raised = None
 
     def adapter(self) -> tuple[str, dict[str, Any]]:
-        """Source of what numba compiles around the function, and the names in it that are its own."""
+        """Source of the adapter that numba compiles around the function, and the names that it uses."""
         lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
         numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
         lines.append(f"p = Parameters({numbers})")
@@ -212,14 +215,14 @@ class UserFunction:
         if self.writes:
             outputs = ("a", "b")[: len(self.writes)]
             lines += [f"{name} = carray({name}, {shape})" for name, shape in zip(outputs, self.writes, strict=True)]
-            # A function that raises leaves NaN, which the solver sees, and not half of its numbers.
+            # After an exception, all outputs are NaN, which the solver detects.
             lines += ["try:", f"    function({of}, {', '.join(outputs)})", "except Exception:"]
             lines += [f"    {name}[:] = nan" for name in outputs]
         else:
             outputs = ("out",)
             lines += ["try:", f"    returned = function({of})"]
             copies = [f"out[{i}] = returned{self._entry(i)}" for i in range(self.values)]
-            if self.entries:  # an array may have another length at another time
+            if self.entries:  # an array may have a different length each time
                 rows = self.values // (self.columns or 1)
                 sizes = [f"len(returned) == {rows}"]
                 sizes += [f"len(returned[{k}]) == {self.columns}" for k in range(rows if self.columns else 0)]
@@ -232,14 +235,14 @@ class UserFunction:
         return source, {"Parameters": parameters_class(self.parameters)}
 
     def _entry(self, i: int) -> str:
-        """How the value of that number is taken out of what is returned."""
+        """The index of value i in what is returned."""
         if self.columns:
             return f"[{i // self.columns}][{i % self.columns}]"
         return f"[{i}]" if self.entries else ""
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:
-    """The functions as `plain_functions` takes them: each writes what it returns."""
+    """The functions for `plain_functions`: each writes what the user's returns."""
 
     def calling(function: UserFunction) -> Callable[..., None]:
         def run(x: Array, u: Array, data: Array, *outputs: Array) -> None:
@@ -252,7 +255,7 @@ def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, floa
 
 
 def address_of(function: UserFunction) -> float:
-    """Where compiled code finds a user's function.
+    """The address of a user's function, for compiled code.
 
     Raises:
       InputError: numba is missing, or cannot compile it.
@@ -274,18 +277,18 @@ def _view(address: int, size: int) -> Array:
 
 
 def brief(x: Array) -> str:
-    """A few of the numbers, for a message."""
+    """The first few numbers, for a message."""
     return "(" + ", ".join(f"{value:g}" for value in x[:6]) + (", ...)" if len(x) > 6 else ")")
 
 
 def check_signature(function: Any, wanted: Sequence[str]) -> None:
-    """Raises InputError unless the function can be called with those arguments."""
+    """Check that a function takes these arguments. Raises InputError."""
     plain = getattr(function, "py_func", function)
     try:
         inspect.signature(plain).bind(*wanted)
     except TypeError as error:
         raise InputError(f"{name_of(function)}: {error}, want a function of ({', '.join(wanted)})") from None
-    except ValueError:  # a built-in tells nothing about itself
+    except ValueError:  # a built-in function has no signature
         return
-    except Exception:  # an object that raises whatever it likes when it is looked at
+    except Exception:  # an object whose attributes raise
         raise InputError(f"function: got {excerpt(function)}, want a function of ({', '.join(wanted)})") from None

@@ -1,4 +1,4 @@
-"""What commands print with `--json`, each part of it as plain dictionaries. docs/json.md describes them."""
+"""Results as plain dictionaries, for `--json`. docs/json.md describes them."""
 
 import dataclasses
 import enum
@@ -24,12 +24,12 @@ Object = dict[str, Any]
 
 
 def text_of(value: object) -> str:
-    """The JSON text of anything that results are made of, in one line; numbers as Python's `repr` has them."""
+    """The JSON text of a result in one line, with numbers at full precision."""
     return json.dumps(_plain(value), allow_nan=False)
 
 
 def of_scenario(name: str, scenario: "Scenario") -> Object:
-    """What `lqrsim list` says of a scenario."""
+    """A scenario, as in `lqrsim list`."""
     problem = scenario.problem
     return {
         "name": name,
@@ -44,7 +44,7 @@ def of_scenario(name: str, scenario: "Scenario") -> Object:
 
 
 def of_funnel(funnel: "Funnel") -> Object:
-    """What is certified at each knot; not the ellipsoids, which its file has."""
+    """Settings and levels of a funnel; the ellipsoids are in its file."""
     columns = zip(funnel.knots, funnel.levels, funnel.trials, funnel.successes, funnel.reasons, strict=True)
     return {
         "rate": funnel.rate,
@@ -67,7 +67,7 @@ def of_funnel(funnel: "Funnel") -> Object:
 
 
 def of_solution(solution: "Solution") -> Object:
-    """Status, log and certificate; not the arrays, which its file has."""
+    """Status, log and certificate of a solution; the arrays are in its file."""
     plan, target = solution.trajectory, solution.target
     clearance = None
     if solution.clearance is not None:
@@ -106,10 +106,10 @@ def of_solution(solution: "Solution") -> Object:
 
 
 def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
-    """The trials as a stress test has them in its tables.
+    """The outcomes of a rollout's trials, as in the tables of a stress test.
 
     Args:
-      problem: whose cost the trials have; none is worked out without one, or where it has another horizon.
+      problem: for the costs; there are none without it, or if it has another horizon.
     """
     from lqrsim.stress.outcome_table import outcomes
 
@@ -133,12 +133,12 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
 
 
 def of_verification(found: "Verification") -> Object:
-    """All that it has, the positions in every frame too."""
+    """All fields of a verification, the positions in every frame included."""
     return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)} | {"passed": found.passed}
 
 
 def of_campaign(results: "Results") -> Object:
-    """How the trials of each cell ended so far."""
+    """The outcomes of each cell of a campaign so far."""
     from lqrsim.results.goal import OUTCOMES
     from lqrsim.stress.analysis import success
 
@@ -170,7 +170,7 @@ def _named(space: "Coordinates") -> list[Object]:
 
 
 def _plain(value: object) -> Any:
-    """The same of what JSON has; null for numbers that are not finite, which it has not."""
+    """Convert a value to types of JSON; null for numbers that are not finite."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, float):

@@ -1,11 +1,11 @@
-"""What the commands share: what they print, progress, and an early look at whether the outputs can be written."""
+"""What the commands share: output, progress, and an early check whether the results can be written."""
 
 import contextlib
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,11 +16,13 @@ from lqrsim.errors import InputError
 from lqrsim.results.archive import excerpt_of
 
 if TYPE_CHECKING:
+    from tqdm import tqdm
+
     from lqrsim.results.solution import Solution
     from lqrsim.results.solution_parts import Iteration
     from lqrsim.scenarios.packaged import Scenario
 
-# What the command that runs has to print with `--json`; None without.
+# The result that the running command prints with `--json`; None without.
 _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
 
 
@@ -30,39 +32,44 @@ class Runnable(Protocol):
     def run(self) -> int: ...
 
 
-def run(command: Runnable) -> int:
-    """Run a command; with `--json` its result is all that is printed, and everything else goes to stderr.
+def run(command: Runnable, name: str) -> int:
+    """Run a command. With `--json` it prints one JSON object, also for bad input, and everything else to stderr.
 
     Returns:
       The exit code.
 
     Raises:
-      InputError: the command's. Nothing is printed then.
-      process.Unprintable: it cannot be written.
+      InputError: the command's own.
+      process.Unprintable: stdout cannot be written.
     """
     if not getattr(command, "json", False):
         return command.run()
-    result: dict[str, Any] = {"format": f"lqrsim {type(command).__name__.lower()}", "version": 1}
+    result: dict[str, Any] = {"format": f"lqrsim {name}", "version": 1}
     token = _RESULT.set(result)
     try:
         with contextlib.redirect_stdout(sys.stderr):
             result["exit_code"] = command.run()
     finally:
         _RESULT.reset(token)
-    with process.printing():
-        print(as_json.text_of(result), flush=True)
+    print_json(result)
     return result["exit_code"]
 
 
+def print_json(result: Mapping[str, Any]) -> None:
+    """Print one JSON object. Raises process.Unprintable if stdout cannot be written."""
+    with process.printing():
+        print(as_json.text_of(result), flush=True)
+
+
 def result(**parts: object) -> None:
-    """Add to what `--json` prints; nothing without it."""
+    """Add to what `--json` prints; without it, do nothing."""
     found = _RESULT.get()
     if found is not None:
         found.update(parts)
 
 
 def wants_result() -> bool:
-    """Whether it is asked for, where it takes time to make."""
+    """Whether `--json` was given, for results that take time to compute."""
     return _RESULT.get() is not None
 
 
@@ -75,10 +82,10 @@ def wrote(path: Path) -> None:
 
 
 def say(text: str = "") -> None:
-    """Print at once, also where the output goes to a file or a pipe, and above any progress bar.
+    """Print immediately, also to a file or a pipe, and above any progress bar.
 
     Raises:
-      process.Unprintable: it cannot be written.
+      process.Unprintable: stdout cannot be written.
     """
     bars = sys.modules.get("tqdm")
     with process.printing():
@@ -90,7 +97,7 @@ def say(text: str = "") -> None:
 
 
 def check_output(field: str, folder: Path, name: str = "") -> None:
-    """Find out before the work starts whether `folder`, or a file of that name in it, can be written.
+    """Check before the work starts that `folder`, or the file `name` in it, can be written.
 
     Raises:
       InputError: it cannot.
@@ -101,7 +108,7 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
     try:
         tempfile.TemporaryFile(dir=existing).close()
         with contextlib.suppress(FileNotFoundError):
-            os.lstat(folder / name)  # fails otherwise for what no file can be called
+            os.lstat(folder / name)  # fails for invalid names
     except (OSError, ValueError) as error:
         reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
         place = excerpt_of(folder / name)
@@ -126,57 +133,48 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
     return solution
 
 
-@contextlib.contextmanager
-def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on a terminal, one line elsewhere, for what takes long; call it with how many are done of all."""
-    from tqdm import tqdm
+class Progress:
+    """How far something is: a bar on a terminal; elsewhere a line now and then. Call it with how much is done.
 
-    watched = sys.stderr.isatty()
-    begun = time.monotonic()
-    announced = False
-    with tqdm(desc=what, unit=unit, leave=False, delay=1.0, disable=not watched) as bar:
-
-        def update(done: int, total: int) -> None:
-            nonlocal announced
-            bar.total = total
-            bar.update(done - bar.n)
-            if not (watched or announced) and time.monotonic() - begun > 1.0:
-                announced = True
-                say(f"{what} {total} {unit}s ...")
-
-        yield update
-
-
-@contextlib.contextmanager
-def long_progress(what: str, unit: str, every: float = 10.0) -> Iterator[Callable[[int, int], None]]:
-    """For what takes minutes or hours, and may have been begun before: how fast it goes, and how long it will take.
-
-    A bar on a terminal; elsewhere a line now and then. The first call says how many are done already, and starts the
-    clock: what is prepared before it, such as compiling, is not counted.
+    The first call starts the clock: preparations before it, such as compiling, do not count.
     """
-    from tqdm import tqdm
 
-    watched = sys.stderr.isatty()
-    bar: tqdm[Any] | None = None
-    begun = last_line = 0.0
-    before = 0
-    with contextlib.ExitStack() as stack:
+    def __init__(self, what: str, unit: str, every: float) -> None:
+        self._what, self._unit, self._every = what, unit, every
+        self._watched = sys.stderr.isatty()
+        self._bar: tqdm[Any] | None = None
+        self._begun = self._last_line = 0.0
+        self._before = 0
 
-        def update(done: int, total: int) -> None:
-            nonlocal bar, begun, before, last_line
-            now = time.monotonic()
-            if bar is None:
-                begun, last_line, before = now, now, done
-                options: dict[str, Any] = {"initial": done, "leave": False, "delay": 1.0, "disable": not watched}
-                bar = stack.enter_context(tqdm(desc=what, unit=f" {unit}s", total=total, **options))
-                if done and done < total:
-                    say(f"{done} of {total} {unit}s are there, {total - done} to go")
-            bar.update(done - bar.n)
-            finished = done == total and now - begun > every
-            if not watched and done > before and (now - last_line > every or finished):
-                last_line = now
-                rate = (done - before) / (now - begun)
-                left = tqdm.format_interval((total - done) / rate)
-                say(f"{what}: {done} of {total} {unit}s, {rate:.3g} {unit}s/s, {left} left")
+    def __call__(self, done: int, total: int, found: str = "") -> None:
+        """Show that `done` of `total` are done, and what has been found so far."""
+        from tqdm import tqdm
 
-        yield update
+        now = time.monotonic()
+        if self._bar is None:
+            self._begun, self._last_line, self._before = now, now, done
+            options: dict[str, Any] = {"initial": done, "leave": False, "delay": 1.0, "disable": not self._watched}
+            self._bar = tqdm(desc=self._what, unit=f" {self._unit}s", total=total, **options)
+            if done and done < total:
+                say(f"{done} of {total} {self._unit}s are done, {total - done} to go")
+        self._bar.set_postfix_str(found, refresh=False)
+        self._bar.update(done - self._bar.n)
+        last = done == total and now - self._begun > self._every
+        if self._watched or not (now - self._last_line > self._every or last):
+            return
+        self._last_line = now
+        line = f"{self._what}: {done} of {total} {self._unit}s"
+        if done > self._before:
+            rate = (done - self._before) / (now - self._begun)
+            line += f", {rate:.3g} {self._unit}s/s, {tqdm.format_interval((total - done) / rate)} left"
+        say(line + (f"; {found}" if found else ""))
+
+    def close(self) -> None:
+        """Remove the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def progress(what: str, unit: str, every: float = 10.0) -> contextlib.AbstractContextManager[Progress]:
+    """Progress during a block; a line every so many seconds if there is no terminal."""
+    return contextlib.closing(Progress(what, unit, every))

@@ -1,5 +1,6 @@
-"""The command that writes a robot to start from."""
+"""The command that writes the files of a new robot."""
 
+import builtins
 import importlib.util
 import keyword
 import shlex
@@ -11,25 +12,28 @@ from tyro.conf import Positional, arg
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
-# Names that mean something else in what is written: two classes of Python's, MuJoCo's first body, pytest's own file.
-TAKEN = ("any", "path", "world", "conftest")
+# Names with another meaning: what the written files use, MuJoCo's first body, pytest's own file, Windows' devices.
+TAKEN = {
+    "any", "path", "self", "world", "conftest", "con", "prn", "aux", "nul",
+    *(f"{port}{number}" for port in ("com", "lpt") for number in range(10)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a robot of your own to start from.
+    """Write the files of a new robot.
 
-    The folder has its MJCF, its dynamics, a scenario and a test. It works as it is: a disc is pushed round a crate.
-    Prints the commands that solve it, run it, film it and test it. docs/new_robot.md says what to change.
+    The folder has an MJCF, dynamics, a scenario and a test. They work as they are: a disc is pushed round a crate.
+    Prints the commands that solve, simulate, render and test it. docs/new_robot.md says what to change.
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """Of the robot, as Python can import it: small letters, digits and underscores."""
+    """Name of the robot, as Python can import it: small letters, digits and underscores."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path(".")
-    """Where the robot's folder is made."""
+    """Folder in which the robot's folder is made."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results.archive import excerpt_of
@@ -56,22 +60,25 @@ class New:
 
 
 def check_robot_name(name: str) -> None:
-    """Raises InputError for what cannot be a module of its own."""
+    """Raise InputError unless the name can be that of a new module."""
     from lqrsim.errors import InputError, excerpt
 
     wanted = "small letters, digits and underscores, a letter first, such as my_robot"
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise InputError(f"name: got {excerpt(name)}, want {wanted}")
-    if name in TAKEN:
-        raise InputError(f"name: got {name!r}, want another: {', '.join(TAKEN)} have a meaning in what is written")
+    reserved = TAKEN | {one.lower() for one in (*dir(builtins), *keyword.kwlist)}
+    if name in reserved:
+        raise InputError(
+            f"name: got {name!r}, which has another meaning in Python, MuJoCo or Windows, want another name"
+        )
     found = importlib.util.find_spec(name)
-    if found is not None and found.origin is not None:  # a folder without a module in it is no module of that name
-        raise InputError(f"name: got {name!r}, which is a module of Python's or of a package, want another name")
+    if found is not None and found.origin is not None:  # a folder without modules has no origin
+        raise InputError(f"name: got {name!r}, which is a module of Python or of a package, want another name")
 
 
 def next_commands(name: str, folder: Path) -> list[list[str]]:
-    """What to do with the robot in that folder: solve, run, film and test it."""
+    """Commands that solve, simulate, render and test the robot in that folder."""
     scenario, runs = f"{(folder / name).as_posix()}.py:scenario", f"runs/{name}"
     return [
         ["lqrsim", "solve", scenario],
@@ -82,5 +89,5 @@ def next_commands(name: str, folder: Path) -> list[list[str]]:
 
 
 def _named(text: str, name: str) -> str:
-    """The text of a template, for the robot of that name."""
+    """Replace the names in the text of a template."""
     return text.replace(TEMPLATE, name).replace(CLASS, "".join(part.capitalize() for part in name.split("_")))

@@ -1,4 +1,4 @@
-"""The whole chain, once for each scenario: solve, simulate, render, and report the results."""
+"""The demo: solve, simulate and render each scenario, and print a table of the results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.view import gl
 from lqrsim.view.plots import plot_run
 from lqrsim.view.policy_plot import plot_policy
@@ -28,11 +28,11 @@ TABLE = (
 
 
 def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick: bool) -> int:
-    """Run the chain for each scenario and print a closing table.
+    """Run the demo for each scenario.
 
     Args:
       references: the scenarios; see `scenarios/references.py`.
-      out: each scenario gets a folder in it.
+      out: folder for a folder of each scenario.
       seed: of the disturbances.
       video: whether to render videos. quick: small videos with fewer frames.
 
@@ -68,7 +68,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
             "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, scenario.disturbances, tube),
         }
         worst, unit = float(runs["undisturbed"].tracking_error.max()), runs["undisturbed"].tracking_unit
-        if not worst <= scenario.tracking_bound:  # a diverged run is NaN
+        if not worst <= scenario.tracking_bound:  # also true for the NaN of a diverged run
             bound = f"want <= {scenario.tracking_bound:g} {unit}"
             failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
         figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
@@ -107,7 +107,7 @@ def _execute(
     disturbances: Sequence[Disturbance],
     tube: Tube | None = None,
 ) -> Rollout:
-    """One closed-loop run with the tube that was predicted, saved and summed up in a line."""
+    """Run the closed loop once, save it with the predicted tube, and print a line."""
     with console.progress("simulating", "step") as progress:
         rollout = simulate(
             scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress,
@@ -120,11 +120,11 @@ def _execute(
 
 
 def _render_video(rollout: Rollout, path: Path, *, quick: bool) -> None:
-    """With the calibrated panes from which the robot's position can be measured."""
+    """Render a video with the calibrated panes that show the robot's position."""
     from lqrsim.view import cameras
     from lqrsim.view.render import render
 
-    insets = cameras.measuring(rollout)
+    insets = cameras.measuring(rollout.plane)
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
         render(rollout, path, insets=insets, quality=quality, fps=fps, progress=progress)

@@ -1,4 +1,4 @@
-"""Commands that run everything, and that manage the cache."""
+"""Commands that run the demo and the paper's experiments, and that manage the cache."""
 
 import itertools
 import time
@@ -24,7 +24,7 @@ class Demo:
     robots: Annotated[tuple[str, ...], arg(metavar="SCENARIO ...")] = ("differential_drive", "quadrotor")
     """Scenarios, by their names in `lqrsim list`; settings follow after commas: quadrotor,query=3."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("videos")
-    """Each scenario gets a folder in it."""
+    """Output folder, with a folder for each scenario."""
     seed: int = 0
     """Seed of the disturbances."""
     video: bool = True
@@ -32,7 +32,6 @@ class Demo:
     quick: bool = False
     """Smaller videos with fewer frames, for a first look."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -59,7 +58,6 @@ class Reproduce:
     quick: bool = False
     """Run a small part of each, for a first look."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -81,7 +79,6 @@ class Cache:
     clear: bool = False
     """Remove everything in it."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""

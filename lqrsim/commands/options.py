@@ -1,26 +1,73 @@
-"""What the options of several commands share."""
+"""Options that several commands share."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 
-def optional(metavar: str) -> object:
-    """An option whose default its own help text tells."""
-    return arg(metavar=metavar, help_behavior_hint="")
+def optional(metavar: str, text: str | None = None) -> object:
+    """An option whose help text describes its default."""
+    return arg(metavar=metavar, help_behavior_hint="", help=text)
 
 
-Policy = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
+PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
-SolutionFile = Annotated[
-    Path | None,
-    arg(
-        metavar="FILE.npz",
-        help_behavior_hint="",
-        help="Run this solution, from `lqrsim solve`, instead of solving the scenario. It must be of the scenario's"
-        " robot, horizon and goal.",
+Strength = Annotated[float, arg(metavar="FACTOR", help="Factor by which the disturbances are scaled.")]
+DesignSet = Annotated[
+    str | None,
+    optional(
+        "NAME",
+        "The set of disturbances for which track and offset_free are designed, named as in `lqrsim stress --sweep`. By"
+        " default moderate.",
     ),
 ]
-Json = FlagCreatePairsOff[bool]
+SolutionFile = Annotated[
+    Path | None,
+    optional(
+        "FILE.npz",
+        "Run this solution, from `lqrsim solve`, instead of solving the scenario. It must be of the scenario's robot,"
+        " horizon and goal.",
+    ),
+]
+GoalRadius = Annotated[
+    float | None,
+    optional(
+        "METRES",
+        "Distance from the goal within which it counts as reached. By default the scenario's or robot's radius.",
+    ),
+]
+GoalTolerance = Annotated[
+    float | None,
+    optional(
+        "SHARE", "The same for goals without a position, relative to each state's range along the plan. By default 0.1."
+    ),
+]
+Seed = Annotated[int, arg(help="Seed of all random numbers. The same seed gives the same output.")]
 Folder = Annotated[Path | None, optional("FOLDER")]
+OwnScenario = Annotated[
+    str | None,
+    optional("SCENARIO", "The campaign's scenario if it is your own function: files never choose code to run."),
+]
+Json = Annotated[
+    FlagCreatePairsOff[bool],
+    arg(help="Print the result as one JSON object, and everything else to stderr; see docs/json.md."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyOptions:
+    """A policy of a scenario under disturbances, for commands that examine one."""
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    """As in `lqrsim solve`."""
+    strength: Strength = 1.0
+    policy: PolicyName = "smooth"
+    """As in `lqrsim stress`."""
+    design_disturbances: DesignSet = None
+    solution: SolutionFile = None
+    goal_radius: GoalRadius = None
+    goal_tolerance: GoalTolerance = None
+    seed: Seed = 0
+    json: Json = False

@@ -1,4 +1,4 @@
-"""The paper's results: one script each, run one after the other, and a page that sums them up."""
+"""Reproduction of the paper: one script per result, run one after the other, and a page with a summary."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from lqrsim.results.save_load import replacing
 _PACKAGED = [Path(__file__).parents[1] / "experiments", Path(__file__).parents[2] / "experiments"]
 EXPERIMENTS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
-# In the order of the page. Each prints, with --json, its result, its report in Markdown, and its statements.
+# In the order of the page. With --json each prints its result, its report in Markdown, and its statements.
 SCRIPTS = (
     "figure_2",
     "figure_3",
@@ -39,24 +39,25 @@ SCRIPTS = (
 
 TIDYING = 20.0  # s
 
-# A script as it runs by itself, but that signals let it remove what it has not finished, and without a word.
+# Runs a script as usual, but a signal lets it remove unfinished files, and end silently.
 _START = "import sys; from lqrsim.process import run_script; run_script(sys.argv[1:])"
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A script that did not come to its end."""
+    """A script that failed."""
 
     script: str
     code: int
 
 
 def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
-    """Run the scripts, write `results.md`, `results.json` and the figures to `out`, and say what holds.
+    """Run the scripts, write `results.md`, `results.json` and the figures, and print which statements hold.
 
     Args:
       scripts: names in `SCRIPTS`; none means all.
-      quick: as little of everything as still shows how it works.
+      out: output folder.
+      quick: run a small part of each.
 
     Returns:
       1 if a script failed, else 0, whether or not the paper's statements hold.
@@ -101,7 +102,7 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
 
 
 def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
-    """What a script prints. It is a process of its own, so that none of them finds what another left behind."""
+    """Run a script in a process of its own, so that scripts do not affect each other. Returns its result."""
     script = EXPERIMENTS / f"{name}.py"
     command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
     below = os.environ | {"TQDM_POSITION": "1"}  # its bars go below ours
@@ -119,7 +120,7 @@ def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
 
 
 def _end(running: subprocess.Popen[str]) -> None:
-    """Have a script end. It may have been told already, as by Ctrl-C; it gets time to remove what is unfinished."""
+    """Stop a script, with time to remove unfinished files. Ctrl-C may have stopped it already."""
     running.terminate()
     try:
         running.wait(TIDYING)

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, Folder, Json, optional
+from lqrsim.commands.options import (
+    ControllerName,
+    DesignSet,
+    Folder,
+    GoalRadius,
+    GoalTolerance,
+    Json,
+    Seed,
+    Strength,
+    optional,
+)
 
 if TYPE_CHECKING:
     from lqrsim.scenarios.packaged import Scenario
@@ -19,7 +29,6 @@ class List:
     """Print the scenarios: robot, scene, states and controls with units."""
 
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -65,11 +74,11 @@ class Solve:
     time_limit: Annotated[float | None, optional("SECONDS")] = None
     """Stop after this time, without compiling, with the best plan so far. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
-    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7,
-    where there is no start."""
+    """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
+    if there is no start."""
     start: Annotated[Path | None, optional("FILE.npz")] = None
-    """Begin with what is stored there: a solution, a policy, or the plan of a rollout or a funnel, of the same robot
-    and with as many steps. By default the scenario's own start, or a search."""
+    """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with as
+    many steps. By default the scenario's own start, or a search."""
     paper_start: bool = False
     """Begin as in the paper: from the nominal control, with the scenario's prior."""
     clearance: Annotated[float | None, optional("METRES")] = None
@@ -80,7 +89,6 @@ class Solve:
     """Also plot the policy to FILE.png, .pdf or .svg: the predicted tube under the scenario's disturbances, the
     cost-to-go along the plan, and the gains over time."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -120,7 +128,7 @@ class Solve:
         console.wrote(save_load.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
-            from lqrsim.simulation.tube_under import tube_under
+            from lqrsim.simulation.uncertainty_of import tube_under
             from lqrsim.view.policy_plot import plot_policy
 
             tube, remark = tube_under(problem, solution, scenario.plant(), scenario.disturbances)
@@ -131,19 +139,19 @@ class Solve:
         return 0 if solution.success else 1
 
     def _start(self, scenario: "Scenario") -> "StartLike":
-        """What to begin with. Raises InputError for a start that there is not, or several."""
+        """The start of the solve. Raises InputError for several, or one that the scenario does not have."""
         from lqrsim.errors import InputError
         from lqrsim.scenarios.solutions import stored_start
 
         given = {"--start": self.start is not None, "--paper-start": self.paper_start, "--starts": self.starts}
         named = [name for name, one in given.items() if one]
         if len(named) > 1:
-            raise InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each says where to begin")
+            raise InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each chooses the start")
         if self.start is not None:
             return stored_start(scenario, self.start)
         if self.paper_start:
             if scenario.paper_start is None:
-                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
+                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario of the paper")
             return scenario.paper_start
         return None if self.starts is not None else scenario.start
 
@@ -173,13 +181,11 @@ class Simulate:
     controller: ControllerName = "feedback"
     """feedback: the solution's policy. track: follows its plan. offset_free: also estimates the state and the
     disturbances. replan: solves again every tenth of the horizon."""
-    stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances for which track or offset_free is designed: the name of a set, as below. By default moderate."""
+    design_disturbances: DesignSet = None
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
     those of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
-    strength: Annotated[float, arg(metavar="FACTOR")] = 1.0
-    """Factor by which those sets are scaled."""
+    strength: Strength = 1.0
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
     force_noise: Annotated[float, arg(metavar="STD")] = 0.0
@@ -189,19 +195,15 @@ class Simulate:
     """Standard deviation of white noise on each measured state, in its unit: one number per state, or one for all."""
     push: Annotated[tuple[float, float, float, float] | None, optional("X Y Z AT")] = None
     """One push: its impulse in N s along the world's axes, and its time in s."""
-    seed: int = 0
-    """Seed of all random numbers."""
+    seed: Seed = 0
     trials: int = 1
     """Number of runs."""
     first_trial: int = 0
     """Number of the first trial. --first-trial 7 alone gives bit-identical results to trial 7 among others."""
 
-    goal_radius: Annotated[float | None, optional("METRES")] = None
-    """Distance from the goal within which it counts as reached. By default the robot's radius."""
-    goal_tolerance: Annotated[float | None, optional("SHARE")] = None
-    """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
+    goal_radius: GoalRadius = None
+    goal_tolerance: GoalTolerance = None
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -209,11 +211,10 @@ class Simulate:
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
         from lqrsim.results.solution import Solution
-        from lqrsim.scenarios.references import resolve
+        from lqrsim.scenarios.references import disturbance_set, resolve
         from lqrsim.simulation.closed_loop import simulate
-        from lqrsim.simulation.tube_under import tube_under
-        from lqrsim.stress.sweeps import sweep
-        from lqrsim.stress.trials import controller_by_name
+        from lqrsim.simulation.uncertainty_of import tube_under
+        from lqrsim.stress.policies import check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
             raise InputError(f"--open-loop: got it with --controller {self.controller}, want one of them")
@@ -227,14 +228,17 @@ class Simulate:
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
         if self.open_loop:
             solution = solution.open_loop()
-        law = controller_by_name(self.controller, scenario, solution, self.stated)
-        named = [one.scaled(self.strength) for name in self.disturbances for one in sweep(name, scenario)]
-        disturbances, plant = [*named, *self._single_disturbances()], scenario.plant()
+        if self.design_disturbances is not None:
+            check_designed((self.controller,))
+        controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
+        named = [one for name in self.disturbances for one in disturbance_set(name, scenario)]
+        disturbances = [*(one.scaled(self.strength) for one in named), *self._single_disturbances()]
+        plant = scenario.plant()
         with console.progress("simulating", "step") as progress:
             rollout = simulate(
                 plant,
                 solution,
-                controller=law,
+                controller=controller,
                 disturbances=disturbances,
                 seed=self.seed,
                 trials=self.trials,
@@ -243,7 +247,7 @@ class Simulate:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
-        tube, remark = tube_under(scenario.problem, solution, plant, disturbances, law)
+        tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
         if remark:
             console.say(remark)
         rollout = rollout if tube is None else tube.added_to(rollout)

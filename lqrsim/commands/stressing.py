@@ -7,7 +7,17 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Json, Policy, SolutionFile, optional
+from lqrsim.commands.options import (
+    DesignSet,
+    Folder,
+    GoalRadius,
+    GoalTolerance,
+    Json,
+    OwnScenario,
+    PolicyName,
+    SolutionFile,
+    optional,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,13 +38,11 @@ class Stress:
     NAME:KIND for one kind alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """Factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate."""
-    policies: Annotated[tuple[Policy, ...] | None, arg(help_behavior_hint="")] = None
-    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. track: keeps to the plan of
-    smooth. offset_free: the same, and estimates the state and what disturbs it. All meet the same numbers. By default
-    the first four; ilqr is left out where the scenario has constraints, which it cannot keep."""
-    stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances for which track and offset_free are designed, named as above, at all strengths. By default
-    moderate."""
+    policies: Annotated[tuple[PolicyName, ...], optional("POLICY ...")] = ()
+    """smooth, ilqr: the policies of these solvers. open_loop: the plan of smooth without feedback. replan: re-plans
+    during the run. track: follows the plan of smooth. offset_free: the same, and estimates the state and the
+    disturbances. By default the first four that the scenario allows: ilqr cannot keep constraints."""
+    design_disturbances: DesignSet = None
     solution: SolutionFile = None
     trials: int = 200
     """Number of trials for each sweep, strength and policy."""
@@ -42,10 +50,8 @@ class Stress:
     """Seed of all random numbers."""
     replan_every: Annotated[float | None, optional("SECONDS")] = None
     """Time between two solves of replan. By default a tenth of the horizon."""
-    goal_radius: Annotated[float | None, optional("METRES")] = None
-    """Distance from the goal within which it counts as reached. By default the robot's radius."""
-    goal_tolerance: Annotated[float | None, optional("SHARE")] = None
-    """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
+    goal_radius: GoalRadius = None
+    goal_tolerance: GoalTolerance = None
     shard: int = 500
     """Trials per file; an interruption loses at most this many per worker."""
     time_limit: Annotated[float, arg(metavar="SECONDS")] = 300.0
@@ -61,34 +67,32 @@ class Stress:
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
-        from lqrsim.scenarios.references import folder_name, resolve
+        from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
         from lqrsim.scenarios.solutions import given
-        from lqrsim.stress.campaign import USUAL, Campaign, run_campaign
+        from lqrsim.stress.campaign import Campaign, run_resolved
+        from lqrsim.stress.policies import DEFAULT_POLICIES, impossible_policies
         from lqrsim.stress.results import Results
-        from lqrsim.stress.sweeps import sweep
-        from lqrsim.stress.trials import impossible_policies
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/stress") / folder_name(scenario)
         solution = None if self.solution is None else given(scenario, self.solution)
         if self.resume:
             begun = Results(folder, scenario=self.scenario)
+            begun.resolved = scenario
             campaign, solution = begun.campaign, solution or begun.given
         else:
-            impossible = impossible_policies(scenario, solution)
+            impossible, design = impossible_policies(scenario, solution), self.design_disturbances
+            possible = tuple(policy for policy in DEFAULT_POLICIES if policy not in impossible)
             campaign = Campaign(
                 scenario=self.scenario,
-                sweeps={name: sweep(name, scenario) for name in self.sweep},
+                sweeps={name: disturbance_set(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=tuple(policy for policy in USUAL if policy not in impossible)
-                if self.policies is None
-                else self.policies,
-                stated=None if self.stated is None else sweep(self.stated, scenario),
+                policies=self.policies or possible,
+                design_disturbances=None if design is None else disturbance_set(design, scenario),
                 trials=self.trials,
                 seed=self.seed,
                 replan_every=self.replan_every,
@@ -98,8 +102,8 @@ class Stress:
                 time_limit=self.time_limit,
             )
         options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler, "solution": solution}
-        with console.long_progress("stressing", "trial") as progress:
-            results = run_campaign(campaign, folder, progress=progress, **options)
+        with console.progress("stressing", "trial") as progress:
+            results = run_resolved(campaign, scenario, folder, progress=progress, **options)
         console.say(results.summary())
         console.wrote(folder)
         own = ["--scenario", self.scenario] if ":" in self.scenario else []  # files never choose code to run
@@ -124,12 +128,10 @@ class Replay:
     """policy,sweep,strength, such as smooth,light,1.5; or the number with which the names of its files begin."""
     trial: int
     """Number of the trial, from 0."""
-    scenario: Annotated[str | None, optional("SCENARIO")] = None
-    """The campaign's scenario if it is your own function: files never choose code to run."""
+    scenario: OwnScenario = None
     out: Annotated[Path, arg(metavar="FILE.npz")] = Path("rollout.npz")
     """File to write."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -143,7 +145,7 @@ class Replay:
         results = Results(self.folder, scenario=self.scenario)
         cell = Cell.named(self.cell, results.cells)
         if others := changed(results.manifest["versions"]):
-            console.say(f"bits can differ from the table's: got {others}")
+            console.say(f"values may differ from the table in the last bits: got {others}")
         rollout = replay(results, cell, self.trial)
         console.say(rollout.summary())
         if summary := rollout.controller_run.summary():
@@ -174,10 +176,8 @@ class Report:
     """The page. By default report.html in that folder."""
     videos: int = 4
     """Number of the worst trials to repeat and render."""
-    scenario: Annotated[str | None, optional("SCENARIO")] = None
-    """The campaign's scenario if it is your own function: files never choose code to run."""
+    scenario: OwnScenario = None
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""

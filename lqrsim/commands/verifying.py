@@ -30,7 +30,6 @@ class Verify:
     solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
     """Solution of the run, to check the recorded plan. By default solution.npz beside the run."""
     json: Json = False
-    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code: 1 if a test failed."""
@@ -48,7 +47,7 @@ class Verify:
         solution = None
         if self.solution or os.path.isfile(beside):
             solution = save_load.load(self.solution or beside, Solution)
-            # What lies beside a run may be another's; what is given is meant.
+            # The solution beside a run may be another's; one that is given is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:

@@ -1,4 +1,4 @@
-"""Commands that show what was executed."""
+"""Commands that render and view runs."""
 
 import contextlib
 from collections.abc import Callable
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, SolutionFile, optional
+from lqrsim.commands.options import ControllerName, DesignSet, SolutionFile, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.control.live_replanner import LiveReplanner
+    from lqrsim.control.replanner import LiveReplanner
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario
@@ -103,17 +103,17 @@ class Render:
             "solution": solutions[0] if len(solutions) == 1 else solutions or None,
             "funnel": funnels[0] if len(funnels) == 1 else funnels or None,
         }  # fmt: skip
-        shown = runs[0] if len(runs) == 1 else runs
+        drawn = runs[0] if len(runs) == 1 else runs
         if is_still:
-            render_still(shown, out, time=self.time, every=self.every, **options)
+            render_still(drawn, out, time=self.time, every=self.every, **options)
         else:
             with console.progress("rendering", "frame") as progress:
-                render(shown, out, fps=self.fps, speed=self.speed, progress=progress, **options)
+                render(drawn, out, fps=self.fps, speed=self.speed, progress=progress, **options)
         console.wrote(out)
         return 0
 
     def _record(self, out: Path) -> int:
-        """Write one trial for Rerun's viewer, which chooses by itself how it looks."""
+        """Write one trial as a recording for Rerun's viewer."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
@@ -125,12 +125,12 @@ class Render:
         given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
         if given or len(paths) > 1 or len(trials) != 1 or len(self.funnel) > 1:
             got = ", ".join(f"--{name}" for name in given) or "several runs, trials or funnels, or none"
-            want = "one run, one --trial, at most one --funnel, and nothing else"
+            want = "one run, one --trial, at most one --funnel, and no other options"
             raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
         funnel = save_load.load(self.funnel[0], Funnel) if self.funnel else None
         for name in rerun_file.write(save_load.load(paths[0], Rollout), out, trial=trials[0], funnel=funnel):
-            console.say(f"left out: {name}, of a kind that Rerun has no shape for")
+            console.say(f"left out: {name}, for whose kind Rerun has no shape")
         console.wrote(out)
         return 0
 
@@ -168,8 +168,7 @@ class View:
     solution: SolutionFile = None
     controller: ControllerName = "feedback"
     """Controller of a live run, as in `lqrsim simulate`."""
-    stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances for which track or offset_free is designed, as in `lqrsim simulate`. By default moderate."""
+    design_disturbances: DesignSet = None
     replan: Annotated[float | None, optional("HZ")] = None
     """Re-plan this many times a second, rounded to control periods; the run then continues after the plan's horizon. A
     solve that takes longer than a control period of real time is not used."""
@@ -183,7 +182,7 @@ class View:
         from lqrsim.results import save_load
         from lqrsim.results.rollout import Rollout
         from lqrsim.scenarios.references import resolve
-        from lqrsim.stress.trials import controller_by_name
+        from lqrsim.stress.policies import check_designed, make_controller
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)
@@ -196,14 +195,12 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
-            if self.controller != "feedback" or self.stated is not None:
-                raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
-            if self.solution is not None:
-                raise InputError(f"--solution: got {self.solution} with {self.what}, want it with a SCENARIO")
-            if self.replan is not None:
-                raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
+            for name in ("controller", "design_disturbances", "solution", "replan"):
+                if (value := getattr(self, name)) not in (None, "feedback"):
+                    option = name.replace("_", "-")
+                    raise InputError(f"--{option}: got {value} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load(self.what, Rollout)
-            shown = viewer.arguments_for_rollout(rollout, self.trial)
+            arguments = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:
                 viewer.play(rollout, screen, trial=self.trial, loop=self.loop)
@@ -213,16 +210,18 @@ class View:
             plant = scenario.plant()
             solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
-            shown = viewer.arguments_for_plant(plant, solution, goal)
-            law = controller_by_name(self.controller, scenario, solution, self.stated)
-            wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
+            arguments = viewer.arguments_for_plant(plant, solution, goal)
+            if self.design_disturbances is not None:
+                check_designed((self.controller,))
+            controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
+            disturbances = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
-                options = {"controller": law, "disturbances": wrong, "seed": self.seed}
+                options = {"controller": controller, "disturbances": disturbances, "seed": self.seed}
                 viewer.live(plant, solution, screen, ended=console.say, planner=planner, goal=goal, **options)
 
-        with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **shown, **options) as screen:
+        with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **arguments, **options) as screen:
             console.say(screen.instructions)
             with contextlib.suppress(KeyboardInterrupt):
                 go(screen)
@@ -230,7 +229,7 @@ class View:
 
     @staticmethod
     def _given(scenario: "Scenario", path: Path) -> "Solution":
-        """The solution in that file. Raises InputError for one that cannot be run in the scenario."""
+        """Load the solution of a file. Raises InputError if it cannot run in the scenario."""
         from lqrsim.commands import console
         from lqrsim.scenarios.solutions import given, remarks
 
@@ -241,25 +240,23 @@ class View:
         return solution
 
     def _check_replanning(self, problem: "Problem") -> None:
-        """Raises InputError for a rate that does not fit the problem, or options that do not go with it."""
+        """Raise InputError for a rate that does not fit the problem, or options that exclude re-planning."""
         from lqrsim.errors import InputError, check_number
 
         if self.replan is None:
             return
-        # At least one plan in a horizon, at most one in a control period; as given, with two or three digits.
+        # At least one plan per horizon, at most one per control period, with a tolerance for rounded rates.
         slowest, fastest = 0.999 / (problem.steps * problem.dt), 1.001 / problem.dt
         check_number("--replan", self.replan, at_least=slowest, at_most=fastest)
         if self.controller != "feedback":
             raise InputError(f"--controller: got {self.controller} with --replan, want one of the two")
         if self.speed > 1:
-            raise InputError(
-                f"--speed: got {self.speed:g} with --replan, want at most 1: a solve takes the time it takes"
-            )
+            raise InputError(f"--speed: got {self.speed:g} with --replan, want at most 1: solves run in real time")
 
     def _planning(
         self, problem: "Problem", solution: "Solution"
     ) -> tuple["Callable[[], LiveReplanner]", "MovableGoal | None"]:
-        """What begins a run of the re-planner, and the goal if it can be moved."""
+        """A function that starts the re-planner, and the goal if it can be moved."""
         from lqrsim.commands import console
         from lqrsim.control.replanner import Replanner
         from lqrsim.errors import InputError
@@ -268,7 +265,7 @@ class View:
         assert self.replan is not None
         every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
         console.say(f"plans again every {every:.4g} s, {1 / every:.4g} times a second")
-        # It compiles, and says what is wrong, before anything opens.
+        # Compiles, and reports errors, before a window opens.
         replanner = Replanner(problem, solution, every=every, horizon="moving")
         try:
             return replanner.live, MovableGoal(problem)

@@ -1,4 +1,4 @@
-"""How likely a robot is to collide, of the mean and the covariance of its states along a plan.
+"""Chance of collision, from mean and covariance of the states along a plan.
 
 Of each obstacle, the clearance is taken to be linear about the mean, so that it is normal. A collision is counted when
 it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring steps
@@ -21,9 +21,12 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
 
+NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
+FAR = 12.0  # standard deviations of clearance, with which the chance of a collision is below 1e-32
+
 
 class Spread(NamedTuple):
-    """How the clearances to O obstacles are distributed at T+1 knots.
+    """Distribution of the clearances to O obstacles at T+1 knots.
 
     Attributes:
       mean: in m, (T+1, O). std: in m, (T+1, O). correlation: of each with that of the knot before, (T, O).
@@ -36,7 +39,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a robot must not touch.
+    """Obstacles of a problem, as its robot sees them.
 
     Attributes:
       dynamics: of the problem.
@@ -135,7 +138,7 @@ class Surroundings:
         return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
-        """At mean states (T+1, n), of covariances (T+1, n, n), and (T, n, n) with the states of the knot before."""
+        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""
         place = list(self.position)
         clearance, normal, displaced = self.clearances(states)
         variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
@@ -159,11 +162,13 @@ def collision_chance(
 
 
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
-    """The same of clearances in standard deviations (T+1, O), and the correlation of each with that before (T, O)."""
+    """`collision_chance` of clearances in standard deviations (T+1, O) and their correlations with the knot before."""
     each = ndtr(-margin)
-    # Who is in collision at a knot and was not at the one before.
-    begins = each[1:] - both_below(-margin[1:], -margin[:-1], correlation)
-    expected = each[0].sum() + np.maximum(begins, 0.0).sum()
+    begins, near = np.zeros_like(correlation), margin[1:] < FAR
+    # In collision at a knot and not at the one before.
+    before = both_below(-margin[1:][near], -margin[:-1][near], correlation[near])
+    begins[near] = np.maximum(each[1:][near] - before, 0.0)
+    expected = each[0].sum() + begins.sum()
     return np.minimum(each.sum(axis=1), 1.0), float(-np.expm1(-expected))
 
 
@@ -172,16 +177,15 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
 
     Plackett's integral over the correlation's angle, by Gauss and Legendre's rule.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(64)
     # Near 1 the integrand is steep: from there it is done from the other end, where it is min(a, b).
     angle = np.arcsin(correlation)
     start = np.where(np.abs(correlation) > 0.95, np.sign(correlation) * np.pi / 2, 0.0)
-    at = start[..., None] + (angle - start)[..., None] * (nodes + 1) / 2
+    at = start[..., None] + (angle - start)[..., None] * (NODES + 1) / 2
     a, b = first[..., None], second[..., None]
     cosine, sine = np.cos(at), np.sin(at)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         exponent = -(a * a + b * b - 2 * a * b * sine) / (2 * np.maximum(cosine, 1e-150) ** 2)
-    total = (np.exp(np.nan_to_num(exponent, nan=-np.inf)) @ weights) * (angle - start) / (4 * np.pi)
+    total = (np.exp(np.nan_to_num(exponent, nan=-np.inf)) @ NODE_WEIGHTS) * (angle - start) / (4 * np.pi)
     independent = ndtr(first) * ndtr(second)
     same, opposite = ndtr(np.minimum(first, second)), np.maximum(ndtr(first) - ndtr(-second), 0.0)
     return total + np.where(start > 0, same, np.where(start < 0, opposite, independent))

@@ -1,4 +1,8 @@
-"""What decides on the controls: a policy, a function or a `Controller`; and what one run of it remembers."""
+"""Whatever decides on the controls: a policy, a function or a `Controller`; and one run of it.
+
+Affine laws run compiled for many trials at once, so that each trial gets what it gets alone, to the last bit.
+`AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
+"""
 
 import abc
 from collections.abc import Callable, Mapping
@@ -6,15 +10,52 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.fingerprint import fingerprint
-from lqrsim.control.law import evaluator
+from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_function, check_kind
+from lqrsim.kernels import policy_evaluation
+from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
+
+
+def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
+    """What evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
+
+    As `AffinePolicy.__call__`, but that each trial gets what it gets alone, to the last bit.
+    """
+    limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
+    laws = _laws(len(states), len(controls))
+
+    def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
+        near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
+        law = Policy(in_c_order(gain), in_c_order(offset))
+        laws.apply_policy(len(shown), near, law, in_c_order(nominal), turning, limits, out)
+        return out
+
+    return evaluate
+
+
+def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
+    """As `space.nearest`, compiled and in place: states (T+1, K, n), C-ordered, become those nearest to (T+1, n)."""
+    flat, turning = states.reshape(-1, len(space)), turning_of(space)
+    _laws(len(space), 1).all_to_nearest(len(states), states.shape[1], flat, in_c_order(nominal), turning)
+
+
+def _laws(n: int, m: int) -> CompiledModule:
+    return module_of(source_of(policy_evaluation), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
+
+
+def turning_of(space: Coordinates) -> AngularStates:
+    """Which states are to be turned to the nearest, as `kernels/policy_evaluation.py` takes it."""
+    angles, rotations = (np.array(one, dtype=np.float64) for one in (space.angles, space.rotation_vectors))
+    return AngularStates(angles, len(angles), rotations, len(rotations))
+
 
 ControlFunction = Callable[[Array, float], npt.ArrayLike]
 
@@ -120,7 +161,7 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
             return OutputFeedback(given), plan
         case _:
             check_function("controller", given, WANTED, arguments=2)
-            return Function(given, dynamics, plan.trajectory.dt), plan
+            return FunctionController(given, dynamics, plan.trajectory.dt), plan
 
 
 class Feedback(Controller):
@@ -190,7 +231,7 @@ class _OutputFeedbackRun(ControllerRun):
         return commands
 
 
-class Function(Controller):
+class FunctionController(Controller):
     """A function of the measured state (n,) and the time in s. Its controls are held within the robot's limits."""
 
     def __init__(self, function: ControlFunction, dynamics: Dynamics, dt: float) -> None:
@@ -212,7 +253,7 @@ class Function(Controller):
 
 
 class _FunctionRun(ControllerRun):
-    def __init__(self, of: Function) -> None:
+    def __init__(self, of: FunctionController) -> None:
         self._function, self._dt, self._controls = of.function, of.dt, of.coordinates[1]
 
     def control(self, step: int, measured: Array) -> Array:

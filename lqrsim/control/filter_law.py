@@ -1,14 +1,23 @@
-"""A Kalman filter about a plan, and the law that follows its estimates: matrices, made ahead of time."""
+"""A Kalman filter with the law that follows its estimates: matrices about a plan, runs of K trials, and the export.
 
+The run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPolicy`, is linear about the plan.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.errors import Array
+from lqrsim.kernels.estimation import FAR
+from lqrsim.kernels.records import Limits, Measurements, Policy
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 
 
@@ -17,12 +26,12 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: what it is about, as it was solved for.
-      model: the linear model about it, which the filter believes.
+      plan: that it follows, as solved.
+      model: the linear model about it, which the filter assumes.
       filter: its gains and covariances.
-      weights: what deviations from the plan cost the law.
+      weights: of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
-      nominal: (T+1, Z), what z is in an undisturbed run.
+      nominal: z in an undisturbed run, (T+1, Z).
     """
 
     plan: Plan
@@ -37,11 +46,11 @@ class FilterLaw:
     def of(
         cls, plan: Plan, model: PlanModel, kalman: KalmanFilter, weights: Weights, granted: Array | None = None
     ) -> "FilterLaw":
-        """The law about the model's plan, which takes states (D,) of the unknowns for granted, by default zeros."""
+        """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes, by default 0."""
         trajectory = model.plan
         granted = np.zeros(len(model.transition)) if granted is None else granted
         gain, offset = tracking_laws(model, weights)
-        # In what the filter estimates, and not in deviations from the plan.
+        # From deviations to the filter's own numbers.
         unknowns = np.tile(granted, (trajectory.steps + 1, 1))
         nominal = np.concatenate([trajectory.states, model.reached, unknowns], axis=1)
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
@@ -49,7 +58,7 @@ class FilterLaw:
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        """Of the states and of the controls."""
+        """Coordinates of the states and of the controls."""
         return self.plan.policy.state_coordinates, self.plan.policy.control_coordinates
 
     @property
@@ -57,3 +66,187 @@ class FilterLaw:
         """Lowest and highest controls, (m,) each."""
         controls = self.plan.policy.control_coordinates
         return np.array(controls.low), np.array(controls.high)
+
+
+class FilterRun(ControllerRun):
+    """K trials of a run, with their estimates.
+
+    If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
+    commands since, to the time at which the next command acts.
+
+    Args:
+      law: to begin with.
+      trials: K.
+      records: arrays for `estimates` and `innovations`, to be filled; None to record nothing.
+
+    Attributes:
+      law: in force.
+      first: the step that its plan begins at.
+      z: the estimates now, (K, Z), of the knot that the newest measurement is of.
+      estimates: what was recorded of them, (T+1, K, Z), or None; see `OffsetFree`.
+      innovations: likewise, (T+1, K, Y).
+    """
+
+    def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
+        self.law, self.first = law, 0
+        self.model = law.model  # for predictions, whatever a later plan assumes of the unknowns
+        self._trials = trials
+        self.z = np.tile(law.nominal[0], (trials, 1))
+        # If the first measurement is lost, the plan's first state is shown.
+        self._last = np.tile(law.model.plan.states[0], (trials, 1))
+        self._diverged: dict[int, str] = {}
+        self._differences = np.empty((trials, law.model.sensor.size))
+        self.estimates, self.innovations = records or (None, None)
+        self._limits = Limits(*law.limits)
+        self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
+        # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
+        controls = law.model.plan.controls
+        self._commands = [np.tile(controls[min(i, len(controls) - 1)], (trials, 1)) for i in range(self._delay)]
+
+    def control(self, step: int, measured: Array) -> Array:
+        self.take_in(step, measured)
+        return self.command(step)
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        return self._diverged
+
+    def take_in(self, step: int, measured: Array) -> None:
+        """Predict the estimate to the knot of a step's measurement, and correct it."""
+        if step < self._latency:  # no measurement has arrived
+            return
+        law, model = self.law, self.model
+        if step > self._latency:
+            self._predict(self.z, self._commands.pop(0))
+        # After the horizon the last gain stays in force.
+        knot = min(step - self.first - self._latency, law.model.plan.steps)
+        lost = (measured == self._last).all(axis=1).astype(np.float64)
+        self._last[:] = measured
+        model.compiled.correct(
+            self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
+            law.filter.gain[knot], model.compiled_sensor, model.turning, self.z, self._differences,
+        )  # fmt: skip
+        at = step - self._latency
+        if self.estimates is not None and self.innovations is not None and at < len(self.estimates):
+            self.estimates[at], self.innovations[at] = self.z, self._differences
+
+    def command(self, step: int) -> Array:
+        """The controls of a step, whose measurement was taken in."""
+        law, model = self.law, self.model
+        ahead = self.z
+        if self._commands:
+            ahead = ahead.copy()
+            for command in self._commands:
+                self._predict(ahead, command)
+        t = min(step - self.first + self._delay, law.model.plan.steps - 1)
+        out = np.empty((self._trials, self.model.m))
+        near = in_c_order(law.model.plan.states[t])
+        gains = Policy(law.gain[t], law.offset[t])
+        model.compiled.command(self._trials, ahead, near, gains, self._limits, model.turning, out)
+        self._commands.append(out.copy())
+        self._look_for_diverged(ahead)
+        return out
+
+    def _look_for_diverged(self, estimates: Array) -> None:
+        """Note the trials whose estimate is not finite or larger than any plausible value."""
+        places = np.empty(self._trials)
+        self.model.compiled.diverged(self._trials, estimates, places)
+        for k in np.flatnonzero(places < self.model.size):
+            i = int(places[k])
+            what = f"is beyond {FAR:g}" if np.isfinite(estimates[k, i]) else "is not finite"
+            self._diverged.setdefault(int(k), f"the estimate of {self.model.names[i]} {what}")
+
+    def _predict(self, estimates: Array, commands: Array) -> None:
+        """Predict estimates by one control period."""
+        self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
+
+
+def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:
+    """Arrays of NaN for the estimates and innovations of K trials."""
+    knots, model = law.model.plan.steps + 1, law.model
+    return np.full((knots, trials, model.size), np.nan), np.full((knots, trials, model.sensor.size), np.nan)
+
+
+def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
+    """The law as an `OutputFeedbackPolicy`, linear about the plan.
+
+    Commands under way are part of its state and move up by one place in each period. If measurements are late by k
+    periods, z is k periods behind, and the law acts on the prediction of z with the commands since, which is linear.
+    """
+    model, plan = law.model, law.model.plan
+    late, steps, m = model.uncertainty, plan.steps, model.m
+    latency, delay = late.latency, late.delay
+    size, width = model.size, model.size + (latency + delay) * m
+    F, G, nominal = model.F, model.G, law.nominal
+    f = nominal[1:] + model.c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
+    arrays = {
+        "gain": np.zeros((steps, m, width)), "offset": np.zeros((steps, m)),
+        "correction": np.zeros((steps, width, model.sensor.size)),
+        "sensor": np.empty((steps, model.sensor.size, model.n)), "sensor_offset": np.empty((steps, model.sensor.size)),
+        "transition": np.zeros((steps, width, width)), "input": np.zeros((steps, width, m)),
+        "drift": np.zeros((steps, width)), "nominal": np.empty((steps, width)),
+    }  # fmt: skip
+    measured = _expected(law)
+    for t in range(steps):
+        knot = max(t - latency, 0)  # of z
+        under_way = min(t, latency) + delay  # commands, of which the newest are last
+        first = width - under_way * m
+        arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
+        if t >= latency:
+            arrays["correction"][t, :size] = law.filter.gain[knot]
+        # The prediction with the commands under way: z ahead = onto (z, commands) + constant.
+        onto, constant = np.eye(size, width), np.zeros(size)
+        for i in range(under_way):
+            j = min(knot + i, steps - 1)
+            onto, constant = F[j] @ onto, F[j] @ constant + f[j]
+            onto[:, first + i * m : first + (i + 1) * m] += G[j]
+        at = min(t + delay, steps - 1)
+        arrays["gain"][t], arrays["offset"][t] = law.gain[at] @ onto, law.gain[at] @ constant + law.offset[at]
+        arrays["nominal"][t, :size] = nominal[knot]
+        places = np.clip(t + delay - np.arange((latency + delay), 0, -1), 0, steps - 1)
+        arrays["nominal"][t, size:] = plan.controls[places].ravel()
+        _advance({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
+    return OutputFeedbackPolicy(
+        **arrays, dt=plan.dt, state_coordinates=law.coordinates[0], control_coordinates=law.coordinates[1],
+        measured_coordinates=_measured_coordinates(law),
+    )  # fmt: skip
+
+
+def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, moves: bool) -> None:
+    """Write one period's transition, input and drift. Without `moves`, z waits for the first measurement."""
+    (F, G, f), m, late = step, now["input"].shape[1], len(now["drift"]) > size
+    now["transition"][:size, :size] = np.eye(size)
+    if moves:
+        now["transition"][:size, :size], now["drift"][:size] = F, f
+        if late:  # by the oldest command
+            now["transition"][:size, size : size + m] = G
+        else:
+            now["input"][:size] = G
+    if late:  # all commands move up, and the new one is the last
+        count = len(now["drift"]) - size - m
+        now["transition"][size : size + count, size + m :] = np.eye(count)
+        now["input"][-m:] = np.eye(m)
+
+
+def _expected(law: FilterLaw) -> Array:
+    """h of y = H x + h about the plan, (T+1, Y)."""
+    model, plan = law.model, law.model.plan
+    values = np.empty((plan.steps + 1, model.sensor.size))
+    model.compiled.measurements(len(values), in_c_order(plan.states), model.compiled_sensor, values)
+    return values - np.einsum("tij,tj->ti", model.H, plan.states)
+
+
+def _measured_coordinates(law: FilterLaw) -> Coordinates:
+    """Coordinates of the measured numbers: those of the states, if they are states."""
+    space, names = law.coordinates[0], law.model.sensor.names
+    if not set(names) <= set(space.names):
+        return Coordinates(names=names, units=("",) * len(names))
+    chosen = [space.names.index(name) for name in names]
+    whole = [
+        place
+        for place, i in enumerate(chosen)
+        if i in space.rotation_vectors and chosen[place : place + 3] == [i, i + 1, i + 2]
+    ]
+    return Coordinates(
+        names=names, units=tuple(space.units[i] for i in chosen), rotation_vectors=tuple(whole),
+        angles=tuple(place for place, i in enumerate(chosen) if i in space.angles),
+    )  # fmt: skip

@@ -1,26 +1,40 @@
-"""A time-varying Kalman filter about a plan: its gains depend on no measurement, so they are made ahead of time."""
+"""The Kalman filter about a plan, in square-root form: its gains depend on no measurement, so they are computed ahead.
+
+The filter propagates square roots of its covariances by orthogonal transformations, and never subtracts covariances.
+They stay positive semidefinite, and the standard deviation of each entry keeps its own relative precision, whether
+sensors are exact, measure the same twice, or unknowns are nearly the same.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.uncertainty import triangular_root
 from lqrsim.errors import Array, InputError
 
-TINY = 1e-12  # of the largest variance of what is measured: sensors without noise would make a singular matrix
+# The least noise of a measured number, relative to the standard deviation with which it is predicted. Of exact or
+# redundant sensors it makes something that can be inverted; it smooths what a rank decision would make a cliff.
+RESOLUTION = 1e-6
+NOTHING = 1e-150  # the same, where there is no doubt about the prediction: its square is still a number
 
 
 class KalmanFilter(NamedTuple):
-    """What a filter is made of.
+    """A filter's gains and covariances.
 
     Attributes:
-      gain: K, (T+1, Z, Y). predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
-      corrected: after it. innovation: covariance of what a measurement differs by from what was expected, (T+1, Y, Y).
+      gain: K, (T+1, Z, Y).
+      predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
+      corrected: after it, (T+1, Z, Z).
+      corrected_root: lower triangular square roots of these, (T+1, Z, Z).
+      innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
     """
 
     gain: Array
     predicted: Array
     corrected: Array
+    corrected_root: Array
     innovation: Array
 
 
@@ -28,42 +42,45 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     """The filter of a plan's model.
 
     Args:
-      known: covariance (Z, Z) after the measurement of the first knot, if that is taken in already: the gain there
-        is zero. By default the model's start, before it.
+      known: square root (Z, Z) of the covariance after the measurement of the first knot, if that measurement has been
+        used already: the gain there is zero. By default the filter begins before it, with the model's start.
     """
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
-    gain = np.empty((knots, size, measured))
-    predicted, corrected = np.empty((knots, size, size)), np.empty((knots, size, size))
-    innovation = np.empty((knots, measured, measured))
-    F, H, noise, fresh = model.F, model.H, model.measurement_noise, model.process_noise
-    P = model.start if known is None else known
+    gain, innovation = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
+    before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
+    root = model.start_root if known is None else known
     for t in range(knots):
-        predicted[t] = P
-        seen = P[:, :n] @ H[t].T  # of z with what is measured
-        S = H[t] @ seen[:n] + noise[t]
-        S = 0.5 * (S + S.T)
-        S[np.diag_indices(measured)] += TINY * S.diagonal().max() + 1e-30
-        K = np.linalg.solve(S, seen.T).T
-        if t == 0 and known is not None:
-            K = np.zeros_like(K)
-        P = P - K @ seen.T
-        P = 0.5 * (P + P.T)
-        gain[t], corrected[t], innovation[t] = K, P, S
+        before[t] = root
+        expected, noise = model.H[t] @ root[:n], model.measurement_root[t]
+        least = np.maximum(RESOLUTION * np.sqrt((expected**2).sum(axis=1) + (noise**2).sum(axis=1)), NOTHING)
+        # [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
+        array = np.zeros((measured + size, n + measured + root.shape[1]))
+        array[:measured, :n], array[:measured, n : n + measured] = noise, np.diag(least)
+        array[:measured, n + measured :], array[measured:, n + measured :] = expected, root
+        array = triangular_root(array)
+        S = array[:measured, :measured]
+        innovation[t] = S @ S.T
+        if t or known is None:
+            gain[t] = solve_triangular(S, array[measured:, :measured].T, lower=True, trans=1).T
+            root = array[measured:, measured:]
+        after[t] = root
         if t + 1 < knots:
-            P = F[t] @ P @ F[t].T + fresh[t]
-    return KalmanFilter(gain, predicted, corrected, innovation)
+            root = triangular_root(np.concatenate([model.F[t] @ root, model.process_root[t]], axis=1))
+    return KalmanFilter(gain, before @ before.transpose(0, 2, 1), after @ after.transpose(0, 2, 1), after, innovation)
 
 
 def check_observable(who: str, model: PlanModel) -> None:
-    """Raise InputError for an unknown that changes nothing of what is measured, by name."""
+    """Raise InputError for an unknown that moves the robot and changes nothing of what is measured, by name."""
     first = model.n + model.lagging
-    effect, seen = np.eye(model.size)[:, first:], np.zeros(model.size - first)
+    effect = np.eye(model.size)[:, first:]
+    moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
+        moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
         seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
         if t < model.plan.steps:
             effect = model.F[t] @ effect
     for unknown, own in zip(model.remembered, model.own_states, strict=True):
-        if (unknown.std or unknown.drift) and not seen[own].max() > 0:
+        if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
                 f"{who}: unknowns: got {unknown.name}, which changes nothing of what is measured ({measured}),"

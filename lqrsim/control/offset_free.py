@@ -1,7 +1,6 @@
-"""Output feedback that, by the linear model, leaves no steady error.
+"""Output feedback without steady errors, by the linear model.
 
-A Kalman filter estimates the state, what the actuators have reached, and what disturbs the robot; a tracking law
-follows all of it.
+A Kalman filter estimates the state, the actuators' outputs and the unknowns; a tracking law acts on all of it.
 """
 
 from dataclasses import replace
@@ -10,16 +9,13 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import FilterLaw
-from lqrsim.control.filter_run import FilterRun, empty_records
+from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
-from lqrsim.control.loop_moments import Loop
-from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.policy_of_filter import policy_of
+from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
-from lqrsim.control.sensors import Sensors, sensor_of
-from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
+from lqrsim.control.tracking import Prediction, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
@@ -31,34 +27,39 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution
 
 MEMORY = 5.0  # s
-INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
+# The least errors that a filter assumes, relative to the tolerated effort: of each control; and of each state's
+# prediction, as if so much effort had moved it. A model is never exact: what acts does not act evenly over a control
+# period, integration has errors, and the gains are those about the plan. With exact sensors a filter that does not
+# know this reads unknowns from the last digits of its prediction errors.
+INEXACT = 0.02
 
 
 class OffsetFree(Controller):
-    """Estimates the state, the actuators and what disturbs the robot, and keeps to the plan by all of it.
+    """Keeps to a plan with estimates of the state, the actuators and the unknowns.
 
-    The filter's gains are made ahead of time, about the plan; it predicts with the model itself, with the unknowns as
-    they are estimated. A measurement that is the last one to the last bit got lost, and is predicted. One that is late
-    by `uncertainty.latency` is taken in where it belongs. Commands count as they are after saturation, so that nothing
-    winds up.
+    Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
+    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
+    `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
+    winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
+    states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` has what it assumes.
 
     Args:
       problem: that was solved.
       solution: its solution, or any with a plan of the same system.
-      uncertainty: what the run meets, as `uncertainty_of` makes it. What varies may have a mean, too, and what is
-        constant may change, in `memory` seconds by about its standard deviation: see `Uncertainty.steady`.
+      uncertainty: of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean, and
+        constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
       effort: as in `track`.
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter.
-      record: whether runs keep what the filter makes of them, for holding it against `filter`; see below.
-      replan_every: seconds, rounded to control periods, after which it is looked at, again and again, whether the law
-        still leads to the goal and clear of obstacles: by the model, from the estimated state and with the estimated
-        constants. Where it does not, what is left of the horizon is solved from there; by default never. Where a solve
-        does not succeed, the law before goes on. Costs that depend on the step's number are not supported then.
-      replan_always: whether to solve at each of these times, wherever the law leads.
+      record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
+      replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
+        without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
+        the horizon is solved from there. If the solve fails, the law stays in force. By default, no checks. Costs that
+        depend on the step's number are then not supported.
+      replan_always: whether to solve at each of these times without a check.
 
     A run of it, which is a rollout's `controller_run`, has these attributes:
 
@@ -109,7 +110,7 @@ class OffsetFree(Controller):
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
-        self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
+        self.model = for_filter(PlanModel.of(problem.dynamics, plan, uncertainty, sensor), memory, efforts)
         check_observable("OffsetFree", self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
@@ -126,14 +127,14 @@ class OffsetFree(Controller):
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
-        """Of the tolerances, or of those that are chosen."""
+        """The weights of the given tolerances, or of chosen ones."""
         if tolerate is not None:
             return Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
         controls = self.solution.policy.control_coordinates
         low, high = np.array(controls.low), np.array(controls.high)
         surroundings = Surroundings.of(self.problem, self.uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> Prediction:
+        def predicted(tried: Weights) -> list[Prediction]:
             radius = self.solution.goal_radius
             return with_filter(self.model, self.filter, tried, (low, high), surroundings, radius)
 
@@ -150,28 +151,28 @@ class OffsetFree(Controller):
         return self.solution
 
     def _check_one_plan(self, what: str) -> None:
-        """Raise InputError if there will be others: no matrices are known of these ahead of time."""
+        """Raise InputError if the law re-plans: matrices about later plans are not known in advance."""
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
-    def loop(self) -> Loop:
-        """The closed loop about the plan, as matrices, with the uncertainty as it was stated.
+    def loop(self) -> LinearLoop:
+        """Return the closed loop about the plan as matrices, under the uncertainty as stated.
 
         Raises:
-          InputError: with `replan_every`, for then there are other plans.
+          InputError: with `replan_every`, which makes other plans.
         """
         self._check_one_plan("loop")
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
-        return Loop(truth, self.gain, offset, self.filter.gain, *self._law.limits)
+        return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits)
 
     @property
     def policy(self) -> OutputFeedbackPolicy:
-        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file.
+        """Filter and law for a robot, in NumPy alone, with predictions that are linear about the plan; `save` takes it.
 
         Raises:
-          InputError: with `replan_every`: NumPy alone solves nothing.
+          InputError: with `replan_every`, which needs a solver.
         """
         self._check_one_plan("policy")
         return policy_of(self._law)
@@ -195,11 +196,20 @@ class OffsetFree(Controller):
         return self._law.coordinates
 
 
-def for_filter(uncertainty: Uncertainty, memory: float, effort: Array, problem: Problem) -> Uncertainty:
-    """What a filter is to believe: see `Uncertainty.steady`; and that no command is carried out exactly.
+def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
+    """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
 
-    Without that, a filter that is told of no noise would listen to no measurement.
+    Args:
+      model: with the uncertainty as stated.
+      memory: seconds.
+      effort: of the controls, (m,).
     """
-    stated = per_entry("Uncertainty: control", uncertainty.control, problem.dynamics.control_coordinates)
-    wrong = np.hypot(stated, INEXACT * effort)
-    return replace(uncertainty.steady(memory), control=tuple(wrong.tolist()))
+    stated, space = model.uncertainty, model.dynamics.state_coordinates
+    moved = unit_means(space.units, reach_of(model, effort, 2)[2])
+    control = per_entry("Uncertainty: control", stated.control, model.dynamics.control_coordinates)
+    error = per_entry("Uncertainty: model_error", stated.model_error, space)
+    assumed = replace(
+        stated.steady(memory), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+        model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
+    )  # fmt: skip
+    return replace(model, uncertainty=assumed)

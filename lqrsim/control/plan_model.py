@@ -9,23 +9,109 @@ c is what the lag does to a plan that does not know of it: the actuators' nomina
 the planned controls.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
-from lqrsim.codegen.sources import source_of
-from lqrsim.control.law import turning_of
-from lqrsim.control.sensors import Sensor, sensor_of
-from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
-from lqrsim.errors import Array
+from lqrsim.codegen.sources import Source, source_of, text_source
+from lqrsim.codegen.user_functions import check_signature, name_of
+from lqrsim.control.controllers import turning_of
+from lqrsim.control.uncertainty import (
+    GAIN,
+    OFFSET,
+    ShapingFilter,
+    Uncertainty,
+    Unknown,
+    per_entry,
+    shaping_filter,
+    triangular_root,
+)
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import estimation
 from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.compiled import dynamics_model
+
+# None for all states, names of states, a matrix (Y, n), or a function h(x, u, p) of SymPy symbols.
+Sensors = None | Sequence[str] | npt.ArrayLike | Callable[[Any, Any, Any], Any]
+
+
+class Sensor(NamedTuple):
+    """A function of the state that is measured.
+
+    Attributes:
+      source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
+      data: what these take. size: Y, how many numbers there are. names: what messages call them.
+    """
+
+    source: Source
+    data: Array
+    size: int
+    names: tuple[str, ...]
+
+
+def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
+    """Return the sensor for a user's `sensors`.
+
+    Raises:
+      InputError: there is no such state, a matrix of another shape, or a function that depends on what is no state.
+    """
+    if sensors is None:
+        sensors = space.names
+    if callable(sensors):
+        return _symbolic(sensors, len(space))
+    if isinstance(sensors, str):
+        raise InputError(f"sensors: got {excerpt(sensors)}, want a tuple of names: ({excerpt(sensors)},)")
+    listed: Any = sensors
+    if isinstance(listed, (list, tuple)) and all(isinstance(one, str) for one in listed):
+        names = check_items("sensors", listed, str, f"a tuple of names of states, of {', '.join(space.names)}")
+        if not names or len(set(names)) < len(names):
+            raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, and each once")
+        chosen = [space.names.index(check_name("sensors", name, space.names)) for name in names]
+        source = "def measure(x, data, out):\n" + "".join(f"    out[{i}] = x[{j}]\n" for i, j in enumerate(chosen))
+        source += "def measure_slope(x, data, out):\n"
+        source += "".join(f"    out[{i}, {j}] = 1.0\n" for i, j in enumerate(chosen))
+        return Sensor(text_source(source, "sensors"), np.zeros(1), len(names), names)
+    matrix = check_array("sensors", listed, (None, len(space)))
+    if not len(matrix):
+        raise InputError("sensors: got no rows, want a matrix with one for each number that is measured")
+    rows = len(matrix)
+    source = f"def measure(x, data, out):\n    for i in range({rows}):\n        out[i] = 0.0\n"
+    source += "        for j in range(N):\n            out[i] += data[N * i + j] * x[j]\n"
+    source += f"def measure_slope(x, data, out):\n    for i in range({rows}):\n        for j in range(N):\n"
+    source += "            out[i, j] = data[N * i + j]\n"
+    return Sensor(
+        text_source(source, "sensors"), matrix.ravel().copy(), rows, tuple(f"row {i} of sensors" for i in range(rows))
+    )
+
+
+def _symbolic(function: Callable[[Any, Any, Any], Any], states: int) -> Sensor:
+    """The sensor of a formula of the state."""
+    check_signature(function, ("x", "u", "p"))
+    of = name_of(function)
+
+    def make() -> dict[str, Any]:
+        values, x, _ = symbolic.trace(function, states, 0, [])
+        slopes = {(i, j): value.diff(xj) for i, value in enumerate(values) for j, xj in enumerate(x)}
+        slopes = {f"out[{i}, {j}]": slope for (i, j), slope in slopes.items() if slope != 0}
+        assigned = {f"out[{i}]": value for i, value in enumerate(values)}
+        source = symbolic.write_function("measure", "x, data, out", "data", assigned, of=of)
+        source += symbolic.write_function("measure_slope", "x, data, out", "data", slopes, of=of)
+        return {"source": source, "size": len(values)}
+
+    made = symbolic.kept(function, ("sensor", states), make, source=str, size=int)
+    size = int(made["size"])
+    return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
+
 
 STEP = 1e-5  # of a parameter for differences, relative to its value where that is larger than 1
 
@@ -74,7 +160,7 @@ class PlanModel:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What messages call the entries of z, (Z,)."""
+        """Names of the entries of z for messages, (Z,)."""
         controls = self.dynamics.control_coordinates.names[: self.lagging]
         unknowns = (one.name for one, own in zip(self.remembered, self.own_states, strict=True) for _ in own)
         return (*self.dynamics.state_coordinates.names, *(f"what {one} has reached" for one in controls), *unknowns)
@@ -106,7 +192,7 @@ class PlanModel:
     @cached_property
     def own_states(self) -> list[range]:
         """Which of the unknowns' states are those of each remembered one."""
-        ends = np.cumsum([0, *(len(part[0]) for part in self._filters)])
+        ends = np.cumsum([0, *(len(part.output) for part in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]
 
     @property
@@ -123,24 +209,24 @@ class PlanModel:
         return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
 
     @cached_property
-    def _filters(self) -> list[tuple[Array, Array, Array, Array]]:
+    def _filters(self) -> list[ShapingFilter]:
         return [shaping_filter(one, self.plan.dt) for one in self.remembered]
 
     @cached_property
     def transition(self) -> Array:
         """Of the unknowns' states, (D, D)."""
-        return _diagonal([part[0] for part in self._filters])
+        return _diagonal([part.transition for part in self._filters])
 
     @cached_property
     def output(self) -> Array:
         """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
         columns = [
-            self._column(one)[:, None] * part[2] for one, part in zip(self.remembered, self._filters, strict=True)
+            self._column(one)[:, None] * part.output for one, part in zip(self.remembered, self._filters, strict=True)
         ]
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
     def _column(self, unknown: Unknown) -> Array:
-        """Its shares of these values."""
+        """Its shares of these values, (P + 2 m,)."""
         controls, own = self.dynamics.control_coordinates.names, len(self.parameters)
         column = np.zeros(own + 2 * self.m)
         for name, share in unknown.shares.items():
@@ -154,7 +240,7 @@ class PlanModel:
 
     @cached_property
     def predictor(self) -> Predictor:
-        """What takes estimates on."""
+        """Record for the compiled predictions."""
         lag = np.array([self.lag.left, self.lag.mean])
         return Predictor(self.compiled_dynamics, self.plan.dt, self.places, lag, self.transition, self.output)
 
@@ -272,39 +358,46 @@ class PlanModel:
         self.compiled.sensor_slopes(len(H), in_c_order(self.plan.states), self.compiled_sensor, H)
         return H
 
-    # Noise.
+    # Noise, as square roots: a root times its transpose is the covariance.
 
     @cached_property
-    def start(self) -> Array:
-        """Covariance of z at the start, (Z, Z)."""
+    def start_root(self) -> Array:
+        """Of the covariance of z at the start, (Z, Z)."""
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
-        return _diagonal([np.diag(std**2), at_rest, *(part[3] for part in self._filters)])
+        return _diagonal([np.diag(std), at_rest, *(part.start for part in self._filters)])
+
+    @cached_property
+    def process_root(self) -> Array:
+        """Of the covariance of w, (T, Z, Z), lower triangular."""
+        n, first, steps = self.n, self.n + self.lagging, self.plan.steps
+        states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
+        commanded = self.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
+        white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
+        pushed = np.zeros((steps, self.size, len(white)))
+        if white:
+            pushed[:, :n] = self.effects @ np.array(white).T
+        error = np.zeros((self.size, n))
+        error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
+        fresh = np.zeros((self.size, self.size - first))
+        fresh[first:] = _diagonal([part.noise for part in self._filters])
+        own = [np.tile(one, (steps, 1, 1)) for one in (error, fresh)]
+        return triangular_root(np.concatenate([commanded, pushed, *own], axis=2))
 
     @cached_property
     def process_noise(self) -> Array:
         """Covariance of w, (T, Z, Z)."""
-        n, white = self.n, [one for one in self.uncertainty.unknowns if one.white]
-        std = per_entry("Uncertainty: control", self.uncertainty.control, self.dynamics.control_coordinates)
-        commanded = self.G * std  # before the lag: what the actuators have reached keeps some of it
-        noise = commanded @ commanded.transpose(0, 2, 1)
-        for one in white:
-            onto = self.effects @ (one.std * self._column(one))
-            noise[:, :n, :n] += onto[:, :, None] * onto[:, None, :]
-        first = n + self.lagging
-        noise[:, first:, first:] = _diagonal([part[1] for part in self._filters])
-        return noise
+        return self.process_root @ self.process_root.transpose(0, 2, 1)
 
     @cached_property
-    def shown_noise(self) -> Array:
-        """Variance of the noise on each state that is shown, (n,)."""
-        space = self.dynamics.state_coordinates
-        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, space) ** 2
+    def shown_std(self) -> Array:
+        """Standard deviation of the noise on each state that is shown, (n,)."""
+        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, self.dynamics.state_coordinates)
 
     @cached_property
-    def measurement_noise(self) -> Array:
-        """Covariance of v, (T+1, Y, Y)."""
-        return (self.H * self.shown_noise) @ self.H.transpose(0, 2, 1)
+    def measurement_root(self) -> Array:
+        """Of the covariance of v, (T+1, Y, n)."""
+        return self.H * self.shown_std
 
 
 def _diagonal(blocks: list[Array]) -> Array:

@@ -1,7 +1,6 @@
-"""Solving again as a robot goes: what is solved, when and from where, and how that went.
+"""Re-planning: what is solved, when and from where, and the log of the solves.
 
-`replanner.py` has the two ways to run it, of which `live_replanner.py` is the one on a robot, in a thread;
-`replanned.py` runs it within output feedback.
+`replanner.py` runs it, in simulations or on a robot; `replanned.py` runs it within output feedback.
 """
 
 import math

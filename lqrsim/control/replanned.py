@@ -1,4 +1,4 @@
-"""Output feedback that plans again where its law no longer leads to the goal, with what it has estimated in the model.
+"""Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
 At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
 constants at their estimated values. Where that collides or misses the goal, what is left of the horizon is solved from
@@ -16,8 +16,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.filter_law import FilterLaw
-from lqrsim.control.filter_run import FilterRun
+from lqrsim.control.filter_law import FilterLaw, FilterRun
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
@@ -30,7 +29,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 
 
 class ReplannedRun(ControllerRun):
-    """A run whose trials have a law each.
+    """A run in which each trial has its own law.
 
     Args:
       rule: when it is looked at whether to solve.
@@ -86,7 +85,7 @@ class ReplannedRun(ControllerRun):
         return near and (clearance is None or bool(clearance.min() >= 0))
 
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:
-        """The law from now on is about a new plan, if there is one."""
+        """Replace the law of a trial by one about a new plan, if needed and found."""
         law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
         granted = np.where(np.logical_and(in_parameters(model), constants(model)), z[n + model.lagging :], 0.0)
@@ -117,12 +116,12 @@ class ReplannedRun(ControllerRun):
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that is taken in already.
-        kalman = kalman_filter(about, law.filter.corrected[done])
+        kalman = kalman_filter(about, law.filter.corrected_root[done])
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 
 def constants(model: PlanModel) -> Array:
-    """Which of the unknowns' states are constants, (D,): what will still be so at the end of the horizon."""
+    """Which of the unknowns' states are constants, (D,): they keep their value to the end of the horizon."""
     found = np.zeros(len(model.transition), dtype=bool)
     for one, own in zip(model.remembered, model.own_states, strict=True):
         found[list(own)] = one.constant
@@ -130,7 +129,7 @@ def constants(model: PlanModel) -> Array:
 
 
 def in_parameters(model: PlanModel) -> Array:
-    """Which of the unknowns' states do nothing but change parameters of the dynamics, (D,)."""
+    """Which of the unknowns' states change only parameters of the dynamics, (D,)."""
     moved = (model.output != 0).any(axis=0)
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
     return moved & ~beyond

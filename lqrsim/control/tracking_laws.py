@@ -1,13 +1,12 @@
-"""Laws that keep a robot on a plan, whatever the plan was for: one more backward pass, about the plan.
+"""Tracking laws: one more backward pass, which minimises deviations from a plan instead of its cost.
 
-The policy of `smooth` minimises the plan's cost, which mostly does not mind being off the plan. A tracking law
-minimises the deviation: with z = (e, a, d) as in `plan_model.py` and u the deviation of the command,
+It minimises, with z = (e, a, d) as in `plan_model.py` and u the deviation of the command,
 
     sum_t  e' Q e + (u + M_t d)' R (u + M_t d)  +  e_T' Q_T e_T.
 
-M_t d is what of the unknowns' effect on the next state the controls can undo: a control that only does that costs
-nothing, or a steady disturbance would leave a steady error. For the same reason a law takes it that what disturbs the
-robot now will go on as it is: one that counts on a wind to abate gives way to one that does not.
+M_t d is the control that cancels the unknowns' effect on the next state as far as controls can. It costs nothing;
+otherwise a steady disturbance would leave a steady error. For the same reason a law assumes that the current
+disturbance continues: a law that expects a wind to abate yields to one that does not.
 """
 
 from dataclasses import dataclass
@@ -29,10 +28,12 @@ AT_END = 0.1
 
 @dataclass(frozen=True)
 class Weights:
-    """What deviations from a plan cost: 1 for what is just tolerated.
+    """Weights of deviations from a plan: a deviation that is just tolerated costs 1.
 
     Attributes:
-      state: the diagonal of Q, (n,). control: of R, (m,). end: of Q_T, (n,).
+      state: the diagonal of Q, (n,); or of several to compare, (C, n).
+      control: of R, (m,).
+      end: of Q_T, likewise.
     """
 
     state: Array
@@ -41,7 +42,7 @@ class Weights:
 
     @classmethod
     def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: float = AT_END) -> "Weights":
-        """Of tolerances in the states' units and efforts (m,) in the controls'.
+        """The weights for tolerances in the states' units and efforts (m,) in the controls'.
 
         Args:
           at_end: of the position, relative to before; of all states where there is none.
@@ -57,20 +58,24 @@ class Weights:
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
-    """What may be added to each control, (m,). Raises InputError as `Weights.of`, or where there are no limits."""
+    """Return the tolerated effort of each control, (m,); by default a share of its range.
+
+    Raises:
+      InputError: as `Weights.of`, or there is neither an effort nor a range.
+    """
     controls = dynamics.control_coordinates
     if effort is not None:
         return per_entry("effort", effort, controls, above=0.0)
     ranges = np.subtract(controls.high, controls.low)
     for name, size in zip(controls.labels, ranges, strict=True):
         if not np.isfinite(size):
-            raise InputError(f"effort: got none, and {name} has no limits to take it from, want it in its unit")
+            raise InputError(f"effort: got none, and {name} has no limits to derive it from, want effort= in its unit")
     return CONTROL_SHARE * ranges
 
 
 @dataclass(frozen=True)
 class Averse:
-    """Noise on the states about a plan, and how much large deviations are dreaded.
+    """Noise on the states about a plan, and the aversion to large deviations.
 
     Attributes:
       matrices: M (T, n, k), at each step. risk: theta, of 1/2 the sum that the law minimises.
@@ -80,7 +85,7 @@ class Averse:
     risk: float
 
     def worst(self, t: int, S: Array, s: Array) -> tuple[Array, Array]:
-        """What 1/2 y'Sy + s'y is taken for at t + 1, where noise gets it to: S + S Y S and s + S Y s.
+        """Hessian and gradient of the cost-to-go at t + 1 under the worst noise: S + S Y S and s + S Y s.
 
         Raises:
           np.linalg.LinAlgError: the risk is too high.
@@ -94,43 +99,42 @@ class Averse:
 
 
 def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> tuple[Array, Array]:
-    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m)."""
+    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z)."""
     n, m, steps = model.n, model.m, model.plan.steps
-    own = n + model.lagging  # what the controls can do something about
+    own = n + model.lagging  # states that controls can move
     F, G, c = model.F[:, :own, :own], model.G[:, :own], model.c[:, :own]
     E = model.F[:, :own, own:]
-    Q, R = np.zeros((own, own)), np.diag(weights.control)
-    Q[range(n), range(n)] = weights.state
-    undo = R @ _undoing(model, weights)
-    gain, offset = np.empty((steps, m, model.size)), np.empty((steps, m))
-    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a); what d alone costs changes no law.
-    S, D, s = np.zeros((own, own)), np.zeros((own, E.shape[2])), np.zeros(own)
-    S[range(n), range(n)] = weights.end
+    many = weights.state.shape[:-1]
+    Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
+    Q[..., range(n), range(n)] = weights.state
+    undo = np.moveaxis(R @ _undoing(model, weights), -3, 0)
+    gain, offset = np.empty((*many, steps, m, model.size)), np.empty((*many, steps, m))
+    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a). The cost of d alone does not
+    # change the law. `ahead` is (D, s).
+    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, E.shape[2] + 1))
+    S[..., range(n), range(n)] = weights.end
     for t in range(steps - 1, -1, -1):
         if averse is not None:
-            S, s = averse.worst(t, S, s)
-        SF, ahead = S @ F[t], S @ E[t] + D
-        slope = S @ c[t] + s
-        to_control = G[t].T
-        right = np.concatenate([to_control @ SF, to_control @ ahead + undo[t], (to_control @ slope)[:, None]], axis=1)
-        law = -np.linalg.solve(R + to_control @ S @ G[t], right)
-        gain[t], offset[t] = law[:, :-1], law[:, -1]
-        left = F[t].T
-        cross = SF.T @ G[t]
-        S = Q + left @ SF + cross @ law[:, :own]
-        S = 0.5 * (S + S.T)
-        D = left @ ahead + cross @ law[:, own:-1]
-        s = left @ slope + cross @ law[:, -1]
+            S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
+        slope = S @ np.concatenate([F[t], E[t], c[t][:, None]], axis=1)
+        slope[..., own:] += ahead
+        right = G[t].T @ slope
+        right[..., own:-1] += undo[t]
+        law = -np.linalg.solve(R + G[t].T @ S @ G[t], right)
+        gain[..., t, :, :], offset[..., t, :] = law[..., :-1], law[..., -1]
+        left = F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law
+        S, ahead = Q + left[..., :own], left[..., own:]
+        S = 0.5 * (S + np.swapaxes(S, -1, -2))
     return gain, offset
 
 
 def _undoing(model: PlanModel, weights: Weights) -> Array:
-    """M, (T, m, D): the controls that undo, in one step and as far as they can, what the unknowns do."""
+    """M, (T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can."""
     B = model.jacobian[:, :, model.n :]
-    weighed = B.transpose(0, 2, 1) * weights.state
+    weighed = B.transpose(0, 2, 1) * weights.state[..., None, None, :]
     curve = weighed @ B
-    curve += 1e-9 * np.trace(curve, axis1=1, axis2=2)[:, None, None] * np.eye(model.m) + 1e-300 * np.eye(model.m)
-    return np.linalg.solve(curve, weighed @ model.E)
+    least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
+    return np.linalg.solve(curve + least[..., None, None] * np.eye(model.m), weighed @ model.E)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:

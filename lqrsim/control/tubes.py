@@ -1,7 +1,7 @@
-"""Where a closed loop will be: the covariance of its deviation from the plan, and how likely it is to collide.
+"""Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and known before any run; `loop_moments.py` has the recursion.
+are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.loop_moments import Loop
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import check_plan
@@ -126,11 +126,11 @@ def predict_tube(
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         space = policy.control_coordinates
-        loop = Loop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
+        loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
     return tube_of(loop, Surroundings.of(problem, uncertainty.obstacles))
 
 
-def tube_of(loop: Loop, surroundings: Surroundings) -> Tube:
+def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
     """The tube of a closed loop among obstacles. Raises InputError for what the linear model does not have."""
     model = loop.model
     for field in ("latency", "delay"):

@@ -6,6 +6,7 @@ person with a robot of their own can write one down.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from lqrsim.results.coordinates import Coordinates
 PerEntry = float | Sequence[float] | Mapping[str, float]
 
 MEAN = 0.5  # standard deviation of the mean of what varies, for a filter, relative to its own
+SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 
 
@@ -106,6 +108,8 @@ class Uncertainty:
       start: standard deviation of where a run begins, of each state.
       control: of white noise on each control.
       measurement: of white noise on each state that is measured.
+      model_error: of what the model mispredicts of each state in one control period, white noise as well. A filter
+        assumes some whatever is stated here; see `OffsetFree`.
       lag: time constant in s with which the actuators follow their commands.
       delay: control periods by which commands come late.
       latency: by which measurements do.
@@ -121,6 +125,7 @@ class Uncertainty:
     start: PerEntry = 0.0
     control: PerEntry = 0.0
     measurement: PerEntry = 0.0
+    model_error: PerEntry = 0.0
     lag: float = 0.0
     delay: int = 0
     latency: int = 0
@@ -152,6 +157,7 @@ class Uncertainty:
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
         per_entry("Uncertainty: start", self.start, states)
         per_entry("Uncertainty: measurement", self.measurement, states)
+        per_entry("Uncertainty: model_error", self.model_error, states)
         per_entry("Uncertainty: control", self.control, controls)
         for unknown in self.unknowns:
             for name in unknown.shares:
@@ -240,22 +246,54 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
     return values
 
 
-def shaping_filter(unknown: Unknown, dt: float) -> tuple[Array, Array, Array, Array]:
-    """The process as x' = F x + w, its value h x: F (k, k), the covariance of w (k, k), h (k,), covariance of x at 0.
+class ShapingFilter(NamedTuple):
+    """An unknown as the output h x of x' = F x + w, with k states: 0 for white noise, else its order.
 
-    k is 0 for what is white, 1 or 2. The second order is made of p, with p'' + 2 p' + p = 2 w, and p', which are of
-    variance 1 each and uncorrelated when stationary.
+    Attributes:
+      transition: F, (k, k).
+      noise: a square root of the covariance of w, (k, k).
+      output: h, (k,).
+      start: a square root of the covariance of x at the start, (k, k).
+    """
+
+    transition: Array
+    noise: Array
+    output: Array
+    start: Array
+
+
+def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
+    """The shaping filter of an unknown for a control period of dt seconds.
+
+    That of second order has the states p and p', with p'' + 2 p' + p = 2 w in time constants. Stationary, they have
+    variance 1 and are uncorrelated.
     """
     std, drift = unknown.std, unknown.drift
     if unknown.white:
-        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0))
+        return ShapingFilter(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
     step = dt / unknown.time_constant
     keep = np.exp(-step)
     if unknown.order == 1:
-        fresh = std * std * -np.expm1(-2 * step) + drift * drift * dt  # one of the two is zero
-        return np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std * std)
+        fresh = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
+        return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std))
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
-    return F, np.eye(2) - F @ F.T, std / 2 * np.array([1.0, np.sqrt(3.0)]), np.eye(2)
+    # The integral of e^As b b' e^A's over the period. I - F F' is the same and cancels if the period is short.
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    length = min(step, 40.0)
+    s = 0.5 * length * (nodes + 1)
+    noise = np.sqrt(0.5 * length * weights) * 2 * np.exp(-s) * np.array([s, 1 - s])
+    return ShapingFilter(F, triangular_root(noise), std / 2 * np.array([1.0, np.sqrt(3.0)]), np.eye(2))
+
+
+def triangular_root(root: Array) -> Array:
+    """The lower triangular (..., n, n) whose product with its transpose is that of root (..., n, k).
+
+    By an orthogonal transformation: nothing is squared, so that each row keeps its own precision, whatever its size.
+    """
+    rows, columns = root.shape[-2:]
+    if columns < rows:
+        root = np.concatenate([root, np.zeros((*root.shape[:-1], rows - columns))], axis=-1)
+    return np.swapaxes(np.linalg.qr(np.swapaxes(root, -1, -2), mode="r"), -1, -2)
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
@@ -266,9 +304,7 @@ def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
     """
     total = Uncertainty()
     for one in parts:
-        numbers = {
-            name: _added(name, getattr(total, name), getattr(one, name)) for name in ("start", "control", "measurement")
-        }
+        numbers = {name: _added(name, getattr(total, name), getattr(one, name)) for name in SUMMED}
         total = Uncertainty(
             unknowns=(*total.unknowns, *one.unknowns),
             **numbers,

@@ -1,4 +1,4 @@
-"""Scenarios as environments of Gymnasium; the extra `gym` brings what it needs.
+"""Scenarios as environments of Gymnasium; needs the extra `gym`.
 
     import gymnasium
     import lqrsim.gym
@@ -12,7 +12,7 @@ Importing this registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lq
 try:
     import gymnasium
 except ModuleNotFoundError as error:
-    raise ImportError(f"lqrsim.gym: {error}; want what `pip install 'lqrsim[gym]'` installs") from None
+    raise ImportError(f"lqrsim.gym: {error}; run: pip install 'lqrsim[gym]'") from None
 
 from lqrsim.gym.environment import Environment
 from lqrsim.gym.expert import Expert

@@ -1,22 +1,23 @@
-"""The closed loop of `simulate`, a control period at a time, with whoever acts from outside as its controller."""
+"""The closed loop of `simulate`, one control period at a time, with commands from outside."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from lqrsim.control import law
-from lqrsim.control.controllers import Controller, ControllerRun
-from lqrsim.errors import Array
-from lqrsim.gym.task import Flags, Task, Trials
+from lqrsim.control.controllers import Controller, ControllerRun, turn_to_nearest
+from lqrsim.errors import Array, InputError
+from lqrsim.gym.task import EpisodeTrials, Flags, Task
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
 from lqrsim.scenes.scene import unlogged
-from lqrsim.simulation.closed_loop import Loop
+from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.run_settings import RunSettings
 
 
 class Commanded(Controller):
-    """What is commanded from outside."""
+    """A controller whose commands come from outside."""
 
     def __init__(self, coordinates: tuple[Coordinates, Coordinates]) -> None:
         self._coordinates = coordinates
@@ -34,7 +35,7 @@ class Commanded(Controller):
 
 
 class CommandedRun(ControllerRun):
-    """Its `commands` (K, m) are set before each control period."""
+    """Set `commands` (K, m) before each control period."""
 
     def __init__(self, commands: Array) -> None:
         self.commands = commands
@@ -45,7 +46,7 @@ class CommandedRun(ControllerRun):
 
 @dataclass(frozen=True)
 class Moment:
-    """What a control period came to, of K trials: observations (K, n+1), rewards (K,), and who ended by what (K,)."""
+    """The result of a control period of K trials: observations (K, n+1), rewards and flags, (K,) each."""
 
     observations: Array
     rewards: Array
@@ -53,14 +54,52 @@ class Moment:
     truncated: Flags
 
 
+class Resettable:
+    """What `Environment` and `VectorEnvironment` share: a task, and its current episode."""
+
+    task: Task
+    _seed: int | None = None
+    _next_trial = 0
+    _episode: "Episode | None" = None
+
+    @property
+    def solution(self) -> Solution:
+        """The solution with the plan."""
+        return self.task.solution
+
+    def rollout(self) -> Rollout:
+        """The current episode so far, as `simulate` records it, for `render`, `outcomes` and `save`."""
+        return self._current().rollout()
+
+    def _begin(
+        self, seed: int | None, random: np.random.Generator, options: Any, count: int, *, frames: bool,
+        threads: int | None,
+    ) -> "Episode":  # fmt: skip
+        """Begin an episode of `count` trials: the first ones of a seed, or those after the last episode."""
+        if seed is not None:
+            self._seed, self._next_trial = seed, 0
+        elif self._seed is None:
+            self._seed = int(random.integers(2**63))
+        assert self._seed is not None
+        trials = self.task.trials(self._seed, self._next_trial, options)
+        self._episode = Episode(self.task, trials, count, frames=frames, threads=threads)
+        self._next_trial = trials.first + count
+        return self._episode
+
+    def _current(self) -> "Episode":
+        if self._episode is None:
+            raise InputError("no episode: call reset() first")
+        return self._episode
+
+
 class Episode:
-    """One run of K trials of a task. Who has ended stays as it is, without a reward, until all have.
+    """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
     Attributes:
-      ended: (K,) whose episode is over. outcomes: (K,) how; empty for those that go on.
+      ended: (K,) whether each episode has ended. outcomes: (K,) how; empty for those that go on.
     """
 
-    def __init__(self, task: Task, trials: Trials, count: int, *, frames: bool, threads: int | None) -> None:
+    def __init__(self, task: Task, trials: EpisodeTrials, count: int, *, frames: bool, threads: int | None) -> None:
         self.task, self.trials = task, trials
         dynamics = task.plant.robot.dynamics
         commanded = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
@@ -70,7 +109,7 @@ class Episode:
             generators=None, progress=None, watch=None, **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, settings.trajectory
-        self._loop = Loop(settings)
+        self._loop = ClosedLoop(settings)
         self._loop.begin()
         self.ended = np.zeros(count, dtype=bool)
         self.outcomes = np.full(count, "", dtype=object)
@@ -78,31 +117,31 @@ class Episode:
 
     @property
     def observations(self) -> Array:
-        """What is observed now, (K, n+1)."""
+        """The current observations, (K, n+1)."""
         return self._last.copy()
 
     @property
     def time(self) -> float:
-        """Seconds since it began."""
+        """Seconds since the start."""
         return self._loop.step * self._plan.dt
 
     @property
     def states(self) -> Array:
-        """The true states now, (K, n), angles in the representative nearest the plan."""
+        """The current true states, (K, n), angles in the representative nearest the plan."""
         return self._near_plan(self._loop.states)
 
     @property
     def clearance(self) -> Array:
-        """Signed distance to the nearest obstacle less the robot's radius now, (K,), in metres."""
+        """Current signed distance to the nearest obstacle minus the robot's radius, (K,), in metres."""
         return self._loop.collisions.clearance.copy()
 
     @property
     def frames(self) -> Array:
-        """MuJoCo's qpos now, (K, nq)."""
+        """MuJoCo's current qpos, (K, nq)."""
         return self._loop.physics.frame()
 
     def advance(self, controls: Array) -> Moment:
-        """One control period under controls (K, m)."""
+        """Run one control period with controls (K, m)."""
         loop, step, before = self._loop, self._loop.step, self.states
         run = self._loop.controller_run
         assert isinstance(run, CommandedRun)
@@ -121,7 +160,7 @@ class Episode:
         rewards[running] = -self._costs.stage(step, before, loop.records.applied[:, step])[running]
         now = self._ended_at.any(axis=0) & running
         if now.any():
-            # What is lost has no state any more, but the one before.
+            # A trial that has become unstable has no state; use the one before.
             last = np.where(lost[:, None], before, self.states)
             rewards[now] -= self._costs.final(last, loop.records.applied[:, step])[now]
         self._last[running] = self._observe(lost)[running]
@@ -133,18 +172,18 @@ class Episode:
         return Moment(self.observations, rewards, *self._ended_at.copy())
 
     def rollout(self) -> Rollout:
-        """What was recorded until now, as `simulate` has it; NaN after it."""
+        """The records so far, as `simulate` has them; NaN after now."""
         return self._loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:
-        """The states that are shown, with the time as a share of the horizon; what it was, of those who are lost."""
+        """Measured states and time as a share of the horizon; the last valid ones of unstable trials."""
         loop, plan = self._loop, self._plan
-        seen = np.column_stack([self._near_plan(loop.shown), np.full(len(loop.shown), loop.step / plan.steps)])
+        seen = np.column_stack([self._near_plan(loop.measured), np.full(len(loop.measured), loop.step / plan.steps)])
         if lost is not None:
             seen[lost, :-1] = self._last[lost, :-1]
         return seen
 
     def _near_plan(self, states: Array) -> Array:
         near = np.array(states, order="C")[None]
-        law.turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
+        turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
         return near[0]

@@ -12,21 +12,21 @@ from lqrsim.gym.vector import VectorEnvironment
 
 
 class Expert:
-    """A controller as an agent: what to imitate, and what to compare with.
+    """A controller as an agent, to imitate or to compare with.
 
         expert = lqrsim.gym.Expert(env)
         observation, info = env.reset(seed=0)
         observation, reward, *ended, info = env.step(expert(observation))
 
     Called with the observation (n+1,) of an `Environment`, or those (K, n+1) of a `VectorEnvironment`, it returns the
-    action (m,), or the actions (K, m). At time 0 the controller is started anew.
+    action (m,), or the actions (K, m). At time 0 the controller starts anew.
 
     Args:
-      env: the environment, in wrappers or not; the wrappers may not change observations or actions.
+      env: the environment, possibly in wrappers that change neither observations nor actions.
       controller: as in `simulate`; by default the policy of the environment's solution.
 
     Raises:
-      InputError: the environment is not one of lqrsim's, or the controller is none.
+      InputError: the environment is not one of lqrsim's, or the controller is invalid.
     """
 
     def __init__(self, env: Any, controller: ControllerLike | None = None) -> None:

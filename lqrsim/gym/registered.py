@@ -1,4 +1,4 @@
-"""What Gymnasium knows by name, and how to make an environment of any other scenario."""
+"""Registration with Gymnasium, and functions that make environments of any scenario."""
 
 from collections.abc import Container
 from typing import Any
@@ -13,7 +13,7 @@ ANY = "lqrsim/Scenario-v0"
 
 
 def register(known: Container[str]) -> None:
-    """Register what is not `known` yet."""
+    """Register the environments that are not `known` yet."""
     for name, scenario in {**SCENARIOS, ANY: None}.items():
         if name not in known:
             gymnasium.register(
@@ -28,8 +28,8 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
     """Make the environment of any scenario, with Gymnasium's usual wrappers.
 
     Args:
-      scenario: as on the command line: a name with settings, "quadrotor,query=3"; a function of yours,
-        "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}". Or a Scenario.
+      scenario: a Scenario, or a reference as on the command line: a name with settings, "quadrotor,query=3"; a function
+        of yours, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
       options: those of `Environment`, and those of `gymnasium.make`.
 
     Raises:
@@ -39,7 +39,7 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
 
 
 def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """Make many environments of one scenario that MuJoCo runs as one batch: see `VectorEnvironment`.
+    """Make many environments of one scenario, run by MuJoCo as one batch: see `VectorEnvironment`.
 
     Args:
       scenario: as in `make_env`. num_envs: how many. options: those of `VectorEnvironment`.

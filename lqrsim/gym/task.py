@@ -1,4 +1,4 @@
-"""What an environment is about: the scenario, its plan, what disturbs it, and what actions and observations mean."""
+"""The task of an environment: scenario, plan, disturbances, and the meaning of actions and observations."""
 
 import logging
 import os
@@ -24,26 +24,25 @@ from lqrsim.errors import (
 )
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.scenarios.solutions import given, remarks, solve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.compiled import CostsByStep
-from lqrsim.stress.sweeps import sweep
 
 _log = logging.getLogger("lqrsim")
 
 Actions = Literal["normalized", "controls"]
 Disturbances = str | Sequence[str | Disturbance]
 
-LARGEST = 1e10  # MuJoCo's mjMAXVAL: it calls a simulation unstable whose numbers are beyond it
+LARGEST = 1e10  # MuJoCo's mjMAXVAL: a simulation with larger numbers counts as unstable
 ACTIONS = ("normalized", "controls")
 RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trials:
-    """Which trials an episode runs: `first` and those after it, of a seed, under these disturbances."""
+class EpisodeTrials:
+    """The trials of an episode: number `first` of a seed and those after it, with their disturbances."""
 
     seed: int
     first: int
@@ -51,10 +50,10 @@ class Trials:
 
 
 class Task:
-    """A scenario as environments have it. The arguments are those of `Environment`.
+    """The task of an environment. The arguments are those of `Environment`.
 
     Attributes:
-      scenario, plant: what is run. low, high: limits of the controls, (m,).
+      scenario, plant: what is run. low, high: limits of the controls, (m,) each.
 
     Raises:
       InputError: as `Environment` does.
@@ -82,18 +81,18 @@ class Task:
         for name, low, high in zip(space.names, space.low, space.high, strict=True):
             if not np.isfinite(high - low):
                 raise InputError(
-                    f"scenario: got control {name} within {low:g} to {high:g}, want finite limits, which bound actions"
+                    f"scenario: got control {name} within {low:g} to {high:g}, want finite limits, for the actions"
                 )
         self._disturbances = self.disturbances_of(disturbances, strength)
 
     @cached_property
     def solution(self) -> Solution:
-        """The plan: as given, or what `smooth` makes of the scenario."""
+        """The given solution, or that of `smooth` for the scenario."""
         return solve(self.scenario) if self._given is None else self._given
 
     @cached_property
     def costs(self) -> CostsByStep:
-        """Of the scenario's problem."""
+        """The costs of the scenario's problem."""
         problem, plan = self.scenario.problem, self.solution.trajectory
         if (problem.steps, problem.dt) != (plan.steps, plan.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} of {problem.dt:g} s"
@@ -101,18 +100,18 @@ class Task:
         return CostsByStep(problem)
 
     def action_space(self) -> Box:
-        """Of one environment, (m,)."""
+        """The action space of one environment, (m,)."""
         if self._actions == "controls":
             return Box(self.low, self.high, dtype=np.float64)
         return Box(-1.0, 1.0, self.low.shape, dtype=np.float64)
 
     def observation_space(self) -> Box:
-        """Of one environment, (n + 1,)."""
+        """The observation space of one environment, (n + 1,)."""
         most = np.full(len(self.plant.robot.dynamics.state_coordinates), LARGEST)
         return Box(np.append(-most, 0.0), np.append(most, 1.0), dtype=np.float64)
 
     def controls_of(self, actions: Any, trials: int) -> Array:
-        """The controls (K, m) of actions (K, m). Raises InputError unless these are finite, and so many."""
+        """Convert actions (K, m) to controls (K, m). Raises InputError unless they are finite and have this shape."""
         actions = shaped("action", actions, (trials, len(self.low)))
         if not np.isfinite(actions).all():
             raise InputError(f"action: got {excerpt(actions)}, want finite numbers")
@@ -121,53 +120,53 @@ class Task:
         return self.low + (actions + 1) / 2 * (self.high - self.low)
 
     def actions_of(self, controls: Array) -> Array:
-        """The actions (..., m) that have these controls (..., m)."""
+        """Convert controls (..., m) to actions (..., m)."""
         if self._actions == "controls":
             return controls
         return np.clip(2 * (controls - self.low) / (self.high - self.low) - 1, -1.0, 1.0)
 
     def disturbances_of(self, given: Any, strength: Any) -> tuple[Disturbance, ...]:
-        """Disturbances by name or as they are, so many times as strong. Raises InputError for what is neither."""
+        """Scaled disturbances, given by name or as objects. Raises InputError for anything else."""
         wanted = "a name, such as 'moderate', or a tuple of names and disturbances"
         strength = check_number("strength", strength, at_least=0.0)
         items = (given,) if isinstance(given, str) else check_items("disturbances", given, (str, Disturbance), wanted)
         found: list[Disturbance] = []
         for one in items:
-            found += sweep(one, self.scenario) if isinstance(one, str) else (one,)
+            found += disturbance_set(one, self.scenario) if isinstance(one, str) else (one,)
         return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
 
-    def trials(self, seed: int, following: int, options: Any) -> Trials:
-        """What `reset` asks for, with `following` as the first trial where its options name none.
+    def trials(self, seed: int, following: int, options: Any) -> EpisodeTrials:
+        """The trials for the options of a `reset`; by default they begin with number `following`.
 
         Raises:
-          InputError: an option is unknown, or wrong.
+          InputError: an option is unknown or invalid.
         """
-        stated = stated_options(options)
-        for name in stated:
+        given = reset_options(options)
+        for name in given:
             check_name("options", name, RESET_OPTIONS)
-        first = check_seed("options: trial", stated.get("trial", following))
-        if "preset" in stated and "disturbances" in stated:
+        first = check_seed("options: trial", given.get("trial", following))
+        if "preset" in given and "disturbances" in given:
             raise InputError("options: got disturbances and preset, want one of the two")
-        if "preset" not in stated and "disturbances" not in stated:
-            if "strength" in stated:
+        if "preset" not in given and "disturbances" not in given:
+            if "strength" in given:
                 raise InputError("options: got strength alone, want it with disturbances or preset")
-            return Trials(seed=seed, first=first, disturbances=self._disturbances)
-        disturbances = stated.get("disturbances", stated.get("preset"))
-        disturbances = self.disturbances_of(disturbances, stated.get("strength", 1.0))
-        return Trials(seed=seed, first=first, disturbances=disturbances)
+            return EpisodeTrials(seed=seed, first=first, disturbances=self._disturbances)
+        disturbances = given.get("disturbances", given.get("preset"))
+        disturbances = self.disturbances_of(disturbances, given.get("strength", 1.0))
+        return EpisodeTrials(seed=seed, first=first, disturbances=disturbances)
 
 
-def stated_options(options: Any) -> dict[str, Any]:
-    """The options of a `reset`. Raises InputError for what are none."""
+def reset_options(options: Any) -> dict[str, Any]:
+    """A copy of the options of a `reset`. Raises InputError unless they are a mapping or None."""
     return dict(check_kind("options", options, (Mapping, type(None)), "options by name, or None") or {})
 
 
 def _plant_of(scenario: Scenario) -> Plant:
-    """The plant. Raises InputError for a problem of another system."""
+    """The scenario's plant. Raises InputError if its problem has other states."""
     plant = scenario.plant()
-    moved, stated = plant.robot.dynamics.state_coordinates, scenario.problem.dynamics.state_coordinates
-    if moved.names != stated.names:
-        raise InputError(f"scenario: got a problem of states {', '.join(stated.names)}, want {', '.join(moved.names)}")
+    robot, problem = plant.robot.dynamics.state_coordinates, scenario.problem.dynamics.state_coordinates
+    if robot.names != problem.names:
+        raise InputError(f"scenario: got a problem of states {', '.join(problem.names)}, want {', '.join(robot.names)}")
     return plant
 
 

@@ -1,4 +1,4 @@
-"""Many environments of one scenario, which MuJoCo runs as one batch."""
+"""Many environments of one scenario, run by MuJoCo as one batch."""
 
 import os
 from collections.abc import Sequence
@@ -10,24 +10,23 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from lqrsim.errors import Array, InputError, check_count, check_seed, shaped
-from lqrsim.gym.episode import Episode
-from lqrsim.gym.task import Actions, Disturbances, Flags, Task, stated_options
-from lqrsim.results.rollout import Rollout
+from lqrsim.gym.episode import Episode, Resettable
+from lqrsim.gym.task import Actions, Disturbances, Flags, Task, reset_options
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 
 
-class VectorEnvironment(VectorEnv[Array, Array, Any]):
-    """K trials of one scenario at once: `Environment` says what actions, observations and rewards are.
+class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
+    """K trials of one scenario at once, with the actions, observations and rewards of `Environment`.
 
-    All begin together and have the same horizon. One that has ended stands still: its observation and its flags stay
-    as they are, its rewards are 0, its actions have no effect. There is no automatic reset: `reset` begins all again.
+    All begin together and have the same horizon. After its end a trial keeps its observation and flags; its rewards are
+    0, and its actions have no effect. There is no automatic reset: `reset` begins all trials again.
 
-    `reset(seed=s)` begins trials 0 to K-1 of seed s, the next `reset()` trials K to 2K-1. Each is the same to the last
-    bit as in `simulate`, and as in an `Environment`. The info has arrays with an entry a trial.
+    `reset(seed=s)` begins trials 0 to K-1 of seed s, the next `reset()` trials K to 2K-1. Each is bit-identical to the
+    trial in `simulate` and in an `Environment`. The info has arrays with an entry per trial.
 
     Args:
-      num_envs: K. threads: of MuJoCo's; by default as many as there are processors.
+      num_envs: K. threads: of MuJoCo; by default one per processor.
       frames: whether `rollout()` can be drawn; it takes memory.
 
     The others are those of `Environment`.
@@ -36,7 +35,7 @@ class VectorEnvironment(VectorEnv[Array, Array, Any]):
       InputError: as `Environment` does.
     """
 
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as its base class has it
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as in its base class
 
     def __init__(
         self,
@@ -58,58 +57,35 @@ class VectorEnvironment(VectorEnv[Array, Array, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._frames, self._threads = frames, threads
-        self._seed: int | None = None
-        self._following = 0
-        self._episode: Episode | None = None
-
-    @property
-    def solution(self) -> Solution:
-        """The one whose plan it is."""
-        return self.task.solution
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Begin all episodes. Raises InputError for more than one seed, or an option that is wrong."""
+        """Begin all episodes. Raises InputError for more than one seed, or an invalid option."""
         if isinstance(seed, Sequence) and not isinstance(seed, str):
             raise InputError(f"seed: got {len(seed)} of them, want one: episodes are trials 0, 1, 2, ... of it")
-        seed, options = None if seed is None else check_seed("seed", seed), stated_options(options)
+        seed, options = None if seed is None else check_seed("seed", seed), reset_options(options)
         mask = options.pop("reset_mask", None)
         if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
             raise InputError("options: reset_mask: got some of the episodes, want all: they begin together")
         super().reset(seed=seed)
-        if seed is not None:
-            self._seed, self._following = seed, 0
-        elif self._seed is None:
-            self._seed = int(self.np_random.integers(2**63))
-        assert self._seed is not None
-        trials = self.task.trials(self._seed, self._following, options)
-        self._episode = Episode(self.task, trials, self.num_envs, frames=self._frames, threads=self._threads)
-        self._following = trials.first + self.num_envs
-        return self._episode.observations, self._info(self._episode)
+        count, frames, threads = self.num_envs, self._frames, self._threads
+        episode = self._begin(seed, self.np_random, options, count, frames=frames, threads=threads)
+        return episode.observations, self._info(episode)
 
     def step(self, actions: npt.ArrayLike) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
-        """One control period of all that have not ended.
+        """Run one control period of all episodes that have not ended.
 
         Raises:
           InputError: the actions are not finite, or not (K, m); or all episodes have ended.
         """
-        episode = self._begun()
+        episode = self._current()
         if episode.ended.all():
-            raise InputError("step: got episodes that have all ended, want reset() first")
+            raise InputError("step: all episodes have ended, call reset() first")
         moment = episode.advance(self.task.controls_of(actions, self.num_envs))
         return moment.observations, moment.rewards, moment.terminated, moment.truncated, self._info(episode)
-
-    def rollout(self) -> Rollout:
-        """The episodes so far, as `simulate` records them."""
-        return self._begun().rollout()
 
     def render(self) -> NoReturn:
         """Raises InputError: a batch has no pictures of its own; `lqrsim.render` draws its rollout."""
         raise InputError("render: got a batch, want an Environment, or lqrsim.render(rollout()) with frames=True")
-
-    def _begun(self) -> Episode:
-        if self._episode is None:
-            raise InputError("environment: got one without an episode, want reset() first")
-        return self._episode
 
     def _info(self, episode: Episode) -> dict[str, Any]:
         numbers = episode.trials.first + np.arange(self.num_envs)

@@ -1,10 +1,10 @@
-"""What an iteration with an active set takes of a problem, and its pivots. The kernels' subset.
+"""What an iteration with an active set evaluates, and its pivots. The kernels' subset.
 
-Rows of constraints and limits of controls, as in `interior_point.py`, some of which are held at zero.
+The rows are those of all constraints, then the limits of the controls; the active set holds some of them at zero.
 `solvers/active_set.py` has the method.
 """
 
-from math import inf, isnan
+from math import inf
 
 from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.interior_point import (
@@ -17,25 +17,28 @@ from lqrsim.kernels.interior_point import (
     stage_models,
     terminal_cost_to_go,
 )
+from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
+from lqrsim.kernels.rollouts import larger
 
-# Columns of `ActiveRows.table`: what a row is, by how much it changes, and what it is to have to spare where it is
-# held; of a limit the control, whether it is the lower one (1) or the upper one (-1), and where that is.
+# Columns of `ActiveRows.table`: the kind of a row; its typical size; its target value in the active set; and of a limit
+# the control, 1 for the lower one and -1 for the upper one, and its value.
 KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
-ROUNDING = 1e-10  # of a row's size, by which it may be missed by a model
+ROUNDING = 1e-10  # of a row's size: a model may violate it by that much
 
 
 def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows, out, active):
-    """Write the models of all stages at a plan: those of its cost, its steps and its constraints; and the numbers of
-    the active set's rows, if it has any. Return the cost.
+    """Write the models of all stages at a plan, and the values of the active set's rows, if it has any.
 
     Args:
-      soft: 1 where there is an initial cost. second: 1 where the steps' and constraints' second derivatives are wanted.
-      costates: (T+1, N), of where each step leads.
-      own: 1 where the costates are to be those of this plan with its forces; they are written.
-      values: of each constraint its numbers, which are written. rows: `records.ConstraintRows`. out:
-        `records.StageModels`. active: `records.ActiveRows`; a row that turns out not to act is let go.
+      soft: 1 if there is an initial cost. second: 1 to include second derivatives of steps and constraints.
+      own: 1 to compute the costates here, for this plan and the forces of its rows. costates: (T+1, N).
+      values: a vector for each constraint, written. rows: ConstraintRows. out: StageModels, written.
+      active: ActiveRows; rows that do not act leave the active set.
+
+    Returns:
+      The cost.
     """
     if active.size > 0:
         evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
@@ -46,15 +49,14 @@ def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows
         total += stage_models(t, steps, second, plan, costates, model, rows, out)
         if own == 1 and t > 0:
             lagrangian_slope(t, steps, costates[min(t + 1, steps)], out, active, slope)
-            for i in range(N):
-                costates[t, i] = slope[i]
+            copy(slope, N, costates[t])
     if soft == 1:
         total += add_initial(plan.states[0], model, out)
     return total
 
 
 def read_row_values(steps, plan, constraints, values, rows, active):
-    """Write what all rows have to spare, in the order of rows."""
+    """Write the values of all rows, and remove those that do not act from the active set."""
     for t in range(steps + 1):
         u = plan.controls[min(t, steps - 1)]
         for k in range(constraints.size):
@@ -66,16 +68,15 @@ def read_row_values(steps, plan, constraints, values, rows, active):
             if active.table[row, KIND] == LIMIT:
                 number = u[int(active.table[row, CONTROL])] - active.table[row, SIDE]
                 active.numbers[at] = active.table[row, SIGN] * number
-            if active.numbers[at] == inf:  # so a constraint says that it does not act
+            if active.numbers[at] == inf:  # the constraint does not act
                 active.live[at] = 0.0
             if active.live[at] == 0:
                 active.force[at], active.held[at] = 0.0, 0.0
 
 
 def lagrangian_slope(t, steps, after, models, active, slope):
-    """Write the slope (W,) of the Lagrangian in the state and the control at t, given the costate (N,) after it."""
-    for i in range(W):
-        slope[i] = models.gradient[t, i]
+    """Write the gradient (W,) of the Lagrangian in state and control at t, given the costate (N,) at t + 1."""
+    copy(models.gradient[t], W, slope)
     if t < steps:
         for j in range(N):
             for i in range(W):
@@ -88,19 +89,21 @@ def lagrangian_slope(t, steps, after, models, active, slope):
 
 
 def optimality_measures(steps, plan, models, gaps, active, state_size, control_size):
-    """How far a plan is from an optimum; writes its gaps (T, N).
+    """Measure the optimality of a plan; write its gaps (T, N).
+
+    Args:
+      models: StageModels. active: ActiveRows. state_size: (N,) and control_size: (M,), typical sizes.
 
     Returns:
-      The largest slope of the Lagrangian in a control, times its size (M,); by how much an inequality is missed, or
-      what it has to spare, negative; by how much an equality is missed; the largest gap, relative to the states' sizes
-      (N,); and the largest product of a multiplier and what is left to spare.
+      The largest derivative of the Lagrangian in a control, times its size; the largest violation of an inequality,
+      negative if all are satisfied; that of an equality; the largest gap, relative to the state's size; and the largest
+      product of a multiplier and its row's value.
     """
     slope, after = stack(W), stack(N)
     steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
     for t in range(steps, -1, -1):
         lagrangian_slope(t, steps, after, models, active, slope)
-        for i in range(N):
-            after[i] = slope[i]
+        copy(slope, N, after)
         if t < steps:
             for i in range(M):
                 steepest = larger(steepest, abs(slope[N + i]) * control_size[i])
@@ -120,29 +123,23 @@ def optimality_measures(steps, plan, models, gaps, active, state_size, control_s
     return steepest, missed, unequal, widest, product
 
 
-def larger(a, b):
-    """The larger one; NaN if one of them is."""
-    return b if b > a or isnan(b) else a
-
-
 def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy, to_go, changes):
-    """The step to the minimum of the stages' models with the rows held at zero that are, and which are wrong there.
+    """The step to the minimum of the stages' models with the active set held, and the rows that are wrong there.
 
     Args:
-      free: (N,) 0 for the states that the start fixes. share: of the projected Hessian of the cost.
-      scale: cost that multipliers are relative to. weight: on what a row that is held is away from zero, by its size;
-        of constraints that share of it that is `price`.
-      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go: as in
-        `riccati_step`; the gradients are the costates where the step leads. changes: gets those of the plan.
+      free: (N,) 0 for the states that the start fixes, else 1. share: of the projected Hessian of the cost.
+      scale: cost that multipliers are relative to.
+      weight: on the distance of a held row from its target, relative to its size; times `price` for constraints.
+      models: StageModels. gaps: (T, N). active: ActiveRows, written.
+      policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.
 
     Returns:
-      The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1; and how many
-      rows are wrong.
+      The step whose control block is not positive definite, T + 1 if it is the start's, or -1; and how many rows are
+      wrong.
     """
     stage, slope = stack(W, W), stack(W)
     for t in range(steps, -1, -1):
-        for i in range(W):
-            slope[i] = models.gradient[t, i]
+        copy(models.gradient[t], W, slope)
         blend(share, models.hessian[t], models.convex[t], stage)
         add_held_rows(t, weight, price, models, active, stage, slope)
         if t == steps:
@@ -155,7 +152,7 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
 
 
 def blend(share, one, other, out):
-    """Write a matrix (W, W) with that share of another one in it."""
+    """Write (1 - share) one + share other, (W, W)."""
     for i in range(W):
         for j in range(W):
             if share == 0:
@@ -167,7 +164,7 @@ def blend(share, one, other, out):
 
 
 def add_held_rows(t, weight, price, models, active, stage, slope):
-    """Add what the rows at a step that are held add to its model."""
+    """Add the penalties of the held rows at a step to its model."""
     for row in range(active.size):
         at = active.size * t + row
         if active.held[at] == 0:
@@ -183,13 +180,13 @@ def add_held_rows(t, weight, price, models, active, stage, slope):
 
 
 def held_weight(row, weight, price, active):
-    """The weight on a row that is held."""
+    """The penalty on a held row."""
     size = active.table[row, SIZE]
     return (weight if active.table[row, KIND] == LIMIT else price * weight) / (size * size)
 
 
 def predict_rows(steps, scale, weight, price, models, active, changes):
-    """Write the multipliers that a step leads to, and which rows are wrong there; returns how many."""
+    """Write the multipliers after a step, and which rows are wrong there; return how many."""
     count = 0
     for t in range(steps + 1):
         for row in range(active.size):
@@ -215,10 +212,10 @@ def predict_rows(steps, scale, weight, price, models, active, changes):
 
 
 def update_active_set(steps, worst, active):
-    """Hold rows that are missed, and let those go that pull.
+    """Add rows that are violated to the active set, and remove those with a negative multiplier.
 
     Args:
-      worst: 1 for those that are worse than at the steps before and after; 0 for the last one alone.
+      worst: 1 for all rows that are worse than at the neighbouring steps; 0 for the last one alone.
     """
     last = -1
     for row in range(active.size):
@@ -239,12 +236,12 @@ def update_active_set(steps, worst, active):
 
 
 def rollout_of_active_set(steps, soft, plan, policy, limits, active, model, values, out):
-    """Write the motion that a plan comes to with a policy about it, and the constraints' numbers; return its cost.
+    """Roll out a policy about a plan, and evaluate the constraints there; return the cost.
 
     Args:
-      soft: 1 where there is an initial cost. plan: its controls are put between their limits (T, M), and those that are
-        held there at them. policy: no offsets; its gains are zero at limits. values: of each constraint its numbers.
-        out: gets the motion.
+      soft: 1 if there is an initial cost. plan: its controls are clamped, and set to the limits that are held.
+      policy: its offsets are set to zero, and so are its gains at limits. limits: (T, M) each.
+      values: a vector for each constraint, written. out: Motion, written.
     """
     for t in range(steps):
         for i in range(M):
@@ -254,8 +251,7 @@ def rollout_of_active_set(steps, soft, plan, policy, limits, active, model, valu
             if active.table[row, KIND] == LIMIT and active.held[active.size * t + row] != 0:
                 i = int(active.table[row, CONTROL])
                 plan.controls[t, i] = active.table[row, SIDE]
-                for j in range(N):
-                    policy.gain[t, i, j] = 0.0
+                fill(policy.gain[t, i], N, 0.0)
     closed_loop_rollout(steps, 0.0, plan, policy, limits, model, out)
     evaluate_constraints(steps, out.states, out.controls, model.stage.constraints, values)
     return cost_of_plan(steps, soft, out, model)

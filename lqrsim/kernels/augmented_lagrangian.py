@@ -1,82 +1,131 @@
-"""The augmented Lagrangian: what is added to the cost for constraints. The kernels' subset.
+"""The augmented Lagrangian: what is added to the cost for a constraint. The kernels' subset.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
     sum (max(0, lambda - mu d)^2 - lambda^2) / (2 mu)
 
-and for equalities d = 0, with multipliers of either sign, the same without the max, which is
+and for equalities d = 0, with multipliers of either sign, the same without the max: sum -lambda d + mu/2 d^2. At the
+optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is the value less
+the tolerance to which the constraint is solved, so that what is within the tolerance satisfies the constraint itself.
+A constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where
+its force would be. Of its curvature only `mu n n'` is used, n the gradient of d: the rest can be negative.
 
-    sum -lambda d + mu/2 d^2
+`multipliers` is one array a constraint: mu (0 where the constraint does not act yet), the number of values at a step,
+the first step at which they act, the tolerance, the price (infinite where there is none), and from HEADER on lambda,
+step by step.
 
-At the optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is what a
-constraint has to spare beyond the tolerance to which it is solved, so that what is within the tolerance keeps the
-constraint itself. A constraint may have a price, in cost a unit, for which it may be missed: no force is larger, and
-beyond what one of that size keeps the Lagrangian goes on as a straight line. Of the curvature only `mu n n'` is taken,
-n the slope of d: the rest can be negative.
-These functions are compiled with each constraint.
-
-`multipliers` is one array a constraint: mu, how many numbers there are at a step, the first step at which they act, the
-tolerance that is to be left to spare, the price, infinite where there is none, and from HEADER on lambda, step by step.
-With mu of zero there is nothing.
+A constraint whose rows share numbers, such as the centres of a robot's balls, computes these once a step, by `places`.
+Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of state and control.
 """
 
 from math import inf
 
-from lqrsim.kernels.declarations import EQUALITY, HEADER, W, constraint_slope, constraint_value, stack
+from lqrsim.kernels.declarations import (
+    EQUALITY,
+    HEADER,
+    N,
+    W,
+    constraint_slope,
+    constraint_value,
+    places,
+    places_jacobian,
+    stack,
+    zeros,
+)
+from lqrsim.kernels.linear_algebra import fill
+
+SHARED = 0  # numbers that the rows share; 0 for a constraint on state and control
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
     """Add the quadratic model at (x, u) to hessian (W, W) and gradient (W,), and return the value."""
-    penalty, rows = multipliers[0], int(multipliers[1])
-    slope = stack(W)
     total = 0.0
-    if penalty > 0 and t >= multipliers[2]:
-        for row in range(rows):
-            multiplier = multipliers[HEADER + rows * t + row]
-            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
-            total -= multiplier * multiplier
-            if EQUALITY or force > 0:
-                held = min(max(force, -multipliers[4]), multipliers[4])
-                total += held * (2 * force - held)
-                curvature = penalty if held == force else 0.0
-                for i in range(W):
-                    slope[i] = 0.0
-                constraint_slope(x, u, t, row, data, slope)
-                for i in range(W):
-                    gradient[i] -= held * slope[i]
-                    for j in range(W):
-                        hessian[i, j] += curvature * slope[i] * slope[j]
-        total /= 2 * penalty
+    if multipliers[0] > 0 and t >= multipliers[2]:
+        if SHARED:
+            shared, jacobian = stack(SHARED), zeros(SHARED, N)
+            places_jacobian(x, data, shared, jacobian)
+            total = augment_at(shared, jacobian, t, data, multipliers, hessian, gradient)
+        else:
+            total = augment_at(x, u, t, data, multipliers, hessian, gradient)
     return total
+
+
+def augment_at(x, u, t, data, multipliers, hessian, gradient):
+    """Add the quadratic model, and return the value; x and u may be the shared numbers and their Jacobian."""
+    rows, slope, total = int(multipliers[1]), stack(W), 0.0
+    for row in range(rows):
+        force, held, value = force_of(x, u, t, row, data, multipliers)
+        total += value
+        if EQUALITY or force > 0:
+            curvature = multipliers[0] if held == force else 0.0
+            fill(slope, W, 0.0)
+            constraint_slope(x, u, t, row, data, slope)
+            for i in range(W):
+                gradient[i] -= held * slope[i]
+                for j in range(W):
+                    hessian[i, j] += curvature * slope[i] * slope[j]
+    return total / (2 * multipliers[0])
 
 
 def augmentation(x, u, t, data, multipliers):
     """The value alone."""
-    penalty, rows = multipliers[0], int(multipliers[1])
     total = 0.0
-    if penalty > 0 and t >= multipliers[2]:
-        for row in range(rows):
-            multiplier = multipliers[HEADER + rows * t + row]
-            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
-            total -= multiplier * multiplier
-            if EQUALITY or force > 0:
-                held = min(max(force, -multipliers[4]), multipliers[4])
-                total += held * (2 * force - held)
-        total /= 2 * penalty
+    if multipliers[0] > 0 and t >= multipliers[2]:
+        if SHARED:
+            shared = stack(SHARED)
+            places(x, data, shared)
+            total = augmentation_at(shared, u, t, data, multipliers)
+        else:
+            total = augmentation_at(x, u, t, data, multipliers)
     return total
 
 
-def add_slope(x, u, t, row, data, gradient):
-    """Add the gradient (W,) of one of a constraint's numbers."""
-    constraint_slope(x, u, t, row, data, gradient)
+def augmentation_at(x, u, t, data, multipliers):
+    """The value alone; x may be the shared numbers."""
+    total = 0.0
+    for row in range(int(multipliers[1])):
+        _, _, value = force_of(x, u, t, row, data, multipliers)
+        total += value
+    return total / (2 * multipliers[0])
+
+
+def force_of(x, u, t, row, data, multipliers):
+    """The force lambda - mu d of one value, the same within its price, and its part of the Lagrangian times 2 mu."""
+    multiplier = multipliers[HEADER + int(multipliers[1]) * t + row]
+    force = multiplier - multipliers[0] * (constraint_value(x, u, t, row, data) - multipliers[3])
+    held, value = 0.0, -multiplier * multiplier
+    if EQUALITY or force > 0:
+        held = min(max(force, -multipliers[4]), multipliers[4])
+        value += held * (2 * force - held)
+    return force, held, value
 
 
 def constraint_values(x, u, t, acts, data, multipliers, values):
-    """Write a constraint's numbers at a step, step by step as the multipliers are.
+    """Write a constraint's values at step t, ordered as the multipliers are.
 
-    Where they do not act they are kept: an inequality's is infinite, an equality's zero.
+    Where it does not act they are satisfied: infinite for an inequality, zero for an equality.
     """
+    if SHARED:
+        shared = stack(SHARED)
+        places(x, data, shared)
+        values_at(shared, u, t, acts, data, multipliers, values)
+    else:
+        values_at(x, u, t, acts, data, multipliers, values)
+
+
+def values_at(x, u, t, acts, data, multipliers, values):
+    """Write the values; x may be the shared numbers."""
     rows = int(multipliers[1])
     for row in range(rows):
-        kept = 0.0 if EQUALITY else inf
-        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else kept
+        satisfied = 0.0 if EQUALITY else inf
+        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else satisfied
+
+
+def add_slope(x, u, t, row, data, gradient):
+    """Add the gradient (W,) of one of a constraint's values."""
+    if SHARED:
+        shared, jacobian = stack(SHARED), zeros(SHARED, N)
+        places_jacobian(x, data, shared, jacobian)
+        constraint_slope(shared, jacobian, t, row, data, gradient)
+    else:
+        constraint_slope(x, u, t, row, data, gradient)

@@ -1,97 +1,92 @@
-"""What a plan really is, worked out from the problem by a short path of its own. The kernels' subset.
+"""Certification of a plan, computed from the problem on a short path of its own. The kernels' subset.
 
-Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's own functions, their
-derivatives, and a Cholesky factor. The cost is the one that derivatives come with, not what rollouts added up.
-`certify.py` compares with what a solver claims.
+Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's functions, their
+derivatives, and a Cholesky factor. The cost is the value that comes with the derivatives, not what rollouts added up.
+`certify.py` compares the results with what a solver claims.
 """
 
 from math import nan
 
-from lqrsim.kernels.declarations import (
-    NOISY,
-    M,
-    N,
-    W,
-    stack,
-)
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve
-from lqrsim.kernels.model_functions import cost_added, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, copy, copy_matrix, fill
+from lqrsim.kernels.model_functions import augment_cost, cost_alone, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
-    """Write to `found`: cost, its scale, motion, law, limits, and the decrease of cost that is still promised.
+    """Write cost, residuals and predicted decrease of a plan and its policy.
 
-    The scale is what the curved part of the cost would be if nothing in it cancelled: rounding is a share of it.
-    Motion is the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1. Law is the largest
-    difference of a control from the policy's, within the limits, relative to the terms of that sum. Limits is by how
-    much a control is beyond one.
+    The predicted decrease is `1/2 sum e' E^-1 e` with the gradients e of the cost in the offsets of the policy, later
+    controls responding with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It is what a Riccati
+    pass predicts about the plan where the gains are that pass's. Controls go no further than their limits. Cost and
+    decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
-    The promised decrease is `1/2 sum e' E^-1 e` with the slopes e of the cost in the offsets of the policy, later
-    controls responding with its gains, and E = R + B'SB with the Hessians S (T+1, N, N) of the cost-to-go. It is what
-    a Riccati pass predicts where the gains are that pass's, about the plan. Controls go no further than their limits.
-    What noise is expected to cost belongs to all of it. With `own`, the Hessians are worked out here, of the policy as
-    it is with controls at their limits, and written to the cost-to-go: those of a Riccati pass take controls to respond
-    that cannot. The cost includes no augmented Lagrangian, the decrease does.
+    Args:
+      own: whether to compute the Hessians S (T+1, N, N) here, for the policy as it is with controls at their limits,
+        and write them to `to_go`: a Riccati pass's assume that controls respond that cannot.
+      plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
+      found: row of CERTIFICATE, written.
+        scale: what the curved part of the cost would be if nothing in it cancelled; rounding is a share of it.
+        dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
+        policy_residual: the largest difference of a control from the policy's, within its limits, relative to the terms
+        of that sum.
+        beyond_limits: the largest violation of a control's limit.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, room = stack(N), Limits(stack(M), stack(M))
-    none, costate, size, beyond = stack(M), stack(N), stack(N), stack(N)
-    states, steps, hessians, nowhere = plan.states, settings.steps, to_go.hessian, stack(N)
-    law, limits, decrease = 0.0, 0.0, 0.0
-    for i in range(M):
-        none[i] = 0.0
+    none, costate, size, residual, nowhere = zeros(M), stack(N), stack(N), zeros(N), zeros(N)
+    states, steps, hessians = plan.states, settings.steps, to_go.hessian
+    off_policy, limits, decrease = 0.0, 0.0, 0.0
     for i in range(N):
-        size[i], beyond[i], nowhere[i] = 1.0, 0.0, 0.0
+        size[i] = 1.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    cost = cost_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
-    cost -= cost_added(states[steps], none, steps, model.final)
+    # What constraints add is never part of the sum: a large penalty would leave its rounding.
+    cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
+    augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
-    for i in range(N):
-        costate[i] = stage.gradient[i]
-        for j in range(N):
-            if own:
-                hessians[steps, i, j] = stage.hessian[i, j]
+    copy(stage.gradient, N, costate)
+    if own:
+        copy_matrix(stage.hessian, N, N, hessians[steps])
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
         step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-        cost += cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
-        cost -= cost_added(x, u, t, model.stage)
-        if NOISY:  # of the policy as it is, the slope ahead is the costate
-            slope = NextStep(
+        cost += cost_alone(x, u, t, model.stage, 0.0, stage.hessian, stage.gradient)
+        augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
+        if NOISY:  # for the policy as it is, the gradient of the cost-to-go is the costate
+            ahead = NextStep(
                 step.jacobian,
                 nowhere if own else arrived,
                 hessians[t + 1],
                 costate if own else to_go.gradient[t + 1],
             )
-            cost += noise_quadratic(x, u, model.noise, slope, False, stage)
+            cost += noise_quadratic(x, u, model.noise, ahead, False, stage)
         scale += scale_of(x, u, stage)
         for i in range(N):
             difference = abs(states[t + 1, i] - arrived[i])
-            if not difference <= beyond[i]:  # a NaN stays
-                beyond[i] = difference
+            if not difference <= residual[i]:  # a NaN stays
+                residual[i] = difference
         for i in range(M):
             room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
             limits = max(limits, room.low[i], -room.high[i])
-        law = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, law)
-        decrease += promised_decrease(step, stage, policy.gain[t], hessians[t + 1], room, costate)
+        off_policy = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, off_policy)
+        decrease += predicted_decrease(step, stage, policy.gain[t], hessians[t + 1], room, costate)
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         scale += scale_of(states[0], none, stage)
         decrease += start_decrease(stage, hessians[0], costate)
-    motion = 0.0
+    worst = 0.0
     for i in range(N):
-        if not beyond[i] <= motion * size[i]:
-            motion = beyond[i] / size[i]
-    found.cost, found.scale, found.motion = cost, scale, motion
-    found.law, found.limits, found.decrease = law, limits, decrease
+        if not residual[i] <= worst * size[i]:
+            worst = residual[i] / size[i]
+    found.cost, found.scale, found.dynamics_residual = cost, scale, worst
+    found.policy_residual, found.beyond_limits, found.decrease = off_policy, limits, decrease
 
 
 def scale_of(x, u, stage):
-    """What the curved part of a cost at (x, u) would be if nothing in it cancelled, states and controls apart."""
+    """The quadratic part of a cost at (x, u) with the sizes of its terms, states and controls apart."""
     scale = 0.0
     for i in range(N):
         for j in range(N):
@@ -103,7 +98,7 @@ def scale_of(x, u, stage):
 
 
 def policy_residual(x, u, gain, offset, limits, worst):
-    """By how much a control is off the policy's within the limits, or what is worse already."""
+    """The relative difference of a control from the policy's within its limits, if above `worst`; else `worst`."""
     for i in range(M):
         total, terms = offset[i], abs(offset[i]) + abs(u[i])
         for j in range(N):
@@ -115,10 +110,12 @@ def policy_residual(x, u, gain, offset, limits, worst):
     return worst
 
 
-def promised_decrease(step, stage, gain, S, room, costate):
-    """What the controls of a step promise: `1/2 e' E^-1 e` within the room that the limits leave.
+def predicted_decrease(step, stage, gain, S, room, costate):
+    """The decrease `1/2 e' E^-1 e` that the controls of a step predict, within the room that their limits leave.
 
-    The costate at t + 1 becomes that at t, the controls responding with the gain (M, N); at a limit they do not.
+    Args:
+      step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. room: Limits of changes.
+      costate: (N,) at t + 1, overwritten by that at t; controls respond with the gain, but not at a limit.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
     slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
@@ -143,32 +140,30 @@ def promised_decrease(step, stage, gain, S, room, costate):
         if room.low[i] < 0 < room.high[i]:
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
-    for i in range(N):
-        costate[i] = before[i]
+    copy(before, N, costate)
     return box_decrease(factor, slope, room.low, room.high, moved)
 
 
 def singular_semidefinite(matrix):
-    """Whether a block is singular and no more than that: positive definite with next to nothing on its diagonal."""
+    """Whether a control block (M, M) is positive semidefinite to rounding: definite with a little on its diagonal."""
     block, size = stack(M, M), 1e-300
     for i in range(M):
         size = max(size, abs(matrix[i, i]))
     for i in range(M):
-        for j in range(M):
-            block[i, j] = matrix[i, j]
+        copy(matrix[i], M, block[i])
         block[i, i] += 1e-9 * size
     return cholesky(block, M)
 
 
 def start_decrease(stage, S, costate):
-    """What a soft start promises, its cost quadratised in `stage`."""
+    """The predicted decrease of a soft start, its cost quadratised in `stage`; add its gradient to the costate (N,)."""
     factor, direction = stack(N, N), stack(N)
     for i in range(N):
         costate[i] += stage.gradient[i]
         direction[i] = costate[i]
         for j in range(N):
             factor[i, j] = stage.hessian[i, j] + S[i, j]
-        if costate[i] == 0 and factor[i, i] == 0:  # a state that nothing weighs may stay
+        if costate[i] == 0 and factor[i, i] == 0:  # a state without weight need not move
             factor[i, i] = 1.0
     good, decrease = cholesky(factor, N), 0.0
     cholesky_solve(factor, N, direction)
@@ -178,9 +173,12 @@ def start_decrease(stage, S, costate):
 
 
 def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
-    """Write the Hessian of what the policy costs from here on, given that from the next step on.
+    """Write the Hessian (N, N) of the policy's cost-to-go at t, given that at t + 1.
 
-    A control at a limit, where there is no room on one side, does not respond.
+    A control at a limit, without room on one side, does not respond.
+
+    Args:
+      jacobian: (N, W). cost: (W, W) of the stage. gain: (M, N). room: Limits of changes. ahead: (N, N) at t + 1.
     """
     closed, both, product = stack(N, N), stack(W, N), stack(W, N)
     for j in range(N):
@@ -213,19 +211,19 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
 
 
 def box_decrease(matrix, slope, lowest, highest, best):
-    """The decrease of `1/2 x'E x + e'x` at its minimiser `best` (M,) within a box about zero; NaN unless E >= 0.
+    """The decrease of `1/2 x'E x + e'x` at its minimiser within a box about zero; NaN unless E >= 0.
 
-    Where E is singular, it is that of e'x.
+    Where E is singular, it is that of e'x: an upper bound.
+
+    Args:
+      matrix: E (M, M). slope: e (M,). lowest, highest: (M,) of the box. best: (M,), the minimiser, written.
     """
     factor = stack(M, M)
     inside = True
     for i in range(M):
         best[i] = -slope[i]
-        for j in range(M):
-            factor[i, j] = matrix[i, j]
-    if not cholesky(
-        factor, M
-    ):  # singular_semidefinite: no more than a straight line promises, up to where the box ends
+        copy(matrix[i], M, factor[i])
+    if not cholesky(factor, M):  # at most what e'x decreases to the end of the box
         decrease = 0.0
         for i in range(M):
             if slope[i] != 0:
@@ -234,9 +232,8 @@ def box_decrease(matrix, slope, lowest, highest, best):
     cholesky_solve(factor, M, best)
     for i in range(M):
         inside = inside and lowest[i] <= best[i] <= highest[i]
-    if not inside:  # one entry after the other, until none moves
-        for i in range(M):
-            best[i] = 0.0
+    if not inside:  # coordinate descent, until no entry moves
+        fill(best, M, 0.0)
         for _ in range(1000):
             moved, size = 0.0, 0.0
             for i in range(M):

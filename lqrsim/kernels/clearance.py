@@ -1,29 +1,56 @@
-"""The distance to each obstacle, less what there must be of it. The kernels' subset.
+"""Distances to obstacles, less what they must be: values of a constraint. The kernels' subset.
 
-`data` has for how many steps there are least distances, of which the last hold from there on, and for how many
-obstacles, of which one holds for all; how many obstacles there are, and at how many steps they are told, of which the
-last holds from there on; then the least distances, a step after the other, and for each step the ROW numbers of each
-obstacle.
+The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
+Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
+
+From AT on, `data` has the number of steps with margins, the number of margins a step, the number of obstacles, and the
+number of steps with a table of obstacles; then each ball's radius, the margins and the tables, step by step. The last
+margins and the last table hold from their step on. A row is an obstacle, for the first ball, then for the next; it has
+margin number `row` modulo the margins a step. AT is 0 for a point, and for balls what `places` reads comes before.
 """
 
-from lqrsim.kernels.declarations import ROW, stack
+from lqrsim.kernels.declarations import ROW, N, stack
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
-AXES = (0, 1, 2)  # which states are the position; two of them in a plane, whose third coordinate is 0
+AT = 0
+BALLS = 0  # 0 for a point
+AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane, whose third coordinate is 0
 
 
 def value(x, u, t, row, data):
-    """What the obstacle of that row leaves to spare."""
-    steps, each = int(data[0]), int(data[1])
-    least = data[4 + min(t, steps - 1) * each + row % each]
-    at = 4 + steps * each + ROW * (int(data[2]) * min(t, int(data[3]) - 1) + row)
-    return signed_distance(data, at, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0) - least
+    """The distance of one ball to one obstacle, less its radius and the margin."""
+    a, b, c = place(x, row, data)
+    steps, each = int(data[AT]), int(data[AT + 1])
+    least = data[AT + 4 + BALLS + min(t, steps - 1) * each + row % each]
+    if BALLS:
+        least += data[AT + 4 + row // int(data[AT + 2])]
+    return signed_distance(data, obstacle_at(t, row, data), a, b, c) - least
 
 
 def slope(x, u, t, row, data, gradient):
-    """Add its gradient."""
+    """Add its gradient (W,)."""
     normal, curve = stack(3), stack(3, 3)
-    at = 4 + int(data[0]) * int(data[1]) + ROW * (int(data[2]) * min(t, int(data[3]) - 1) + row)
-    signed_distance_derivatives(data, at, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0, normal, curve)
-    for i in range(len(AXES)):
-        gradient[AXES[i]] += normal[i]
+    a, b, c = place(x, row, data)
+    signed_distance_derivatives(data, obstacle_at(t, row, data), a, b, c, normal, curve)
+    if BALLS:
+        ball = row // int(data[AT + 2])
+        for i in range(N):
+            for j in range(3):
+                gradient[i] += normal[j] * u[3 * ball + j, i]
+    else:
+        for i in range(len(AXES)):
+            gradient[AXES[i]] += normal[i]
+
+
+def place(x, row, data):
+    """Where the ball of a row is."""
+    if BALLS:
+        first = 3 * (row // int(data[AT + 2]))
+        return x[first], x[first + 1], x[first + 2]
+    return x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0
+
+
+def obstacle_at(t, row, data):
+    """Where the numbers of the obstacle of a row begin."""
+    obstacles, tables = int(data[AT + 2]), AT + 4 + BALLS + int(data[AT]) * int(data[AT + 1])
+    return tables + ROW * (obstacles * min(t, int(data[AT + 3]) - 1) + (row % obstacles if BALLS else row))

@@ -2,31 +2,50 @@
 
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
 The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the
-forward pass takes the same ones out; and wherever a control is applied, it is cut off at its limits. Where that
-settles, each control minimises what is left of the cost within its limits: the conditions of first order, to rounding,
-without a penalty or a multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
+forward pass fixes the same ones; and wherever a control is applied, it is clamped. Where that settles, each control
+minimises the remaining cost within its limits: the first-order conditions, to rounding, without a penalty or a
+multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
 from lqrsim.kernels.declarations import M, N, W, stack
-from lqrsim.kernels.linear_algebra import within
+from lqrsim.kernels.linear_algebra import affine, clamp
 
 
-def fix_control(i, value, stage, step) -> float:
-    """Make control i a constant in a step and a stage about the origin, as `riccati_forward` takes them.
+def limited_control(gain, offset, x, limits, u):
+    """Write the control u = gain x + offset, (M,), clamped to its limits."""
+    affine(gain, offset, x, M, N, u)
+    clamp(u, limits)
 
-    In its place comes one that does nothing and costs `1/2 (u - value)^2`. Returns what the stage's constant gains.
+
+def fix_controls_at_limits(u, gain, limits, stage, step):
+    """Fix the controls that the last backward pass fixed: those at a limit without a gain, (M, N).
+
+    Args:
+      stage, step: about the origin, as `riccati_forward` takes them; changed in place.
+
+    Returns:
+      What the stage's constant gains.
     """
-    constant = fix_control_in_cost(i, value, stage)
-    jacobian, c = step.jacobian, step.offset
-    for j in range(N):
-        c[j] += jacobian[j, N + i] * value
-        jacobian[j, N + i] = 0.0
+    constant, jacobian, c = 0.0, step.jacobian, step.offset
+    for i in range(M):
+        if u[i] == limits.low[i] or u[i] == limits.high[i]:
+            free = False
+            for j in range(N):
+                free = free or gain[i, j] != 0
+            if not free:
+                constant += fix_control(i, u[i], stage)
+                for j in range(N):
+                    c[j] += jacobian[j, N + i] * u[i]
+                    jacobian[j, N + i] = 0.0
     return constant
 
 
-def fix_control_in_cost(i, value, stage) -> float:
-    """The same for the cost alone."""
+def fix_control(i, value, stage):
+    """Make control i a constant in a stage about the origin; return what the stage's constant gains.
+
+    A control without effect, of cost `1/2 (u - value)^2`, takes its place.
+    """
     hessian, slope = stage.hessian, stage.gradient
     k = N + i
     constant = (slope[k] + 0.5 * hessian[k, k] * value) * value
@@ -38,68 +57,53 @@ def fix_control_in_cost(i, value, stage) -> float:
     return constant + 0.5 * value * value
 
 
-def fix_controls_at_limits(u, gain, limits, stage, step) -> float:
-    """Fix the controls that the last backward pass fixed: at a limit, without a gain. Returns what the stage gains."""
-    constant = 0.0
-    for i in range(M):
-        if u[i] == limits.low[i] or u[i] == limits.high[i]:
-            free = False
-            for j in range(N):
-                free = free or gain[i, j] != 0
-            if not free:
-                constant += fix_control(i, u[i], stage, step)
-    return constant
+def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
+    """Minimise a stage over the control as `minimize_control` does, with controls clamped at the state x (N,).
 
+    Args:
+      stage: about the origin; controls at a limit are fixed in it. gain, feedforward, hessian, gradient: written.
 
-def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient) -> tuple[float, bool]:
-    """As `minimize_control`, but the control keeps its limits at the state x (N,), and those at a limit are fixed.
-
-    Returns the decrease that the feedforward brings, and whether the control block is positive definite.
+    Returns:
+      The decrease due to the feedforward, and whether the control block is positive definite.
     """
     low, high = limits.low, limits.high
     u, outward = stack(M), stack(M)
     decrease, constant = 0.0, 0.0
-    for last in range(2):  # one call in the text, for it takes long to compile
+    for last in range(2):  # one call in the text, because it takes long to compile
         decrease = minimize_control(stage.hessian, stage.gradient, gain, feedforward, hessian, gradient)
         if last == 1 or not decrease >= 0:
             break
+        affine(gain, feedforward, x, M, N, u)
         beyond = False
         for i in range(M):
-            u[i] = feedforward[i]
-            for j in range(N):
-                u[i] += gain[i, j] * x[j]
             beyond = beyond or u[i] < low[i] or u[i] > high[i]
         if not beyond:
             break
         coordinate_descent(stage, x, limits, u)
-        for i in range(M):  # all of them first: what is fixed no longer shows in the slopes of the others
+        for i in range(M):  # all slopes first: a fixed control no longer shows in the slopes of the others
             outward[i] = slope_at(stage, x, u, i)
         for i in range(M):
             if (u[i] == low[i] and outward[i] > 0) or (u[i] == high[i] and outward[i] < 0):
-                constant += fix_control_in_cost(i, u[i], stage)
+                constant += fix_control(i, u[i], stage)
     return decrease - constant, decrease >= 0
 
 
-def coordinate_descent(stage, x, limits, u) -> None:
-    """Write the control of least cost within the limits at a state: one entry after the other, until none moves."""
+def coordinate_descent(stage, x, limits, u):
+    """Minimise a stage over the control within its limits, at a state (N,), one control at a time until none moves."""
     low, high = limits.low, limits.high
-    within(u, limits)
+    clamp(u, limits)
     for _ in range(1000):
         moved, size = 0.0, 0.0
         for i in range(M):
-            new = u[i] - slope_at(stage, x, u, i) / stage.hessian[N + i, N + i]
-            if new < low[i]:
-                new = low[i]
-            elif new > high[i]:
-                new = high[i]
+            new = min(max(u[i] - slope_at(stage, x, u, i) / stage.hessian[N + i, N + i], low[i]), high[i])
             moved, size = max(moved, abs(new - u[i])), max(size, abs(new))
             u[i] = new
         if not moved > 1e-14 * size:
             break
 
 
-def slope_at(stage, x, u, i) -> float:
-    """The slope of a stage about the origin along control i, at (x, u)."""
+def slope_at(stage, x, u, i):
+    """The derivative of a stage about the origin in control i, at (x, u)."""
     g = stage.hessian
     total = stage.gradient[N + i]
     for j in range(N):
@@ -109,8 +113,8 @@ def slope_at(stage, x, u, i) -> float:
     return total
 
 
-def riccati_backward_within(t, step, stage, constant, x, limits, policy, to_go) -> bool:
-    """As `riccati_backward`, within the limits at the state x."""
+def riccati_backward_within(t, step, stage, constant, x, limits, policy, to_go):
+    """A step of the cost-to-go as `riccati_backward` makes it, with controls clamped at the state x (N,)."""
     shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease, good = minimize_within(
         stage, x, limits, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]

@@ -1,28 +1,32 @@
 """The dual form: the cost-to-come by its moments, as a Kalman filter whose noise is the control. The kernels' subset.
 
-`1/2 (x - mean)' covariance^-1 (x - mean) + constant` is the cost-to-come. The covariance may be singular, and is
-zero at a fixed start; neither the inverse dynamics nor an invertible A is needed. In the backward pass the costate, the
-slope of the cost-to-go at the minimiser, leads from each step to the one before (the modified Bryson-Frazier smoother).
+The cost-to-come is `1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero
+at a fixed start; neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient
+of the cost-to-go at the smoothed state, leads from each step to the one before (the modified Bryson-Frazier smoother).
 
 `cost_to_come_primal.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h =
-R^-1 r, the control is eliminated by u = w - F x - h: the rest is At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B
-h.
+R^-1 r, the substitution u = w - F x - h eliminates the control: At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
 """
 
 from math import sqrt
 
 from lqrsim.kernels.declarations import M, N, inline, stack
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
+from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, copy_matrix, step_offset
 from lqrsim.kernels.model_functions import step_jacobian
 from lqrsim.kernels.records import EliminatedControl
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
-    """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant.
+    """Write the cost-to-come at 0, given c_0 quadratised at x.
 
-    Where c_0 has no curvature, there is no covariance, and it gets a little about x, relative to that of the cost-to-go
-    S where there is one by now. An optimum stays one, and the next iteration moves x on. What is little is told in
-    units of each state's own curvature.
+    Where c_0 has no curvature there is no covariance. It then gets a little curvature about x, relative to each state's
+    own, or to the cost-to-go's: an optimum stays one, and the next iteration moves x on.
+
+    Args:
+      Q, q, constant: c_0 about the origin, (N, N), (N,).
+
+    Returns:
+      The constant of the cost-to-come, and whether it exists.
     """
     S, covariance, mean = to_go.hessian[0], to_come.matrix[0], to_come.vector[0]
     factor, column, slope = stack(N, N), stack(N), stack(N)
@@ -38,9 +42,7 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     curved = cholesky(factor, N)
     for i in range(N):
         curved = curved and factor[i, i] < 1e6  # the reciprocal of the root of a pivot
-    for i in range(N):
-        for j in range(N):
-            factor[i, j] = Q[i, j]
+    copy_matrix(Q, N, N, factor)
     if not curved:
         for i in range(N):
             little = 1e-6 * max(abs(Q[i, i]), S[i, i])
@@ -70,20 +72,25 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
 
 
 def linearize(x, u, model, arrived, step):
-    """Write where (x, u) leads, and the step linearised there: x_next = jacobian (x, u) + offset."""
+    """Write the next state (N,), and the step linearised at (x, u): x_next = jacobian (x, u) + offset."""
     step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-    offset(step.jacobian, x, u, arrived, step.offset)
+    step_offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards, which this form has anyway."""
+    """The Jacobian (N, W) of the step forwards, which this form linearises."""
     return step.jacobian
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """One step of the cost-to-come, in moments: from t to t + 1. Returns whether it succeeded.
+    """Write the moments of the cost-to-come at t + 1, given those at t, and the smoother's gains at t.
 
-    The stage is as in `riccati_backward`. What the backward pass needs is written, too; see `SmootherGains`.
+    Args:
+      step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin.
+      to_come: CostToCome. smoothing: SmootherGains, written.
+
+    Returns:
+      Whether R and the updated covariance exist.
     """
     V0, x0, c, slope = to_come.matrix[t], to_come.vector[t], step.offset, stage.gradient
     V, x, updated = to_come.matrix[t + 1], to_come.vector[t + 1], smoothing.state[t]
@@ -92,12 +99,12 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
     )  # fmt: skip
     h, AT, BT, Q, q = reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
     slope0 = stack(N)
-    # Products are formed here, where nothing else can point to, and then copied: only so they become vector code.
+    # Products are formed in arrays of this function and then copied: without aliasing they become vector code.
     U, G = stack(N, N), stack(N, N)
     good, crossed = eliminate_control(step, stage, reduced)
     if not good:
         return False
-    # Update: add what the step costs, first its value and slope at the mean.
+    # Update with the cost of the stage: first its value and gradient at the mean.
     value = to_come.constant[t] + constant
     for k in range(M):
         value -= 0.5 * slope[N + k] * h[k]
@@ -116,7 +123,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
             moved += U[i, j] * slope0[j]
         updated[i] = x0[i] - moved
         value -= 0.5 * slope0[i] * moved
-    # Predict: along the step, and let the control act.
+    # Predict along the step, with the control as noise.
     for i in range(N):
         for j in range(N):
             total = 0.0
@@ -150,9 +157,10 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 
 @inline
 def eliminate_control(step, stage, reduced):
-    """Write a step and its stage without the control; see `EliminatedControl`.
+    """Eliminate the control from a step and its stage; see EliminatedControl, which is written.
 
-    Returns whether R is positive definite, and a number that is zero where no cost couples states and controls.
+    Returns:
+      Whether R is positive definite; and a number that is zero where no cost couples states and controls.
     """
     jacobian, cost, slope = step.jacobian, stage.hessian, stage.gradient
     factor, F, h, AT, BT, Q, q = reduced.factor, reduced.F, reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
@@ -187,7 +195,11 @@ def eliminate_control(step, stage, reduced):
 
 @inline
 def control_response(reduced, G, updated, crossed, gain, feedforward):
-    """Write the control at t as a function of the costate at t + 1."""
+    """Write the control at t as an affine function of the costate at t + 1: gain (M, N) and feedforward (M,).
+
+    Args:
+      G: (N, N) gain of the state. updated: (N,) mean after the update. crossed: as `eliminate_control` returns it.
+    """
     F, h, BT = reduced.F, reduced.h, reduced.BT
     for k in range(M):
         feedforward[k] = -h[k]
@@ -202,7 +214,7 @@ def control_response(reduced, G, updated, crossed, gain, feedforward):
 
 
 def forward_substitute(factor, rows):
-    """Turn (M, N) rows into U^-T rows, given R = U'U as `cholesky` leaves it."""
+    """Turn rows (M, N) into U^-T rows, given the Cholesky factor U (M, M)."""
     for i in range(M):
         for j in range(N):
             rows[i, j] *= factor[i, i]
@@ -212,7 +224,7 @@ def forward_substitute(factor, rows):
 
 
 def back_substitute(factor, rows):
-    """Turn (M, N) rows into U^-1 rows."""
+    """Turn rows (M, N) into U^-1 rows, given the Cholesky factor U (M, M)."""
     for i in range(M - 1, -1, -1):
         for k in range(i + 1, M):
             for j in range(N):
@@ -222,12 +234,15 @@ def back_substitute(factor, rows):
 
 
 def update(V, Q, size):
-    """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if there is none. Q is used up.
+    """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if it does not exist.
 
-    With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits,
-    what is left is worked out in the form of Joseph, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps
-    V semidefinite. It takes little time where Q has few entries, as those of obstacles have. `size` (N,) is the
-    diagonal of Q before anything was taken from it: what is far less is rounding.
+    With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits, the
+    rest is computed in Joseph's form, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps V
+    semidefinite. It takes little time where Q has few entries, as those of obstacles have.
+
+    Args:
+      V: (N, N), overwritten. Q: (N, N), destroyed. size: (N,) diagonal of Q before the control was eliminated; far
+        smaller pivots are rounding.
     """
     f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0
@@ -235,7 +250,7 @@ def update(V, Q, size):
         scale = max(scale, size[i])
     for i in range(N):
         d = Q[i, i]
-        if abs(d) <= 1e-14 * size[i]:  # then so is the row, unless Q is indefinite
+        if abs(d) <= 1e-14 * size[i]:  # then the row is zero, too, unless Q is indefinite
             for j in range(i + 1, N):
                 if not abs(Q[i, j]) <= 1e-6 * scale:
                     return False
@@ -271,9 +286,10 @@ def update(V, Q, size):
 
 
 def smoothed_state(t, to_go, to_come, costate, x):
-    """Write the minimiser of the total cost at t and the costate there; False if there is none.
+    """Write the smoothed state x = x0 - V costate, (N,), and costate = (I + S V)^-1 (S x0 + s), (N,), at t.
 
-    costate = (I + S V)^-1 (S x0 + s), x = x0 - V costate.
+    Returns:
+      Whether I + S V is invertible.
     """
     S, s, V, x0 = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     a = stack(N, N)
@@ -283,11 +299,7 @@ def smoothed_state(t, to_go, to_come, costate, x):
             for k in range(N):
                 total += S[i, k] * V[k, j]
             a[i, j] = total
-    for i in range(N):
-        total = s[i]
-        for j in range(N):
-            total += S[i, j] * x0[j]
-        costate[i] = total
+    affine(S, s, x0, N, N, costate)
     if not solve(a, costate):
         return False
     for i in range(N):
@@ -299,9 +311,9 @@ def smoothed_state(t, to_go, to_come, costate, x):
 
 
 def solve(a, b):
-    """Solve a y = b in place by elimination with row pivots; False for a singular matrix.
+    """Solve a y = b in place, (N, N) and (N,), by elimination with row pivots; False for a singular matrix.
 
-    Whole rows are subtracted, with what is zero already: loops of constant length take less time than shorter ones.
+    Whole rows are subtracted, zeros included: loops of constant length are faster than shorter ones.
     """
     for k in range(N):
         pivot, largest = k, abs(a[k, k])
@@ -330,15 +342,11 @@ def solve(a, b):
 
 
 def previous_state(t, x_hat, costate, smoothing, model, x, u):
-    """Write the state and control (x, u) on the way to the minimiser at t + 1, whose costate is given."""
+    """Write the state (N,) and control (M,) at t, given the costate (N,) at the smoothed state at t + 1."""
     for i in range(N):
         total = smoothing.state[t, i]
         for j in range(N):
             total -= smoothing.state_gain[t, i, j] * costate[j]
         x[i] = total
-    for k in range(M):
-        total = smoothing.control[t, k]
-        for j in range(N):
-            total += smoothing.control_gain[t, k, j] * costate[j]
-        u[k] = total
-    within(u, model.limits)
+    affine(smoothing.control_gain[t], smoothing.control[t], costate, M, N, u)
+    clamp(u, model.limits)

@@ -1,57 +1,64 @@
-"""The primal form, the paper's: the cost-to-come as a quadratic, along the dynamics run backwards. The kernels' subset.
+"""The primal form, the paper's: the cost-to-come as a quadratic, along inverse dynamics. The kernels' subset.
 
 `cost_to_come_dual.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
 """
 
+from lqrsim.kernels.control_limits import limited_control
 from lqrsim.kernels.cost_to_go import minimize_control
-from lqrsim.kernels.declarations import NOISY, M, N, W, stack
+from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
     cholesky_solve,
-    clear,
     congruence,
-    offset,
+    copy,
+    copy_matrix,
     quadratic_at,
-    within,
+    step_offset,
 )
 from lqrsim.kernels.model_functions import advance, step_jacobian
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
-    """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant. Eq. (18)."""
-    for i in range(N):
-        to_come.vector[0, i] = q[i]
-        for j in range(N):
-            to_come.matrix[0, i, j] = Q[i, j]
+    """Write the cost-to-come at 0: c_0 about the origin, (N, N), (N,), constant. Eq. (18).
+
+    Returns:
+      The constant of the cost-to-come, and whether it exists.
+    """
+    copy(q, N, to_come.vector[0])
+    copy_matrix(Q, N, N, to_come.matrix[0])
     return constant, True
 
 
 def linearize(x, u, model, arrived, step):
-    """Write where (x, u) leads, and the inverse step linearised there: x = jacobian (x_next, u) + offset."""
+    """Write the next state (N,), and the inverse step linearised there: x = jacobian (x_next, u) + offset."""
     x_back = stack(N)
     advance(x, u, model, model.dt, arrived)
     step_jacobian(arrived, u, model, -model.dt, x_back, step.jacobian)
-    offset(step.jacobian, arrived, u, x_back, step.offset)
+    step_offset(step.jacobian, arrived, u, x_back, step.offset)
 
 
 def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards, which is worked out where there is a risk."""
+    """The Jacobian (N, W) of the step forwards; computed only where there is a risk, and undefined elsewhere."""
     if NOISY and model.noise.risk[0] != 0:
         step_jacobian(x, u, model, model.dt, arrived, spare)
     return spare
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """One step of the cost-to-come, Eqs. (15)-(17), (19): from t to t + 1. Returns whether it succeeded.
+    """Write the cost-to-come at t + 1, given that at t, and the inverse policy at t. Eqs. (15)-(17), (19).
 
-    The step is the inverse one linearised, x_t = Abar x_{t+1} + Bbar u_t + cbar; the rest as in `riccati_backward`. The
-    inverse policy is u_t = Lbar x_{t+1} + lbar.
+    Args:
+      step: LinearStep, the inverse step x_t = [Abar Bbar] (x_{t+1}, u_t) + cbar.
+      stage, constant: the cost at t about the origin. to_come: CostToCome.
+      smoothing: SmootherGains; gets the inverse policy u_t = Lbar x_{t+1} + lbar.
+
+    Returns:
+      Whether the control block is positive definite.
     """
     S0, s0, jacobian, c = to_come.matrix[t], to_come.vector[t], step.jacobian, step.offset
     cost, slope = stage.hessian, stage.gradient
-    z, a, v, b = stack(N, N), stack(N), stack(N), stack(W)
-    joint = stack(W, W)
+    z, a, v, b, joint = stack(N, N), stack(N), stack(N), zeros(W), zeros(W, W)
     crossed = 0.0
     for i in range(N):
         a[i] = s0[i] + slope[i]
@@ -61,9 +68,6 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
             v[i] += z[i, j] * c[j]
         for j in range(M):
             crossed += abs(cost[i, N + j])
-    clear(joint, W, W)
-    for i in range(N):
-        b[i] = 0.0
     for i in range(M):
         b[N + i] = slope[N + i]
         for j in range(M):
@@ -87,7 +91,11 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 
 
 def smoothed_state(t, to_go, to_come, costate, x):
-    """Write x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and the costate S x + s; False unless the sum is definite."""
+    """Write the smoothed state x = -(S + Sbar)^-1 (s + sbar), (N,), Eq. (21), and the costate S x + s, (N,), at t.
+
+    Returns:
+      Whether S + Sbar is positive definite.
+    """
     S, s, Sbar, sbar = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     total = stack(N, N)
     for i in range(N):
@@ -97,15 +105,11 @@ def smoothed_state(t, to_go, to_come, costate, x):
     if not cholesky(total, N):
         return False
     cholesky_solve(total, N, x)
-    for i in range(N):
-        costate[i] = s[i]
-        for j in range(N):
-            costate[i] += S[i, j] * x[j]
+    affine(S, s, x, N, N, costate)
     return True
 
 
 def previous_state(t, x_hat, costate, smoothing, model, x, u):
-    """Write the state and control (x, u) that lead to x_hat = x_{t+1}: the inverse policy, then the inverse step."""
-    affine(smoothing.control_gain[t], smoothing.control[t], x_hat, u)
-    within(u, model.limits)
+    """Write the state (N,) and control (M,) that lead to x_hat at t + 1, by the inverse policy and the inverse step."""
+    limited_control(smoothing.control_gain[t], smoothing.control[t], x_hat, model.limits, u)
     advance(x_hat, u, model, -model.dt, x)

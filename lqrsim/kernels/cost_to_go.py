@@ -1,16 +1,20 @@
-"""The cost-to-go: a step of the Riccati recursion, from t + 1 to t. The kernels' subset.
+"""One step of the Riccati recursion, which makes the cost-to-go at t of that at t + 1. The kernels' subset.
 
 Paper: Eqs. (9)-(13), in discrete time.
 """
 
 from lqrsim.kernels.declarations import M, N, stack
-from lqrsim.kernels.linear_algebra import cholesky, congruence, quadratic_at
+from lqrsim.kernels.linear_algebra import affine, cholesky, congruence, quadratic_at
 
 
 def riccati_backward(t, step, stage, constant, policy, to_go):
-    """One step of the cost-to-go, Eqs. (9)-(11), (13): from t + 1 to t. Returns whether it succeeded.
+    """Write policy and cost-to-go at t, given the cost-to-go at t + 1. Eqs. (9)-(11), (13).
 
-    The stage, with its constant, is about the origin, and is used up.
+    Args:
+      step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin; overwritten.
+
+    Returns:
+      Whether the control block is positive definite.
     """
     shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease = minimize_control(
@@ -21,26 +25,26 @@ def riccati_backward(t, step, stage, constant, policy, to_go):
 
 
 def add_cost_to_go(t, step, stage, constant, to_go):
-    """Add to a stage about the origin the cost-to-go at t + 1, where its step leads. Returns the sum's constant."""
+    """Add to a stage the cost-to-go of the state that its step leads to; return the constant of the sum."""
     S1, s1, k1 = to_go.hessian[t + 1], to_go.gradient[t + 1], to_go.constant[t + 1]
-    c = step.offset
-    v = stack(N)
-    for i in range(N):
-        v[i] = s1[i]
-        for j in range(N):
-            v[i] += S1[i, j] * c[j]
+    c, v = step.offset, stack(N)
+    affine(S1, s1, c, N, N, v)
     shifted = k1 + constant + quadratic_at(S1, s1, c)
     congruence(step.jacobian, S1, v, stage.hessian, stage.gradient)
     return shifted
 
 
 def minimize_control(g, h, gain, feedforward, hessian, gradient):
-    """Minimise `1/2 z'gz + h'z` over the control part of z = (x, u).
+    """Minimise `1/2 z'gz + h'z` over the control in z = (x, u); the minimiser is `u = gain x + feedforward`.
 
-    Writes the minimiser `u = gain x + feedforward` and what is left, a quadratic in x. Returns the decrease that
-    the feedforward brings, or -1 if the control block is not positive definite. `g` (W, W) and `h` (W,) are used up.
+    With the paper's blocks [D C'; C E] of g and (d, e) of h: L = -E^-1 C, l = -E^-1 e, S = D + C'L, s = d + C'l.
 
-    With C, E and e the parts of method and paper: L = -E^-1 C, l = -E^-1 e, S = D + C'L, s = d + C'l.
+    Args:
+      g: (W, W). h: (W,).
+      gain, feedforward: L (M, N) and l (M,), written. hessian, gradient: S (N, N) and s (N,) of the minimum, written.
+
+    Returns:
+      The decrease due to the feedforward, or -1 if E is not positive definite.
     """
     e, c, y = stack(M, M), stack(M, N), stack(M)
     for i in range(M):

@@ -1,8 +1,8 @@
-"""The safeguard: LQR smoothing held near the best plan so far, for when it fails on its own. The kernels' subset.
+"""The safeguard: damped LQR smoothing near the best plan so far, for when undamped smoothing fails.
 
-Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost does not tell that the
-method will fail. It is left alone until a pass fails or the least cost so far no longer falls; see `no_progress`. What
-Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothing.
+The kernels' subset. Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost
+does not tell that the method will fail. It runs undamped until a pass fails or the lowest cost no longer falls; see
+`no_progress`. Damped iterations are to LQR smoothing what Levenberg-Marquardt is to Gauss-Newton.
 """
 
 from math import inf, isnan, nan
@@ -21,7 +21,8 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
-from lqrsim.kernels.passes import backward_pass, copy, forward_pass, smoothed_states
+from lqrsim.kernels.linear_algebra import copy
+from lqrsim.kernels.passes import backward_pass, forward_pass, smoothed_states
 from lqrsim.kernels.records import Linearization, ModelOrder
 from lqrsim.kernels.rollouts import (
     copy_plan,
@@ -37,23 +38,21 @@ from lqrsim.kernels.rollouts import (
 
 
 def damped_iterations(first, last, settings, model, work, memory, log):
-    """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is; with constraints, its
-    merit, to which the augmented Lagrangian belongs.
+    """Iterations from the best plan so far that never raise its merit: its cost and the augmented Lagrangian.
 
-    The forward pass linearises about the plan, the backward pass part of the way (`reach`) to where the minimisers
-    lead, and the new policy is followed as far as lowers the cost, by halves. Where a tenth of the way does not, the
-    next iteration reaches less far. At reach 0 both passes linearise about the plan, and the step is that of iLQR: it
-    points downhill, and some part of it lowers the cost, unless the plan is stationary or rounding spoils the matrices.
-    If so, changes of the controls (and of a soft start) get a weight in both passes, relative to the cost's own
-    curvature, which grows tenfold until it helps.
+    The forward pass linearises about the plan, the backward pass a fraction `reach` of the way from the plan to the
+    smoothed states, and a line search by halves follows the new policy. Where a tenth of the step does not lower the
+    merit, the next iteration reaches less far. At reach 0 both passes linearise about the plan, and the step is iLQR's:
+    a descent direction, unless the plan is stationary or rounding spoils the matrices. If it fails, changes of the
+    controls (and of a soft start) get a weight in both passes, relative to the cost's own curvature, which grows
+    tenfold until it helps. After many iterations without convergence, too, reach 0 has its turn, each time for twice as
+    long.
 
-    A small change of cost can come from a short step, so two in a row are wanted. Then everything is done once more,
-    about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
-    functions of the answer.
+    A small change of cost can come from a short step, so two in a row are required. Then one more undamped pass about
+    the plan measures its optimality, and computes the policy and the value functions of the answer.
 
-    After many iterations without an end, too, reach 0 has its turn, each time for twice as long.
-
-    With `first` of `last`, there is no iteration: only policy and value functions are made, about the plan as it is.
+    With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
+    `smoother_iterations`.
     """
     if first == last:
         _, failed = relinearize(settings, False, 0.0, model, work, memory, log[first])
@@ -65,7 +64,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, negligible)
             shorten_step(settings.steps, fraction, work.plan, work.x_hats)
-            # At reach 0 as for iLQR: negligible but a rollout was linearised about.
+            # At reach 0, as in iLQR, only a rollout was linearised about: it has no gap.
             gap = largest_gap(settings.steps, work.x_hats, work.rollout.states) if reach > 0 else 0.0
             copy_plan(settings.steps, work.rollout, work.plan)
             memory.plan_cost, memory.merit = cost, merit
@@ -89,8 +88,10 @@ def damped_iterations(first, last, settings, model, work, memory, log):
 
 
 def damped_step(settings, model, work, memory):
-    """Both passes and the line search. Returns the new merit and cost, the part of the step that was taken, and a cost
-    that is as good as none; see `backward_pass`.
+    """Both passes and the line search.
+
+    Returns:
+      The new merit, the new cost, the fraction of the step that was taken, and the cost that is negligible.
     """
     shift, reach = stack(N), memory.reach
     merit, cost, fraction, negligible = inf, inf, 0.0, 0.0
@@ -103,22 +104,22 @@ def damped_step(settings, model, work, memory):
         for i in range(N):
             shift[i] = work.x_hat[i] - work.plan.states[0, i]
         policy_about_plan(settings.steps, work.plan, work.policy)
-        if NOISY:  # as the new policy's cost-to-go weighs it
+        if NOISY:  # with the new policy's cost-to-go
             update_plan_cost(settings.steps, model, work, memory)
         smallest = 0.1 if reach > 0 else 1e-8
-        bound = memory.merit + 1e-12 * abs(memory.merit)  # what differs by rounding is not refused
+        bound = memory.merit + 1e-12 * abs(memory.merit)  # differences by rounding are accepted
         merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, 0.0, smallest, work.rollout)
     return merit, cost, fraction, negligible
 
 
 def update_plan_cost(steps, model, work, memory):
-    """Work out anew what the plan is expected to cost, with the cost-to-go that was found last."""
+    """Evaluate the plan's expected cost and merit with the latest cost-to-go."""
     cost, added = plan_cost(steps, work.plan, model, work.to_go)
     memory.plan_cost, memory.merit = cost, cost + added
 
 
 def relax_damping(memory, fraction):
-    """What the next iteration ventures after one that lowered the cost, by that fraction of its step."""
+    """Adapt weight and reach after an iteration that lowered the merit with that fraction of its step."""
     if memory.weight > 0:
         memory.weight = 0.1 * memory.weight if memory.weight > 1e-6 else 0.0
     elif memory.reach > 0:
@@ -133,7 +134,7 @@ def relax_damping(memory, fraction):
 
 
 def tighten_damping(memory):
-    """What the next iteration ventures after one that did not lower the cost."""
+    """Adapt weight and reach after an iteration that did not lower the merit."""
     if memory.reach > 0.25:
         memory.reach = 0.25
     elif memory.reach > 0:
@@ -143,16 +144,17 @@ def tighten_damping(memory):
 
 
 def turn_to_ilqr(memory):
-    """Reach 0 for a while: each time for twice as long, for what lies beyond has not helped so far."""
+    """Set reach to 0 for a while, each time for twice as long."""
     memory.reach, memory.since_ilqr = 0.0, 0.0
     memory.ilqr_left = memory.ilqr_next
     memory.ilqr_next *= 2
 
 
 def relinearize(settings, settled, negligible, model, work, memory, row):
-    """Policy and value functions about the plan, without a weight. Returns the outcome, and the step that failed or -1.
+    """Compute policy and value functions about the plan, undamped; write optimality and residual to the log's row.
 
-    Writes optimality and residual to the row of the log.
+    Returns:
+      The outcome, and the step that failed, or -1.
     """
     steps, plan, policy, to_go, shift = settings.steps, work.plan, work.policy, work.to_go, stack(N)
     failed, _, left = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
@@ -169,10 +171,10 @@ def relinearize(settings, settled, negligible, model, work, memory, row):
 
 
 def value_functions_at_plan(settings, model, work, memory, row):
-    """What is left after a pass about the plan: its policy as one that makes the plan, and the cost-to-come.
+    """Complete a backward pass about the plan: a policy that reproduces the plan, and the cost-to-come.
 
-    Writes the residual to the row of the log, and to the memory how far the states of least total cost are from the
-    plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
+    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: where motions are
+    unstable, rounding can spoil the cost-to-come while the rest is right.
     """
     steps, plan, policy = settings.steps, work.plan, work.policy
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
@@ -180,7 +182,7 @@ def value_functions_at_plan(settings, model, work, memory, row):
     memory.final_gap = inf
     if failed < 0 and smoothed_states(steps, work.to_go, work.to_come, work.x_hats):
         memory.final_gap = largest_gap(steps, work.x_hats, plan.states)
-    # The forward pass has left it at the end; what comes next begins at the start.
+    # The forward pass left x_hat at T; the next iteration begins at the start.
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     for t in range(steps):
         for i in range(M):
@@ -188,5 +190,5 @@ def value_functions_at_plan(settings, model, work, memory, row):
             for j in range(N):
                 policy.offset[t, i] -= policy.gain[t, i, j] * plan.states[t, j]
     row.residual = dynamics_residual(steps, work.x_hats, policy, model, plan.states)
-    if isnan(row.gap):  # of an iteration that was rejected
+    if isnan(row.gap):  # the iteration was rejected
         row.gap = 0.0

@@ -1,8 +1,8 @@
 """The names that kernels are written against, and that mean something only when they are compiled.
 
-Sizes become constants; words of the language are what `codegen/language.py` says; functions are filled in, by what the
-form of the cost-to-come, dynamics, constraints and noise bring (see `codegen/sources.py`). This module only declares
-them, so that each kernel can be read, linted and type-checked on its own.
+Sizes become constants, and words of the language what `codegen/language.py` says. Open functions are filled in
+with those of dynamics, costs, constraints, noise and sensors, and of the form of the cost-to-come; see
+`codegen/sources.py`. They are declared here so that each kernel can be read, linted and type-checked on its own.
 """
 
 from collections.abc import Callable
@@ -11,32 +11,32 @@ import numpy as np
 
 N = 0  # states
 M = 0  # controls
-W = N + M  # a state and a control, joined
-NOISY = 0  # 1 for a problem with noise: what `if NOISY` guards is not compiled for others
-EQUALITY = 0  # 1 for a constraint whose numbers are to be zero
+W = N + M  # states and controls, joined
+NOISY = 0  # 1 for a problem with noise; `if NOISY` is not compiled for others
+EQUALITY = 0  # 1 for a constraint whose values must be zero
 
-# How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
-# finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
-# NO_PROGRESS that the least cost so far does not fall. TIMED_OUT is for the drivers: no kernel looks at a clock.
-# RISK_TOO_HIGH is a pass that failed because no expectation exists. IN_VALLEY is where Newton's method can go on.
+# How iterations end; see `Status`. Outcomes without a status of their own: NO_START (the first trajectory is not
+# finite), STALLED (the line search found no lower cost), CYCLING (the same costs repeat), NO_PROGRESS (the lowest cost
+# so far no longer falls), TIMED_OUT (set by the callers: no kernel looks at a clock), RISK_TOO_HIGH (the expectation
+# does not exist) and IN_VALLEY (Newton's method can take over).
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
 NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH, IN_VALLEY = 10, 11, 12, 13
 LONGEST_CYCLE = 8
-# After how many iterations without a lower cost, and after how many in which it fell by less than a thousandth, there
-# is no progress. `python experiments/benchmark_reliability.py --sections overhead` shows that neither is met where the
-# method converges on the paper's queries.
+# Iterations without a lower cost, and with a decrease below a thousandth, after which there is no progress. Neither
+# count is reached where the method converges on the paper's queries:
+# `python experiments/benchmark_reliability.py --sections overhead`.
 NO_FALL, SLOW_FALL = 12, 30
-ROW = 16  # numbers that an obstacle takes in `World.table`: kind, position (3), rotation (9, row by row), size (3)
-HEADER = 5  # numbers that come before the multipliers; see `augmented_lagrangian.py`
+ROW = 16  # numbers of an obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
+HEADER = 5  # numbers before the multipliers of a constraint; see `augmented_lagrangian.py`
 
-# What an entry is to do; see `entry_points.py`.
+# Tasks of the entry points; see `entry_points.py`.
 ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4
 
-# What an iteration was; see `Iteration.method`.
+# Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
 
-# After how many damped iterations without an end iLQR has its turn.
+# Damped iterations after which iLQR has its turn.
 PATIENCE = 50
 
 
@@ -48,32 +48,39 @@ def stack(*shape: int) -> np.ndarray:
     return np.empty(shape)
 
 
+def zeros(*shape: int) -> np.ndarray:
+    """The same, filled with zeros."""
+    return np.zeros(shape)
+
+
 def inline(function: Callable) -> Callable:
-    """Decorates a kernel that becomes part of its callers. LLVM finds most of what is worth it by itself."""
+    """Decorate a kernel that is inlined into its callers. LLVM decides well about most others itself."""
     return function
 
 
 def outline(function: Callable) -> Callable:
-    """Decorates a kernel that stays a function of its own, called for one thing after the other.
+    """Decorate a kernel that is never inlined.
 
-    In a loop LLVM might work on several at once, and for the last few round otherwise: then the bits of a trial would
-    depend on how many there are.
+    Inlined into a loop over trials, LLVM might vectorise across trials and round the remainder differently: the bits of
+    a trial would then depend on how many there are.
     """
     return function
 
 
 def exact(function: Callable) -> Callable:
-    """Decorates a kernel whose sums are taken in the order in which they stand."""
+    """Decorate a kernel whose sums are evaluated in the order in which they are written."""
     return function
 
 
 def call(function, *arguments) -> None:
-    """Call the C function at an address with arrays, by their addresses, floats, ints of 64 bits, and `int32`; records
-    are taken apart."""
+    """Call the C function at an address.
+
+    Arrays are passed by address, numbers as doubles and 64-bit ints (or `int32`), records field by field.
+    """
 
 
 def call_for_value(function, *arguments) -> float:
-    """The same for one that returns a float."""
+    """Call a C function that returns a double."""
     return 0.0
 
 
@@ -83,40 +90,40 @@ def at(address):
 
 
 def rows_at(address, width: int):
-    """The same as rows of a constant width."""
+    """The float64 numbers at an address, in rows of a constant width."""
     return np.empty((0, width))
 
 
 def int32(number: int) -> int:
-    """An int of 32 bits, to call a C function with."""
+    """A 32-bit int, as an argument of a C function."""
     return number
 
 
 def power_of_two(exponent: float) -> float:
-    """2 to a whole number from -1022 to 1023, which is a float; beyond, any number."""
+    """2**exponent, for a whole number from -1022 to 1023 in a float; undefined beyond."""
     return 2.0**exponent
 
 
 def claim(flags, index) -> int:
-    """Set a flag, one of the int64 at an address, from 0 to 1; 1 if it was this thread that did, else 0."""
+    """Atomically set the int64 flag at an address from 0 to 1; return 1 if this thread did, else 0."""
     return 1
 
 
 def load(words, index) -> int:
-    """One of the int64 at an address, which threads share."""
+    """Atomically read an int64 that threads share."""
     return 0
 
 
 def store(words, index, value: int) -> None:
-    """Write one of them; what was written before it is there for who then loads it."""
+    """Atomically write an int64 that threads share; what was written before is visible to whoever loads it."""
 
 
 def fetch_add(words, index, value: int) -> int:
-    """Add to one of them, and return what it was before."""
+    """Atomically add to an int64 that threads share; return its value before."""
     return 0
 
 
-# What dynamics, constraints, balls, noise and sensors bring.
+# Open functions of dynamics, costs, constraints, noise and sensors.
 
 
 def rate(x, u, p, out) -> None:
@@ -124,47 +131,52 @@ def rate(x, u, p, out) -> None:
 
 
 def rate_jacobian(x, u, p, out, fx, fu) -> None:
-    """Write f (N,), and the entries of df/dx (N, N) and df/du (N, M) that are not zero everywhere."""
+    """Write f (N,), and the structurally nonzero entries of df/dx (N, N) and df/du (N, M)."""
 
 
 def rate_curvature(x, u, p, w, curve) -> None:
-    """Write the second derivatives of `sum_i w[i] f[i]` in the entries that `step_curvature.py` takes, but zeros."""
+    """Write the nonzero second derivatives of `sum_i w[i] f[i]`, in the entries that `step_curvature.py` lists."""
+
+
+def value(x, u, t, data) -> float:
+    """A cost."""
+    return 0.0
 
 
 def constraint_value(x, u, t, row, data) -> float:
-    """One of a constraint's numbers, which are not to be negative, or to be zero."""
+    """One value of a constraint: nonnegative, or zero for an equality, where it is satisfied."""
     return 0.0
 
 
 def constraint_slope(x, u, t, row, data, gradient) -> None:
-    """Add its gradient (W,)."""
+    """Add the gradient (W,) of that value."""
 
 
 def places(x, data, out) -> None:
-    """Write where the balls of a robot are, three coordinates each, ball by ball."""
+    """Write the centres of a robot's balls, three coordinates each, ball by ball."""
 
 
 def places_jacobian(x, data, out, slopes) -> None:
-    """Write these, and those of their derivatives in the states (..., N) that are not zero everywhere."""
+    """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N)."""
 
 
 def noise_values(x, u, data, out) -> None:
-    """Write M(x, u), the rows of it that `noise.py` takes."""
+    """Write the rows of M(x, u) that `noise.py` lists."""
 
 
 def noise_slopes(x, u, data, out, slopes) -> None:
-    """Write these, and their derivatives, column by column, in the entries of (x, u) that `noise.py` takes."""
+    """Write these rows, and their derivatives, column by column, in the entries of (x, u) that `noise.py` lists."""
 
 
 def measure(x, data, out) -> None:
-    """Write what the sensors say of a state, (Y,)."""
+    """Write the measurement of a state, (Y,)."""
 
 
 def measure_slope(x, data, out) -> None:
-    """Write those entries of its Jacobian (Y, N) that are not zero everywhere, to zeros."""
+    """Write the structurally nonzero entries of the measurement's Jacobian (Y, N)."""
 
 
-# What the form of the cost-to-come brings; see `cost_to_come_dual.py`, `cost_to_come_primal.py` and `records.py`.
+# Open functions of the form of the cost-to-come; see `cost_to_come_dual.py`, `cost_to_come_primal.py`.
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool]:
@@ -173,23 +185,23 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool
 
 
 def linearize(x, u, model, arrived, step) -> None:
-    """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
+    """Write the next state, and the linear step that `riccati_forward` takes."""
 
 
 def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards, after `linearize`; `spare` may be written to."""
+    """The Jacobian (N, W) of the step forwards, after `linearize`; may use the work array `spare`."""
     return step.jacobian
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:
-    """One step of the cost-to-come, from t to t + 1."""
+    """Write the cost-to-come at t + 1, given that at t; return whether it exists."""
     return True
 
 
 def smoothed_state(t, to_go, to_come, costate, x) -> bool:
-    """Write the minimiser of the total cost at t, and the costate there."""
+    """Write the minimiser of the total cost at t, and the costate there; return whether it exists."""
     return True
 
 
 def previous_state(t, x_hat, costate, smoothing, model, x, u) -> None:
-    """Write the state and control, within its limits, on the way to the minimiser at t + 1."""
+    """Write the state and control at t, given the smoothed state and costate at t + 1."""

@@ -1,25 +1,43 @@
-"""What Python calls: one function a solver, and what is wanted on its own. The kernels' subset.
+"""What Python calls: one function a solver, and the passes and rollouts that are wanted alone. The kernels' subset.
 
 All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
 """
 
 from lqrsim.kernels.certificate import certify
+from lqrsim.kernels.cost_to_go import riccati_backward
 from lqrsim.kernels.damped_iterations import damped_iterations
-from lqrsim.kernels.declarations import CERTIFY, DAMP, EVALUATE, FINISH
+from lqrsim.kernels.declarations import (
+    CERTIFY,
+    DAMP,
+    EVALUATE,
+    FINISH,
+    N,
+    W,
+    riccati_forward,
+    smoothed_state,
+    stack,
+)
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
+from lqrsim.kernels.linear_algebra import copy, copy_matrix
 from lqrsim.kernels.newton_iterations import newton_iterations
 from lqrsim.kernels.passes import opening_pass as opening_pass
+from lqrsim.kernels.records import LinearStep, QuadraticStage
 from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
-    """Undamped, damped or Newton iterations; or the certificate of the rollout and the policy kept.
+    """Run undamped, damped or Newton iterations; or certify the rollout and the policy kept.
 
-    To evaluate is to certify with Hessians of the policy's own, which take the place of the cost-to-go's.
+    Args:
+      task: one of ITERATE, DAMP, FINISH; CERTIFY, with the Hessians of the cost-to-go; or EVALUATE, with Hessians of
+        the policy itself, which overwrite them.
+      first, last: iterations to run, `last` excluded. The rest are records.
+
+    Returns:
+      As `iterations.py` says.
     """
     if task >= CERTIFY:
-        own = task == EVALUATE
-        certify(settings, own, work.rollout, work.kept, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.rollout, work.kept, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == DAMP:
         return damped_iterations(first, last, settings, model, work, memory[0], log)
@@ -29,9 +47,42 @@ def smoother(task, first, last, settings, model, work, memory, log):
 
 
 def ilqr(task, first, last, settings, model, work, log):
-    """Iterations of iLQR; or the certificate of the plan and the policy; see `smoother`."""
+    """Run iterations of iLQR; or certify the plan and the policy. As `smoother`."""
     if task >= CERTIFY:
-        own = task == EVALUATE
-        certify(settings, own, work.plan, work.policy, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.plan, work.policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     return ilqr_iterations(first, last, settings, model, work, log)
+
+
+def lq_passes(steps, dynamics, inverse, stages, constants, work):
+    """Both passes of a linear-quadratic problem, and its smoothed states.
+
+    Args:
+      dynamics: LinearStep, [A B] (T, N, W) and c (T, N). inverse: the steps that the form's forward pass takes.
+      stages: QuadraticStage, (T, W, W) and (T, W). constants: (T,).
+      work: RiccatiArrays, with the cost-to-go at T and the cost-to-come at 0.
+
+    Returns:
+      The step that failed, or -1; and 0 if it was in the backward pass, 1 in the forward pass, 2 in their sum.
+    """
+    stage, costate = QuadraticStage(stack(W, W), stack(W)), stack(N)
+    for t in range(steps - 1, -1, -1):
+        copy_stage(t, stages, stage)
+        step = LinearStep(dynamics.jacobian[t], dynamics.offset[t])
+        if not riccati_backward(t, step, stage, constants[t], work.policy, work.to_go):
+            return t, 0
+    for t in range(steps):
+        copy_stage(t, stages, stage)
+        step = LinearStep(inverse.jacobian[t], inverse.offset[t])
+        if not riccati_forward(t, step, stage, constants[t], work.to_come, work.smoothing):
+            return t, 1
+    for t in range(steps + 1):
+        if not smoothed_state(t, work.to_go, work.to_come, costate, work.x_hats[t]):
+            return t, 2
+    return -1, 0
+
+
+def copy_stage(t, stages, stage):
+    """Copy a stage, because the Riccati steps overwrite theirs."""
+    copy_matrix(stages.hessian[t], W, W, stage.hessian)
+    copy(stages.gradient[t], W, stage.gradient)

@@ -1,47 +1,49 @@
-"""A Kalman filter's steps for many trials at once, and slopes along a plan. The kernels' subset.
+"""The steps of a Kalman filter for many trials at once, and derivatives along a plan. The kernels' subset.
 
-An estimate is one row: the state x (N), what the actuators have reached (LAG: M numbers, or none), and the states of
-the unknowns (D). The unknowns' values, `output` times these, are of so many parameters of the dynamics (P), and the
-gain and the offset of each control.
+An estimate is one row of Z numbers: the state x (N), the actuators' lagging controls (LAG: M numbers, or none), and the
+states of the unknowns' model (D). `output` times these are the unknowns: of P parameters of the dynamics, and of the
+gain and the offset of each control (V = P + 2 M).
 """
 
 from math import nan
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
+from lqrsim.kernels.linear_algebra import affine, clear, copy
 from lqrsim.kernels.policy_evaluation import to_nearest
 
-LAG, D, Y = 0, 1, 1  # lagging actuators, states of unknowns, measured numbers
+LAG, D, Y = 0, 1, 1  # lagging controls, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
-NUMBERS, HELD = 1, 1  # that the dynamics have; D, and at least 1
-FAR = 1e9  # of an estimate, in its unit: nothing of a robot is
+NUMBERS, HELD = 1, 1  # parameters of the dynamics; D, and at least 1
+FAR = 1e9  # an entry of an estimate beyond this has diverged, whatever its unit
 
 
-def sensor_slopes(count, states, sensor, out) -> None:
-    """Write the Jacobians of the sensors at states (count, N): (count, Y, N)."""
+def sensor_slopes(count, states, sensor, out):
+    """Write the Jacobians (count, Y, N) of the measurement at states (count, N)."""
     for t in range(count):
-        for i in range(Y):
-            for j in range(N):
-                out[t, i, j] = 0.0
+        clear(out[t], Y, N)
         call(sensor.slope, states[t], sensor.data, out[t])
 
 
-def measurements(count, states, sensor, out) -> None:
-    """Write what the sensors say at states (count, N): (count, Y)."""
+def measurements(count, states, sensor, out):
+    """Write the measurements (count, Y) at states (count, N)."""
     for t in range(count):
         call(sensor.measure, states[t], sensor.data, out[t])
 
 
-def slopes_along(steps, states, controls, dynamics, dt, ahead, jacobian) -> None:
-    """Write where each step of a plan leads, (steps, N), and its Jacobian [A B], (steps, N, W)."""
+def slopes_along(steps, states, controls, dynamics, dt, arrived, jacobian):
+    """Write the next state (steps, N) and the Jacobian [A B] (steps, N, W) of each step of a plan."""
     for t in range(steps):
-        call(dynamics.step_jacobian, states[t], controls[t], dynamics.parameters, dt, ahead[t], jacobian[t])
+        call(dynamics.step_jacobian, states[t], controls[t], dynamics.parameters, dt, arrived[t], jacobian[t])
 
 
-def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slopes) -> None:
-    """Write how the steps of a plan depend on parameters, (steps, N, P), by central differences."""
+def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slopes):
+    """Write the derivatives (steps, N, P) of the steps of a plan in some parameters, by central differences.
+
+    Args:
+      which: (P,) indices of the parameters. changes: (P,) by how much they are changed.
+    """
     p, q, more, less = dynamics.parameters, stack(NUMBERS), stack(N), stack(N)
-    for i in range(NUMBERS):
-        q[i] = p[i]
+    copy(p, NUMBERS, q)
     for j in range(P):
         k, h = int(which[j]), changes[j]
         for t in range(steps):
@@ -54,49 +56,49 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
         q[k] = p[k]
 
 
-def correct(count, measured, near, gain, sensor, turning, estimates, innovations) -> None:
-    """Take a measurement into the estimates (count, Z), but where it was lost.
+def correct(count, measured, near, gain, sensor, angular, estimates, innovations):
+    """Update estimates (count, Z) with measurements, except where these were lost.
 
-    The states that are shown (count, N) are taken to the representatives nearest to the estimates, and these nearest to
-    `near` (N,). Writes what measurements differ by from what was expected, (count, Y); NaN where they were lost.
+    Args:
+      measured: Measurements; its states are taken to the representatives nearest to the estimates.
+      near: (N,) to which the estimates are taken nearest first. gain: (Z, Y).
+      innovations: (count, Y) measured less expected, written; NaN where the measurement was lost.
     """
     for k in range(count):
-        correct_one(measured.shown[k], measured.lost[k], near, gain, sensor, turning, estimates[k], innovations[k])
+        correct_one(measured.shown[k], measured.lost[k], near, gain, sensor, angular, estimates[k], innovations[k])
 
 
 @outline
-def correct_one(shown, lost, near, gain, sensor, turning, z, innovation) -> None:
-    """That of one trial: z (Z,)."""
+def correct_one(shown, lost, near, gain, sensor, angular, z, innovation):
+    """Update the estimate z (Z,) of one trial."""
     x, seen, expected = stack(N), stack(Y), stack(Y)
-    to_nearest(z, near, turning)
+    to_nearest(z, near, angular)
     if lost != 0.0:
         for j in range(Y):
             innovation[j] = nan
         return
-    for i in range(N):
-        x[i] = shown[i]
-    to_nearest(x, z, turning)
+    copy(shown, N, x)
+    to_nearest(x, z, angular)
     call(sensor.measure, x, sensor.data, seen)
     call(sensor.measure, z, sensor.data, expected)
     for j in range(Y):
-        seen[j] -= expected[j]
-        innovation[j] = seen[j]
+        innovation[j] = seen[j] - expected[j]
     for i in range(Z):
         total = z[i]
         for j in range(Y):
-            total += gain[i, j] * seen[j]
+            total += gain[i, j] * innovation[j]
         z[i] = total
 
 
-def predict(count, controls, predictor, estimates) -> None:
-    """Take the estimates (count, Z) one control period on, in which the controls (count, M) are commanded."""
+def predict(count, controls, predictor, estimates):
+    """Predict estimates (count, Z) over one control period, under the commanded controls (count, M)."""
     for k in range(count):
         predict_one(controls[k], predictor, estimates[k])
 
 
 @outline
-def predict_one(control, predictor, z) -> None:
-    """That of one trial: z (Z,)."""
+def predict_one(control, predictor, z):
+    """Predict the estimate z (Z,) of one trial."""
     p, places, lag = predictor.dynamics.parameters, predictor.places, predictor.lag
     q, v, after, value, fresh = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
     for i in range(V):
@@ -104,8 +106,7 @@ def predict_one(control, predictor, z) -> None:
         for j in range(D):
             total += predictor.output[i, j] * z[N + LAG + j]
         value[i] = total
-    for i in range(NUMBERS):
-        q[i] = p[i]
+    copy(p, NUMBERS, q)
     for i in range(P):
         q[int(places[i])] += value[i]
     for i in range(M):
@@ -116,8 +117,7 @@ def predict_one(control, predictor, z) -> None:
             u += lag[1] * behind
         v[i] = u * (1.0 + value[P + i]) + value[P + M + i]
     call(predictor.dynamics.advance, z, v, q, predictor.dt, after)
-    for i in range(N):
-        z[i] = after[i]
+    copy(after, N, z)
     for i in range(D):
         total = 0.0
         for j in range(D):
@@ -127,25 +127,26 @@ def predict_one(control, predictor, z) -> None:
         z[N + LAG + i] = fresh[i]
 
 
-def command(count, estimates, near, law, limits, turning, out) -> None:
-    """Controls (count, M) within the limits, of the estimates, whose angles are taken nearest to `near`."""
+def command(count, estimates, near, policy, limits, angular, out):
+    """Write the controls (count, M), within their limits, of a policy with gains (M, Z) on the estimates (count, Z).
+
+    The estimates' angles are taken to the representatives nearest to `near` (N,).
+    """
     for k in range(count):
-        command_one(estimates[k], near, law, limits, turning, out[k])
+        command_one(estimates[k], near, policy, limits, angular, out[k])
 
 
 @outline
-def command_one(z, near, law, limits, turning, u) -> None:
-    """Those of one trial: z (Z,) and u (M,)."""
-    to_nearest(z, near, turning)
+def command_one(z, near, policy, limits, angular, u):
+    """Write the control u (M,) of one trial's estimate z (Z,)."""
+    to_nearest(z, near, angular)
+    affine(policy.gain, policy.offset, z, M, Z, u)
     for j in range(M):
-        total = law.offset[j]
-        for i in range(Z):
-            total += law.gain[j, i] * z[i]
-        u[j] = min(max(total, limits.low[j]), limits.high[j])
+        u[j] = min(max(u[j], limits.low[j]), limits.high[j])
 
 
-def diverged(count, estimates, out) -> None:
-    """Write which entry of each estimate is the first that is not finite or beyond `FAR`, (count,); Z where none is."""
+def diverged(count, estimates, out):
+    """Write the first entry of each estimate that is not finite or beyond `FAR`, (count,); Z if there is none."""
     for k in range(count):
         out[k] = Z
         for i in range(Z - 1, -1, -1):

@@ -1,12 +1,21 @@
-"""What an iteration of the interior point takes of a problem, and the step that it makes. The kernels' subset.
+"""What an iteration of the interior point evaluates, and the step that it makes. The kernels' subset.
 
-The plan need not be a motion: where a step leads and where the next state is are apart by a gap, which the iterations
-close. `solvers/interior_point.py` has the method.
+The plan need not satisfy the dynamics: between where a step leads and the next state there is a gap, which the
+iterations close. `solvers/interior_point.py` has the method.
 """
 
-from lqrsim.kernels.cost_to_go import minimize_control
-from lqrsim.kernels.declarations import M, N, W, stack
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, congruence
+from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
+from lqrsim.kernels.declarations import M, N, W, stack, zeros
+from lqrsim.kernels.linear_algebra import (
+    affine,
+    cholesky,
+    cholesky_solve,
+    copy,
+    copy_matrix,
+    entry,
+    fill,
+    set_entry,
+)
 from lqrsim.kernels.model_functions import (
     USES_CONTROL,
     advance,
@@ -17,16 +26,20 @@ from lqrsim.kernels.model_functions import (
     step_jacobian,
     step_second_order,
 )
+from lqrsim.kernels.records import LinearStep, QuadraticStage
 
-TINY = 1e-9  # what is left of a control's own curvature when that is as good as none
-STEP = 6e-6  # of differences of slopes, relative to a number and at least 1: the cube root of rounding
+TINY = 1e-9  # least curvature that a control block must have, relative to the control's own
+STEP = 6e-6  # of differences of gradients, relative to a number and at least to 1: the cube root of the precision
 
 
 def stage_models(t, steps, second, plan, costates, model, rows, out):
-    """Write those of a stage, but for the constraints' slopes, which `slopes` has written. Return its cost."""
-    none = stack(M)
-    for i in range(M):
-        none[i] = 0.0
+    """Write the models of cost and step at t, and of the constraints if `second` is 1; return the cost.
+
+    Args:
+      second: 1 to include second derivatives of step and constraints. costates: (T+1, N). rows: ConstraintRows.
+      out: StageModels; the constraints' gradients are those that `constraint_slopes` wrote.
+    """
+    none = zeros(M)
     x, u = plan.states[t], plan.controls[min(t, steps - 1)]
     if t < steps:
         total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
@@ -37,15 +50,13 @@ def stage_models(t, steps, second, plan, costates, model, rows, out):
     else:
         total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
     if second == 1:
-        curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
+        subtract_curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
     return total
 
 
 def convex_models(steps, soft, plan, model, out):
-    """Write the projected Hessians of the cost at a plan."""
-    gradient, none, hessian = stack(W), stack(M), stack(W, W)
-    for i in range(M):
-        none[i] = 0.0
+    """Write the projected Hessians (T+1, W, W) of the cost at a plan; `soft` is 1 if there is an initial cost."""
+    gradient, none, hessian = stack(W), zeros(M), stack(W, W)
     for t in range(steps):
         cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, out.convex[t], gradient)
     cost_quadratic(plan.states[steps], none, steps, model.final, out.convex[steps], gradient)
@@ -58,9 +69,7 @@ def convex_models(steps, soft, plan, model, out):
 
 def add_initial(x, model, out):
     """Add the initial cost to the first stage; return its value."""
-    hessian, gradient, none = stack(W, W), stack(W), stack(M)
-    for i in range(M):
-        none[i] = 0.0
+    hessian, gradient, none = stack(W, W), stack(W), zeros(M)
     cost = cost_of_order(x, none, 0, model.initial, 1.0, hessian, gradient)
     for i in range(N):
         out.gradient[0, i] += gradient[i]
@@ -70,31 +79,29 @@ def add_initial(x, model, out):
 
 
 def constraint_slopes(steps, plan, constraints, rows, out):
-    """Write the slopes of all constraints at all steps, and which entries they depend on."""
-    slope = stack(W)
+    """Write the gradients ((T+1) size, W) of all constraints, and the entries that they depend on."""
     for t in range(steps + 1):
         x, u = plan.states[t], plan.controls[min(t, steps - 1)]
         for k in range(constraints.size):
             acts = acts_at(k, t, steps, constraints)
             for row in range(int(constraints.multipliers[k][1])):
                 place = int(rows.first[k]) + row
-                for i in range(W):
-                    slope[i] = 0.0
+                slope = out.slopes[rows.size * t + place]
+                fill(slope, W, 0.0)
                 if acts:
                     slope_of_constraint(k, row, x, u, t, constraints, slope)
                 for i in range(W):
-                    out.slopes[rows.size * t + place, i] = slope[i]
                     if slope[i] != 0:
                         rows.support[place, i] = 1.0
 
 
 def acts_at(k, t, steps, constraints):
-    """Whether a constraint acts at a step."""
+    """Whether constraint k acts at a step."""
     return t >= constraints.multipliers[k][2] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
 
 
-def curvatures(x, u, t, steps, constraints, rows, hessian):
-    """Subtract the Hessians of all constraints at a step times their multipliers."""
+def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
+    """Subtract from a Hessian (W, W) those of all constraints at a step, times their multipliers."""
     for k in range(constraints.size):
         if not acts_at(k, t, steps, constraints):
             continue
@@ -104,52 +111,40 @@ def curvatures(x, u, t, steps, constraints, rows, hessian):
 
 
 def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
-    """Subtract the Hessian of one of a constraint's numbers times its multiplier: differences of its slope."""
+    """Subtract the Hessian of one value of a constraint times its multiplier, by differences of its gradient."""
     place = int(rows.first[k]) + row
     weight = rows.multipliers[rows.size * t + place]
-    y, v, ahead, behind = stack(N), stack(M), stack(W), stack(W)
-    for i in range(N):
-        y[i] = x[i]
-    for i in range(M):
-        v[i] = u[i]
+    y, v, above, below = stack(N), stack(M), stack(W), stack(W)
+    copy(x, N, y)
+    copy(u, M, v)
     for j in range(W):
         if rows.support[place, j] == 0:
             continue
-        z = x[j] if j < N else u[j - N]
+        z = entry(x, u, j)
         far = STEP * max(1.0, abs(z))
-        for i in range(W):
-            ahead[i], behind[i] = 0.0, 0.0
+        fill(above, W, 0.0)
+        fill(below, W, 0.0)
         set_entry(y, v, j, z + far)
-        slope_of_constraint(k, row, y, v, t, constraints, ahead)
+        slope_of_constraint(k, row, y, v, t, constraints, above)
         set_entry(y, v, j, z - far)
-        slope_of_constraint(k, row, y, v, t, constraints, behind)
+        slope_of_constraint(k, row, y, v, t, constraints, below)
         set_entry(y, v, j, z)
         for i in range(W):
-            half = 0.5 * weight * (ahead[i] - behind[i]) / (2 * far)
+            half = 0.5 * weight * (above[i] - below[i]) / (2 * far)
             hessian[i, j] -= half
             hessian[j, i] -= half
 
 
-def set_entry(y, v, j, number):
-    """Write one entry of a state and a control, joined."""
-    if j < N:
-        y[j] = number
-    else:
-        v[j - N] = number
-
-
 def trial_cost(steps, soft, plan, model, arrived):
-    """The cost of a plan; writes where each of its steps leads, (T, N)."""
+    """Write where each step of a plan leads, (T, N), and return the plan's cost."""
     for t in range(steps):
         advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
     return cost_of_plan(steps, soft, plan, model)
 
 
 def cost_of_plan(steps, soft, plan, model):
-    """The cost of a plan."""
-    none = stack(M)
-    for i in range(M):
-        none[i] = 0.0
+    """The cost of a plan; `soft` is 1 if there is an initial cost."""
+    none = zeros(M)
     total = cost_value(plan.states[0], none, 0, model.initial) if soft == 1 else 0.0
     for t in range(steps):
         total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
@@ -157,63 +152,58 @@ def cost_of_plan(steps, soft, plan, model):
 
 
 def adjoint(steps, gradient, jacobian, costates, slopes):
-    """The costates (T+1, N) of a sum of stages with these gradients (T+1, W), and its slopes in the controls (T, M)."""
-    for i in range(N):
-        costates[steps, i] = gradient[steps, i]
+    """Write the costates (T+1, N) and the gradient in the controls (T, M) of a sum of stages.
+
+    Args:
+      gradient: (T+1, W) of the stages. jacobian: (T, N, W) of the steps.
+    """
+    copy(gradient[steps], N, costates[steps])
     for t in range(steps - 1, -1, -1):
         for j in range(W):
             total = gradient[t, j]
             for i in range(N):
                 total += jacobian[t, i, j] * costates[t + 1, i]
-            if j < N:
-                costates[t, j] = total
-            else:
-                slopes[t, j - N] = total
+            set_entry(costates[t], slopes[t], j, total)
 
 
 def terminal_cost_to_go(steps, stage, slope, to_go):
-    """Write the cost-to-go at the end."""
-    for i in range(N):
-        to_go.gradient[steps, i] = slope[i]
-        for j in range(N):
-            to_go.hessian[steps, i, j] = stage[i, j]
+    """Write the cost-to-go at T."""
+    copy(slope, N, to_go.gradient[steps])
+    copy_matrix(stage, N, N, to_go.hessian[steps])
 
 
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
-    """A step of the Riccati recursion, from t + 1 to t, with the gap closed; uses up the stage.
+    """Write gains and cost-to-go at t, given the cost-to-go at t + 1, so that the gap closes.
 
     Args:
-      policy: gets the gains, and the changes of controls where states do not change. to_go: gets the cost-to-go of
-        changes.
+      stage: (W, W) and slope: (W,) of the model at the plan; overwritten. jacobian: (N, W). gap: (N,).
+      policy: offsets are the changes of the controls where the state does not change. to_go: of changes of the state.
 
     Returns:
       Whether the control block is positive definite.
     """
-    ahead, least = stack(N), stack(M)
+    least = stack(M)
     for i in range(M):
         least[i] = TINY * abs(stage[N + i, N + i])
-    for i in range(N):
-        ahead[i] = to_go.gradient[t + 1, i]
-        for j in range(N):
-            ahead[i] += to_go.hessian[t + 1, i, j] * gap[j]
-    congruence(jacobian, to_go.hessian[t + 1], ahead, stage, slope)
+    add_cost_to_go(t, LinearStep(jacobian, gap), QuadraticStage(stage, slope), 0.0, to_go)
     if not control_block_definite(stage, least):
         return False
     return minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) >= 0
 
 
 def forward_sweep(steps, free, jacobian, gaps, policy, to_go, changes):
-    """Write the changes of the plan that a policy makes, and as gradients of the cost-to-go the costates where they
-    forward_sweep; whether the start's have a minimum. `free` (N,) is 0 for the states that the start fixes.
+    """Write the changes of the plan that a policy makes, and the costates after them, as gradients of the cost-to-go.
+
+    Args:
+      free: (N,) 0 for the states that the start fixes, else 1. jacobian: (T, N, W). gaps: (T, N). changes: Motion.
+
+    Returns:
+      Whether the change of the start has a minimum.
     """
     if not start_change(free, to_go, changes.states[0]):
         return False
     for t in range(steps):
-        for i in range(M):
-            total = policy.offset[t, i]
-            for j in range(N):
-                total += policy.gain[t, i, j] * changes.states[t, j]
-            changes.controls[t, i] = total
+        affine(policy.gain[t], policy.offset[t], changes.states[t], M, N, changes.controls[t])
         for i in range(N):
             total = gaps[t, i]
             for j in range(N):
@@ -229,7 +219,7 @@ def forward_sweep(steps, free, jacobian, gaps, policy, to_go, changes):
 
 
 def start_change(free, to_go, change):
-    """Write by how much the start moves, (N,); whether that has a minimum. What is fixed does not move."""
+    """Write the best change of the start, (N,), zero where it is fixed; return whether it has a minimum."""
     curve = stack(N, N)
     for i in range(N):
         change[i] = -to_go.gradient[0, i] * free[i]
@@ -243,7 +233,7 @@ def start_change(free, to_go, change):
 
 
 def control_block_definite(stage, least):
-    """Whether a control block is positive definite when so much is subtracted from its diagonal, (M,)."""
+    """Whether the control block of a stage (W, W) less a diagonal (M,) is positive definite."""
     block = stack(M, M)
     for i in range(M):
         for j in range(M):
@@ -253,14 +243,13 @@ def control_block_definite(stage, least):
 
 
 def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
-    """The motion that a part of a step leads to, its gains closing the loop; writes states and controls.
+    """Roll out a fraction of a step from a trajectory, with its gains closing the loop.
 
     Args:
-      plan: a motion. policy: gains, and changes of controls where states do not change, as `riccati_step` writes them.
-      limits: what the controls are held between, at each step, (T, M) each. out: gets the motion.
+      part: the fraction. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
+      limits: of the controls at each step, (T, M) each. out: Motion, written.
     """
-    for i in range(N):
-        out.states[0, i] = plan.states[0, i]
+    copy(plan.states[0], N, out.states[0])
     for t in range(steps):
         for i in range(M):
             total = plan.controls[t, i] + part * policy.offset[t, i]

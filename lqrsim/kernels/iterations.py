@@ -1,8 +1,8 @@
-"""The iterations of the solvers, with nothing but compiled code between them. The kernels' subset.
+"""Iterations of LQR smoothing and of iLQR, all in compiled code. The kernels' subset.
 
-Each function runs the iterations `first` to `last` - 1 and can be called again to go on: what it needs to remember is
-in its arrays. The log gets a row an iteration. All return how many iterations there are now, the outcome (a name in
-`declarations.py`), and for a pass that failed whether it was the backward one and its step, else -1.
+Each function runs the iterations `first` to `last` - 1, and can be called again to continue: its state is in its
+arrays. The log gets a row per iteration. All return the number of iterations so far, the outcome (a name in
+`declarations.py`), and for a pass that failed whether it was the backward one, and its step, else -1.
 """
 
 from math import inf, isnan, nan
@@ -30,8 +30,10 @@ from lqrsim.kernels.declarations import (
     M,
     N,
     stack,
+    zeros,
 )
-from lqrsim.kernels.passes import backward_pass, copy, forward_pass
+from lqrsim.kernels.linear_algebra import copy
+from lqrsim.kernels.passes import backward_pass, forward_pass
 from lqrsim.kernels.records import CostToGo, Linearization, ModelOrder, Policy, Prior, ProblemModel
 from lqrsim.kernels.rollouts import (
     copy_plan,
@@ -48,9 +50,9 @@ from lqrsim.kernels.rollouts import (
 
 
 def relative_improvement(old, cost, negligible):
-    """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too; infinite if the cost is.
+    """The decrease of cost relative to the new cost; 0 where it did not change, -inf where the cost is not finite.
 
-    Costs below `negligible` are zero but for rounding: what there is of them never settles.
+    Costs below `negligible` are rounding of zero, and would never settle.
     """
     if not abs(cost) < inf:
         return -inf
@@ -58,16 +60,17 @@ def relative_improvement(old, cost, negligible):
 
 
 def smoother_iterations(first, last, settings, model, work, memory, log):
-    """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
+    """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy in each iteration.
 
-    The policy and the cost-to-go in the workspace are those to begin with. What the last iteration that was completed
-    found is the rollout and the policy kept; before any, where the first policy leads. The plan is the rollout of least
-    cost so far, that of the first policy included, and `memory.plan_cost` that cost: for the safeguard. With `last` of
-    0, only that is begun with.
+    Args:
+      settings: IterationSettings. model: ProblemModel. memory, log: rows of MEMORY and LOG.
+      work: SmootherArrays. Policy and cost-to-go are what to begin with. `rollout` and `kept` are those of the last
+        complete iteration, and before any those of the first policy. `plan` is the rollout of lowest cost so far, the
+        first policy's included, and `memory.plan_cost` its cost: for the safeguard.
+
+    With `last` of 0, only the first policy is rolled out.
     """
-    no_weight, steps, fixed, x_hat = stack(N), settings.steps, settings.fixed, work.x_hat
-    for i in range(N):
-        no_weight[i] = 0.0
+    no_weight, steps, fixed, x_hat = zeros(N), settings.steps, settings.fixed, work.x_hat
     scaled = ProblemModel(
         model.dynamics, model.dt, model.initial, work.homotopy_scaled, model.final, model.limits, model.noise
     )
@@ -116,7 +119,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 
 
 def roll_out_and_keep(steps, start, model, work, memory):
-    """Run the policy and keep it with where it leads; the best so far is the plan. Returns the cost."""
+    """Run the policy, and keep it with its rollout; the rollout of lowest cost is the plan. Returns the cost."""
     cost = rollout(steps, start, work.policy, model, work.rollout)
     if NOISY:
         cost += noise_cost(steps, work.rollout, model, work.to_go)
@@ -128,17 +131,17 @@ def roll_out_and_keep(steps, start, model, work, memory):
 
 
 def failure(good, model):
-    """The outcome of a pass that failed, given whether all numbers there were finite."""
+    """The outcome of a pass that failed, given whether all numbers in it were finite."""
     if NOISY and model.noise.risk[1] > 0:
         return RISK_TOO_HIGH
     return NOT_POSITIVE_DEFINITE if good else NOT_FINITE
 
 
 def cycling(log, done):
-    """Whether the last costs are, to rounding, those before them in the same order: so they will be from now on.
+    """Whether the costs repeat to rounding: then they always will.
 
-    Two rounds of a cycle that the iterations have come to are looked at; one that they only come nearer to is none yet.
-    A cost that stays the same is one, too: where the iterations that it comes of have not converged, they never will.
+    A cycle must repeat twice; one that the iterations still approach does not count. A cost that stays the same is a
+    cycle, too: iterations that have not converged by then never will.
     """
     same = done >= 5
     for i in range(5):
@@ -158,10 +161,10 @@ def cycling(log, done):
 
 
 def no_progress(log, done):
-    """Whether the least cost so far has not fallen for NO_FALL iterations, or next to nothing for SLOW_FALL.
+    """Whether the lowest cost has not fallen for NO_FALL iterations, or by less than a thousandth for SLOW_FALL.
 
-    Costs that rise are no sign: the method passes through them on its way. Costs that swing about, or creep, are, and
-    costs that stay infinite.
+    A rising cost is no sign of failure, because the method passes through worse rollouts on its way. Costs that
+    oscillate, creep or stay infinite are.
     """
     least, reference, since, slow = inf, inf, 0, 0
     for i in range(done + 1):
@@ -178,7 +181,7 @@ def no_progress(log, done):
 
 
 def optimality(settings, plan, model, cost, negligible):
-    """What a linear-quadratic model about a trajectory promises, relative to its cost; infinite if there is none."""
+    """The decrease that iLQR's model about a trajectory predicts, relative to its cost; infinite if its pass fails."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
     failed, _, left = differential_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
@@ -194,14 +197,14 @@ def write_row(row, cost, improvement, gap, left, residual, method):
 
 
 def relative_optimality(failed, decrease, cost, negligible):
-    """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
+    """A predicted decrease relative to the cost; infinite where the pass that predicts it failed."""
     if failed >= 0 or not decrease < inf or not abs(cost) < inf:
         return inf
     return decrease / max(abs(cost), negligible, 1e-300)
 
 
 def outcome_of(settled, settings, left, cost, full):
-    """The outcome after an iteration whose cost did or did not settle, with that optimality left."""
+    """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last one."""
     if settled and not settings.optimal:
         return COST_CONVERGED
     if settled and left < settings.tolerance:
@@ -212,19 +215,21 @@ def outcome_of(settled, settings, left, cost, full):
 
 
 def ilqr_iterations(first, last, settings, model, work, log):
-    """Iterative LQR: a backward pass about a feasible trajectory and a line search, again and again.
+    """Iterative LQR: a backward pass about a feasible trajectory and a line search in each iteration.
 
-    Far outside an arena costs reach 1e20, and rounding takes the backward pass its positive-definite matrices. Then,
-    and only then, changes of the controls get a weight; it falls again by the same steps.
+    Far outside an arena costs reach 1e20, and rounding makes the backward pass's matrices indefinite. Only then do
+    changes of the controls get a weight, which falls again by the same factor.
 
-    The policy is that which makes the first trajectory; afterwards the plan is the best one, and the policy (relative
-    to it) and the cost-to-go are about it. The log has, in its last row, the cost that the first iteration improves on.
-    With `first` of `last`, there is no iteration: only policy and cost-to-go are made, about the plan as it is.
+    Args:
+      settings: IterationSettings. model: ProblemModel.
+      work: IlqrArrays. The policy makes the first trajectory; afterwards the plan is the best trajectory, and policy
+        (relative to it) and cost-to-go are about it.
+      log: rows of LOG; the last one has the cost that the first iteration improves on.
+
+    With `first` equal to `last`, only policy and cost-to-go are computed, about the plan as it is.
     """
     steps, policy, plan, to_go, damping = settings.steps, work.policy, work.plan, work.to_go, work.damping
-    no_shift = stack(N)
-    for i in range(N):
-        no_shift[i] = 0.0
+    no_shift = zeros(N)
     if first == 0:
         cost = rollout(steps, work.start, policy, model, plan)
         log[settings.max_iterations].cost = cost
@@ -265,7 +270,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:
-            if isnan(left):  # not worked out; but policy and cost-to-go are to be about the trajectory that was found
+            if isnan(left):  # policy and cost-to-go are not yet about the trajectory that was found
                 failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

@@ -1,28 +1,34 @@
-"""Small dense algebra. The kernels' subset.
+"""Small dense linear algebra. The kernels' subset.
 
-The innermost loops are sums of constant length, which LLVM unrolls and turns into vector instructions. Matrices are
-(N, N) or, with states and controls joined, (W, W); their upper triangle is what is read where they are symmetric.
+Innermost loops have constant length, so LLVM unrolls and vectorises them. Matrices are (N, N) or, for states and
+controls joined, (W, W); of symmetric ones the upper triangle is read.
 """
 
 from math import inf, sqrt
 
-from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.declarations import M, N, W, inline, stack
 
 
-def cholesky(a, size):
-    """Factor a = U'U in place, upper triangle, reciprocals on the diagonal; False unless positive definite."""
-    for k in range(size):
-        if not a[k, k] > 0:  # a NaN too
-            return False
-        inverse = 1 / sqrt(a[k, k])
-        a[k, k] = inverse
-        for j in range(k + 1, size):
-            a[k, j] *= inverse
-        for i in range(k + 1, size):
-            factor = a[k, i]
-            for j in range(i, size):
-                a[i, j] -= factor * a[k, j]
-    return True
+@inline
+def copy(a, size, out):
+    """Copy a vector."""
+    for i in range(size):
+        out[i] = a[i]
+
+
+@inline
+def copy_matrix(a, rows, columns, out):
+    """Copy a matrix."""
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = a[i, j]
+
+
+@inline
+def fill(a, size, number):
+    """Set all entries of a vector to a number."""
+    for i in range(size):
+        a[i] = number
 
 
 def clear(a, rows, columns):
@@ -41,6 +47,55 @@ def finite(a, rows, columns):
     return True
 
 
+def entry(x, u, i):
+    """Entry i of (x, u)."""
+    return x[i] if i < N else u[i - N]
+
+
+def set_entry(x, u, i, number):
+    """Set entry i of (x, u)."""
+    if i < N:
+        x[i] = number
+    else:
+        u[i - N] = number
+
+
+@inline
+def affine(matrix, offset, x, rows, columns, out):
+    """Write matrix x + offset, (rows,)."""
+    for i in range(rows):
+        total = offset[i]
+        for j in range(columns):
+            total += matrix[i, j] * x[j]
+        out[i] = total
+
+
+def clamp(u, limits):
+    """Clamp a control to its limits; a NaN stays."""
+    low, high = limits.low, limits.high
+    for i in range(M):
+        if u[i] < low[i]:
+            u[i] = low[i]
+        elif u[i] > high[i]:
+            u[i] = high[i]
+
+
+def cholesky(a, size):
+    """Factor a = U'U in place: U in the upper triangle, reciprocals on its diagonal; False unless positive definite."""
+    for k in range(size):
+        if not a[k, k] > 0:  # a NaN too
+            return False
+        inverse = 1 / sqrt(a[k, k])
+        a[k, k] = inverse
+        for j in range(k + 1, size):
+            a[k, j] *= inverse
+        for i in range(k + 1, size):
+            factor = a[k, i]
+            for j in range(i, size):
+                a[i, j] -= factor * a[k, j]
+    return True
+
+
 def cholesky_solve(a, size, b):
     """Solve U'U y = b in place, given the factor."""
     for i in range(size):
@@ -55,50 +110,45 @@ def cholesky_solve(a, size, b):
         b[i] = total * a[i, i]
 
 
-def moved(z, i, a, j, b, x, u):
-    """Write the state and the control of z (W,), the entry i moved by a and the entry j by b."""
-    for k in range(N):
-        x[k] = z[k]
-    for k in range(M):
-        u[k] = z[N + k]
-    if i < N:
-        x[i] += a
-    else:
-        u[i - N] += a
-    if j < N:
-        x[j] += b
-    else:
-        u[j - N] += b
-
-
 def about_origin(hessian, gradient, x, u, value):
-    """Turn the gradient at (x, u) into the slope at the origin, in place; return the constant term. Eq. (27)."""
+    """Turn a quadratic about (x, u) into one about the origin: its gradient, in place; return its constant. Eq. (27).
+
+    Args:
+      hessian: (W, W). gradient: (W,) at (x, u); overwritten. value: the quadratic's value at (x, u).
+    """
     constant = value
     for i in range(W):
-        zi = x[i] if i < N else u[i - N]
         curved = 0.0
         for j in range(N):
             curved += hessian[i, j] * x[j]
         for j in range(M):
             curved += hessian[i, N + j] * u[j]
-        constant += (0.5 * curved - gradient[i]) * zi
+        constant += (0.5 * curved - gradient[i]) * entry(x, u, i)
         gradient[i] -= curved
     return constant
 
 
-def offset(jacobian, x_from, u, x_to, c):
-    """Write c = x_to - A x_from - B u, the constant of a linearised step. Eq. (25)."""
+def step_offset(jacobian, x, u, x_next, c):
+    """Write c = x_next - A x - B u, the constant of a linearised step. Eq. (25).
+
+    Args:
+      jacobian: [A B] (N, W). x, x_next: (N,). u: (M,). c: (N,), written.
+    """
     for i in range(N):
-        total = x_to[i]
+        total = x_next[i]
         for j in range(N):
-            total -= jacobian[i, j] * x_from[j]
+            total -= jacobian[i, j] * x[j]
         for j in range(M):
             total -= jacobian[i, N + j] * u[j]
         c[i] = total
 
 
 def congruence(jacobian, z, v, g, h):
-    """Add `jacobian' z jacobian` to g (W, W) and `jacobian' v` to h (W,)."""
+    """Add `jacobian' z jacobian` to g (W, W), and `jacobian' v` to h (W,).
+
+    Args:
+      jacobian: (N, W). z: (N, N) symmetric. v: (N,).
+    """
     product = stack(N, W)
     for i in range(N):
         for j in range(W):
@@ -119,7 +169,7 @@ def congruence(jacobian, z, v, g, h):
 
 
 def quadratic_at(z, v, c):
-    """The value `1/2 c'zc + v'c`."""
+    """The value `1/2 c'zc + v'c`; z (N, N), v and c (N,)."""
     total = 0.0
     for i in range(N):
         curved = 0.0
@@ -127,22 +177,3 @@ def quadratic_at(z, v, c):
             curved += z[i, j] * c[j]
         total += (0.5 * curved + v[i]) * c[i]
     return total
-
-
-def affine(gain, feedforward, x, u):
-    """Write u = gain x + feedforward, (M,)."""
-    for i in range(M):
-        total = feedforward[i]
-        for j in range(N):
-            total += gain[i, j] * x[j]
-        u[i] = total
-
-
-def within(u, limits):
-    """Cut a control off at its limits; a NaN stays."""
-    low, high = limits.low, limits.high
-    for i in range(M):
-        if u[i] < low[i]:
-            u[i] = low[i]
-        elif u[i] > high[i]:
-            u[i] = high[i]

@@ -1,9 +1,9 @@
-"""Newton's method from a plan: down the valley that smoothing has found, to its bottom. The kernels' subset.
+"""Newton's method from the plan that smoothing has found. The kernels' subset.
 
-A pass is that of iLQR with models of second order: the Hessians of costs as they are, not projected, and that of the
-dynamics times the costate (differential dynamic programming). Where it finds a control with nothing to gain from being
-finite, it is done again with a smaller share of the second order, down to none, which is iLQR's. About an optimum with
-enough curvature, the plan's error is squared in each iteration.
+A pass is that of differential dynamic programming: iLQR's, with the true Hessians of the costs, not projected, and
+those of the dynamics times the costate. Where a control block is not positive definite, the pass is repeated with a
+smaller share of the second order, down to none, which is iLQR's. Near an optimum with enough curvature, convergence is
+quadratic.
 """
 
 from math import isnan, nan
@@ -22,29 +22,34 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.iterations import failure, relative_improvement, relative_optimality, write_row
-from lqrsim.kernels.passes import copy
+from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.records import CostToGo, ModelOrder
 from lqrsim.kernels.rollouts import copy_plan, differential_pass, initial_step, line_search
 
-# The shares that are tried where a pass with more of the second order has no minimum.
+# Shares of the second order, tried in this order until a pass has a minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
-ARMIJO = 1e-4  # of the decrease that a step promises, what there has to be of it
-SMALLEST = 1e-3  # part of a step
-ROUNDING = 1e-12  # of a merit
-SMALL, WEIGHTS = 1e-10, 8  # of the merit, a weight on changes of controls; how many are tried, in thousands
-MORE = 3  # steps at most, while the states of least total cost are not at the plan
+ARMIJO = 1e-4  # share of the predicted decrease that a step must achieve
+SMALLEST = 1e-3  # fraction of a step that the line search tries
+ROUNDING = 1e-12  # relative, of a merit
+SMALL, WEIGHTS = 1e-10, 8  # first weight on changes of controls, relative to the merit; how many, times 1000 each
+MORE = 3  # further steps at most, while the smoothed states are not at the plan
 
 
 def newton_iterations(first, last, settings, model, work, memory, log):
-    """Newton steps from the plan, whose cost and merit are in the memory, each of which lowers its merit.
+    """Newton steps from the plan, each of which lowers its merit.
 
-    A share below 0 in the memory is for a plan about which there was no pass yet. A row of the log tells of the plan
-    after the step, its optimality included: what the next step promises. A step of which no part lowers the merit is
-    tried once more without the second order; then it has stalled.
+    A step of which no fraction lowers the merit is tried again without the second order; then the method has stalled.
+    At the end, the value functions are those of smoothing, without the second order: convex, so that the minimum of
+    their sum is at the plan. Where it is not, up to MORE further steps follow: in flat directions a plan may be far off
+    though the predicted decrease is small.
 
-    The policy is, at the end, the one of the last pass. The value functions are about the plan, and those of smoothing,
-    without the second order: convex, so that their sum has its minimum at the plan. Where it is not there yet, some
-    more steps are made: in flat directions a plan may be far off though there is negligible to gain.
+    Args:
+      settings: IterationSettings. model: ProblemModel. work: SmootherArrays, with the plan.
+      memory: row of MEMORY, with the plan's cost and merit; a share below 0 if there was no pass about the plan yet.
+      log: rows of LOG. An iteration's optimality is the decrease that the next step promises.
+
+    Returns:
+      As `iterations.py` says.
     """
     steps, plan, shift = settings.steps, work.plan, stack(N)
     if memory.share < 0:
@@ -82,48 +87,46 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         if outcome == RUNNING and done + 1 == settings.max_iterations:
             outcome = MAX_ITERATIONS
         if outcome != RUNNING:
-            value_functions(settings, model, work, memory, log[done])
+            convex_value_functions(settings, model, work, memory, log[done])
             return done + 1, outcome, False, -1
     return last, RUNNING, False, -1
 
 
 def newton_pass(settings, model, work, memory):
-    """A pass about the plan, with as much of the second order as the memory allows and has a minimum.
+    """A pass about the plan, with the largest share of the second order, up to the memory's, that has a minimum.
 
-    Writes to the memory the share it had, the decrease of cost that it promises, also relative to the merit, and the
-    step at which it failed, or -1; to `work.x_hat` where the start is to move. Returns whether all numbers were finite.
-    The cost-to-go of second order is in the place of the cost-to-come.
+    Where even convex models have none, as where a control costs nothing, changes of the controls get a weight.
+
+    Args:
+      work: SmootherArrays. The policy is written, relative to the plan; so is `x_hat`, where the start is to move. The
+        cost-to-go of second order takes the place of the cost-to-come.
+      memory: `share`, `damping`, `failed`, `decrease`, `promised` and `negligible` are written.
+
+    Returns:
+      Whether all numbers were finite.
     """
-    steps, plan, shift, begin = settings.steps, work.plan, stack(N), memory.share
-    failed, good, left = -1, True, nan
+    begin, failed, good, left = memory.share, -1, True, nan
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
-    if NOISY:  # what noise costs is what smoothing takes it to cost
-        failed, good, _ = differential_pass(
-            steps, plan, model, ModelOrder(0.0, 0.0, work.to_go), 1, work.kept, work.to_go
-        )
+    if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
+        order = ModelOrder(0.0, 0.0, work.to_go)
+        failed, good, _ = differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
         memory.failed = failed
         if failed >= 0:
             return good
-        update_plan_cost(steps, model, work, memory)
-    for k in range(len(SHARES)):
-        share = SHARES[k]
+        update_plan_cost(settings.steps, model, work, memory)
+    for k in range(len(SHARES) + WEIGHTS):
+        share, damping = 0.0, 0.0
+        if k < len(SHARES):
+            share = SHARES[k]
+        else:
+            damping = SMALL * max(abs(memory.merit), SMALL) * 1e3 ** (k - len(SHARES))
         if share <= begin:
-            order = ModelOrder(0.0, share, work.to_go)
-            failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
-            copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
-            if failed < 0 and not settings.fixed:
-                left += initial_step(plan.states[0], model, share, second, shift)
-                for i in range(N):
-                    work.x_hat[i] += shift[i]
-                if isnan(left):
-                    failed = 0
-            memory.failed, memory.share, memory.damping = failed, share, 0.0
+            failed, good, left = pass_of_order(settings, model, work, share, damping, second)
+            memory.failed, memory.share, memory.damping = failed, share, damping
             if failed < 0 or not good:
                 break
-    if failed >= 0 and good:
-        failed, left = damped_pass(settings, model, work, memory, second)
     size = 0.0
-    for t in range(steps + 1):
+    for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
     memory.negligible = 1e-26 * size
     memory.decrease = 2 * left
@@ -131,31 +134,23 @@ def newton_pass(settings, model, work, memory):
     return good
 
 
-def damped_pass(settings, model, work, memory, second):
-    """A pass where not even convex models have a minimum, as where a control costs negligible: with the least weight on
-    changes of the controls, of some, with which they have. Returns as a pass does, without whether numbers are finite.
-    """
-    steps, plan, shift, damping, failed, left = settings.steps, work.plan, stack(N), 0.0, 0, nan
-    for k in range(WEIGHTS):
-        damping = SMALL * max(abs(memory.merit), SMALL) * 1e3**k
-        order = ModelOrder(damping, 0.0, work.to_go)
-        failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
-        copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
-        if failed < 0 and not settings.fixed:
-            left += initial_step(plan.states[0], model, 0.0, second, shift)
-            for i in range(N):
-                work.x_hat[i] += shift[i]
-            if isnan(left):
-                failed = 0
-        if failed < 0 or not good:
-            break
-    memory.failed, memory.damping = failed, damping
-    return failed, left
+def pass_of_order(settings, model, work, share, damping, second):
+    """One pass with that share of the second order and that damping; returns as `differential_pass` does."""
+    plan, shift, order = work.plan, stack(N), ModelOrder(damping, share, work.to_go)
+    failed, good, left = differential_pass(settings.steps, plan, model, order, 1, work.policy, second)
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+    if failed < 0 and not settings.fixed:
+        left += initial_step(plan.states[0], model, share, second, shift)
+        for i in range(N):
+            work.x_hat[i] += shift[i]
+        if isnan(left):
+            failed = 0
+    return failed, good, left
 
 
 def finish_at_plan(settings, model, work, memory, row):
-    """Make policy and value functions of the answer; whether it is one. If not, there is a pass to go on with."""
-    value_functions(settings, model, work, memory, row)
+    """Compute the policy and value functions at the plan; return False, after another pass, if they call for a step."""
+    convex_value_functions(settings, model, work, memory, row)
     if memory.final_gap < settings.gap_tolerance or memory.small_changes >= MORE:
         return True
     memory.small_changes += 1
@@ -163,10 +158,10 @@ def finish_at_plan(settings, model, work, memory, row):
     return False
 
 
-def value_functions(settings, model, work, memory, row):
-    """Make those of the plan, without the second order; the policy becomes one that makes the plan.
+def convex_value_functions(settings, model, work, memory, row):
+    """Compute the value functions about the plan without the second order, and a policy that reproduces the plan.
 
-    A control at a limit has no gain, be it one that the next step would take off it, by less than counts.
+    A control at a limit gets no gain, even if the next step would take it off the limit by less than the tolerance.
     """
     policy, controls = work.policy, work.plan.controls
     if not NOISY:
@@ -177,5 +172,4 @@ def value_functions(settings, model, work, memory, row):
         for i in range(M):
             if controls[t, i] == model.limits.low[i] or controls[t, i] == model.limits.high[i]:
                 policy.offset[t, i] = controls[t, i]
-                for j in range(N):
-                    policy.gain[t, i, j] = 0.0
+                fill(policy.gain[t, i], N, 0.0)

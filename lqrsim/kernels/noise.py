@@ -1,40 +1,70 @@
-"""What noise is expected to cost, as part of each stage. The kernels' subset.
+"""The expected cost of noise, as part of each stage. The kernels' subset.
 
 With x' = g(x, u) + M(x, u) w and w ~ N(0, I), a quadratic cost-to-go v with Hessian S at t + 1 has the expectation
 
     E v(g + M w) = v(g) + 1/2 tr M'SM
 
-so noise is one more cost of the stage, which depends on S alone: the backward pass has just worked S out, and the
-forward pass takes that of the last backward pass. Where dynamics and M are linear and costs quadratic, this is exact.
+so noise is one more cost of the stage, which depends on S alone: the backward pass has just computed S, and the forward
+pass uses that of the last backward pass. Where dynamics and M are linear and costs quadratic, this is exact.
 
-With a risk theta it is (1/theta) log E exp(theta v(g + M w)), and with d = S g + s, the slope of v there,
+With a risk theta it is (1/theta) log E exp(theta v(g + M w)), and with d = S g + s, the gradient of v there,
 
     v(g) + theta/2 d'M W M'd - 1/(2 theta) log det(I - theta M'SM),    W = (I - theta M'SM)^-1
 
-which exists where I - theta M'SM is positive definite. For theta to 0 it is the expectation, and for theta above 0 it
-is what v is at g + y, y = theta M W M'd, the worst noise, less what that would cost.
+which exists where I - theta M'SM is positive definite. As theta goes to 0 it becomes the expectation. For theta above 0
+it is v at g + y, y = theta M W M'd the worst noise, less what that noise costs.
 
-Slopes are exact, curvatures Gauss-Newton's: second derivatives of M, and what of the curvature can be negative, are
-left out. The matrices here are compact: the rows of M that are not zero everywhere, and of (x, u) what M depends on.
+Gradients are exact. Hessians are Gauss-Newton's: second derivatives of M, and other parts that can be negative, are
+left out. The matrices here are compact: the rows of M that are not zero everywhere, and the entries of (x, u) that M
+depends on. Shapes: M (COUNT, SIZE), its derivatives by columns (SIZE, COUNT, PADDED_COUNT), S (COUNT, COUNT).
 """
 
 from math import inf, log1p, sqrt
 
-from lqrsim.kernels.declarations import M, N, W, noise_slopes, noise_values, stack
-from lqrsim.kernels.linear_algebra import affine, within
+from lqrsim.kernels.control_limits import limited_control
+from lqrsim.kernels.declarations import M, N, W, noise_slopes, noise_values, outline, stack, zeros
+from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.model_functions import advance, cost_value
 
-ROWS = (0,)  # the states that noise acts on at once
-COUNT = 1  # how many these are
-CONTIGUOUS = 0  # whether these are the first ones, in their order
-SIZE = 1  # independent normal numbers in w
+ROWS = (0,)  # the states that noise acts on directly
+COUNT = 1  # their number
+CONTIGUOUS = 0  # whether they are the first states, in order
+SIZE = 1  # of w
 ACTIVE = (0,)  # entries of (x, u) that M depends on
-ACTIVE_COUNT = 1  # how many these are
-PADDED_COUNT = 4  # the same, rounded up to vectors of four
+ACTIVE_COUNT = 1  # their number
+PADDED_COUNT = 4  # the same, rounded up to a multiple of four for vector code
+
+
+def constant_values(x, u, data, out):
+    """Write a constant M: `data` has its entries, row by row, then the strength."""
+    for i in range(COUNT):
+        for k in range(SIZE):
+            out[i, k] = data[COUNT * SIZE] * data[SIZE * i + k]
+
+
+def constant_slopes(x, u, data, out, slopes):
+    """Write a constant M, which has no derivatives."""
+    constant_values(x, u, data, out)
+
+
+def matrices_of(count, states, controls, data, out):
+    """Write M (count, COUNT, SIZE) at states (count, N) and controls (count, M)."""
+    for i in range(count):
+        matrix_at(states[i], controls[i], data, out[i])
+
+
+@outline
+def matrix_at(x, u, data, out):
+    """Write M at one state and control."""
+    noise_values(x, u, data, out)
 
 
 def noise_value(x, u, data, risk, ahead):
-    """What it is expected to cost, given what lies ahead; infinite where the risk is too high."""
+    """The expected cost of noise at (x, u); infinite where the risk is too high.
+
+    Args:
+      data: what `noise_values` reads. risk: (2,), theta first. ahead: NextStep.
+    """
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
     S = stack(COUNT, COUNT)
@@ -53,18 +83,16 @@ def noise_value(x, u, data, risk, ahead):
 
 
 def noise_quadratic(x, u, data, risk, ahead, convex, stage):
-    """Add the quadratic model to a stage, Hessian (W, W) and gradient (W,), and return the value.
+    """Add the quadratic model of the expected cost to a stage at (x, u), and return its value.
 
-    With `convex` what is added is positive semidefinite, with a negative risk, too. Where the risk is too high the
-    Hessian is spoilt, so that the pass fails, and `risk[1]` is 1.
+    Args:
+      risk: (2,); the second entry is written: 1 where the risk is too high. The Hessian is then made indefinite, so
+        that the pass fails.
+      convex: 1 to keep what is added positive semidefinite with a negative risk, too.
     """
-    values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, PADDED_COUNT)
+    values, slopes = stack(COUNT, SIZE), zeros(SIZE, COUNT, PADDED_COUNT)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
     S = stack(COUNT, COUNT)
-    for k in range(SIZE):
-        for i in range(COUNT):
-            for a in range(ACTIVE_COUNT, PADDED_COUNT):
-                slopes[k, i, a] = 0.0
     noise_slopes(x, u, data, values, slopes)
     noisy_block(ahead.hessian, S)
     times_hessian(S, values, weighed)
@@ -90,28 +118,25 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
 
 
 def noisy_costs(count, steps, start, policy, model, draws, costs):
-    """What runs of a policy from a state cost, the noise drawn: draws (count steps, SIZE), run by run."""
+    """Write the costs (count,) of rollouts of a policy with noise drawn: draws (count steps, SIZE), run by run."""
     x, u, ahead, values = stack(N), stack(M), stack(N), stack(COUNT, SIZE)
     for run in range(count):
-        for i in range(N):
-            x[i] = start[i]
+        copy(start, N, x)
         total = cost_value(x, u, 0, model.initial)
         for t in range(steps):
-            affine(policy.gain[t], policy.offset[t], x, u)
-            within(u, model.limits)
+            limited_control(policy.gain[t], policy.offset[t], x, model.limits, u)
             total += cost_value(x, u, t, model.stage)
             advance(x, u, model, model.dt, ahead)
             noise_values(x, u, model.noise.data, values)
             for i in range(COUNT):
                 for k in range(SIZE):
                     ahead[i if CONTIGUOUS else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
-            for i in range(N):
-                x[i] = ahead[i]
+            copy(ahead, N, x)
         costs[run] = total + cost_value(x, u, steps, model.final)
 
 
 def noisy_block(S, compact):
-    """Write the rows and columns of S that noise acts on; looked up once, for that takes longer than the sums."""
+    """Write the rows and columns of S that noise acts on: once, because looking them up takes longer than the sums."""
     for i in range(COUNT):
         row = i if CONTIGUOUS else ROWS[i]
         for j in range(COUNT):
@@ -138,14 +163,14 @@ def half_trace(values, weighed):
 
 
 def add_trace_model(S, weighed, slopes, stage):
-    """Add 1/2 tr M'SM linearised: with columns m_i ~ J_i z, the sums of J_i'S J_i and of J_i'S m_i, given S M."""
-    line, curve, slope = stack(PADDED_COUNT), stack(ACTIVE_COUNT, PADDED_COUNT), stack(PADDED_COUNT)
-    for b in range(PADDED_COUNT):
-        slope[b] = 0.0
-        for a in range(ACTIVE_COUNT):
-            curve[a, b] = 0.0
+    """Add the model of 1/2 tr M'SM: with columns m_i and their Jacobians J_i, sum J_i'S J_i and sum J_i'S m_i.
+
+    Args:
+      weighed: S M. slopes: the J_i.
+    """
+    line, curve, slope = stack(PADDED_COUNT), zeros(ACTIVE_COUNT, PADDED_COUNT), zeros(PADDED_COUNT)
     for k in range(SIZE):
-        for i in range(COUNT):  # line by line, which stays in registers
+        for i in range(COUNT):  # row by row, which stays in registers
             factor = weighed[i, k]
             for b in range(PADDED_COUNT):
                 line[b] = 0.0
@@ -166,10 +191,15 @@ def add_trace_model(S, weighed, slopes, stage):
 
 
 def factor_of_risk(theta, values, weighed, factor, root):
-    """Factor I - theta M'SM = L D L': write 1 - L below the diagonal, and the reciprocal roots of D.
+    """Factor I - theta M'SM = L D L'.
 
-    Pivots are kept as their distance from 1, so that no digits are lost where theta is small. Returns
-    -1/(2 theta) log det, and whether the matrix is positive definite.
+    Pivots are kept as their distance from 1, so that no digits are lost where theta is small.
+
+    Args:
+      factor: (SIZE, SIZE), gets 1 - L below the diagonal. root: (SIZE,), gets the reciprocal square roots of D.
+
+    Returns:
+      -1/(2 theta) log det, and whether the matrix is positive definite.
     """
     X, total = stack(SIZE, SIZE), 0.0
     for k in range(SIZE):
@@ -191,7 +221,7 @@ def factor_of_risk(theta, values, weighed, factor, root):
 
 
 def risk_columns(theta, factor, root, values, mixed):
-    """Write M V with V V' = W: other columns with the same covariance as noise has when it is as bad as the risk."""
+    """Write M V with V V' = W: columns with the covariance of noise under the risk."""
     for k in range(SIZE):
         for i in range(COUNT):
             mixed[i, k] = values[i, k]
@@ -203,7 +233,7 @@ def risk_columns(theta, factor, root, values, mixed):
 
 
 def risk_column_slopes(theta, factor, root, slopes):
-    """Mix the slopes of the columns likewise, in place."""
+    """Turn the derivatives of the columns of M into those of M V with V held, in place."""
     for k in range(SIZE):
         for j in range(k):
             for i in range(COUNT):
@@ -216,7 +246,7 @@ def risk_column_slopes(theta, factor, root, slopes):
 
 
 def next_slope(ahead, slope):
-    """Write the slope of the cost-to-go where the step leads, in the states that noise acts on."""
+    """Write the gradient (COUNT,) of the cost-to-go at the next state, in the states that noise acts on."""
     for i in range(COUNT):
         row = i if CONTIGUOUS else ROWS[i]
         total = ahead.gradient[row]
@@ -226,7 +256,7 @@ def next_slope(ahead, slope):
 
 
 def square_along(mixed, slope):
-    """d'M W M'd."""
+    """d'M W M'd, given M V and d."""
     total = 0.0
     for k in range(SIZE):
         along = 0.0
@@ -237,10 +267,10 @@ def square_along(mixed, slope):
 
 
 def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
-    """Add theta/2 d'M W M'd: its slope, and the part theta D'D of its curvature, D the slopes of V'M'd.
+    """Add the model of theta/2 d'M W M'd: its gradient, and theta D'D of its Hessian, D the Jacobian of V'M'd.
 
-    D'D is seen about the worst noise y, which M moves by J_y z. With a negative risk D is that of M as it is, so that
-    the sum with the cost-to-go's own curvature stays positive semidefinite.
+    D is taken at the worst noise y, for M and d both. With a negative risk it is that of d alone, so that the sum with
+    the cost-to-go's Hessian stays positive semidefinite.
     """
     S, jacobian, slopes_along, line = ahead.hessian, ahead.jacobian, stack(SIZE, W), stack(W)
     pulled, steered, along, compact = stack(COUNT), stack(N), stack(SIZE), stack(COUNT, COUNT)
@@ -249,14 +279,12 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
         for i in range(COUNT):
             total += mixed[i, k] * slope[i]
         along[k] = total
-        for j in range(N):
-            steered[j] = 0.0
+        fill(steered, N, 0.0)
         for i in range(COUNT):
             state, factor = i if CONTIGUOUS else ROWS[i], mixed[i, k]
             for j in range(N):
                 steered[j] += S[state, j] * factor
-        for a in range(W):
-            line[a] = 0.0
+        fill(line, W, 0.0)
         for j in range(N):
             factor = steered[j]
             for a in range(W):
@@ -266,7 +294,7 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
             stage.gradient[a] += theta * total * line[a]
     if ACTIVE_COUNT:
         noisy_block(S, compact)
-        for i in range(COUNT):  # the slope at g + y
+        for i in range(COUNT):  # the gradient at g + y
             pulled[i] = slope[i]
             for j in range(COUNT):
                 for k in range(SIZE):
@@ -280,9 +308,8 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
                 if theta > 0:
                     slopes_along[k, entry] += pull
     if theta > 0 or convex == 0:
-        for a in range(W):  # line by line, which stays in registers
-            for b in range(W):
-                line[b] = 0.0
+        for a in range(W):  # row by row, which stays in registers
+            fill(line, W, 0.0)
             for k in range(SIZE):
                 factor = theta * slopes_along[k, a]
                 for b in range(W):

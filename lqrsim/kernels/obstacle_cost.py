@@ -1,71 +1,116 @@
 """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
 
-`data` has the radius, the sharpness, the weight, how many obstacles there are and at how many steps they are told, of
-which the last holds from there on; and for each of these the ROW numbers of each obstacle. The obstacles are taken by
-blocks, whose exponentials are worked out together.
+The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the
+sharpness, the weight, the number of obstacles, the number of steps with a table of obstacles, of which the last holds
+from its step on, the radius of each ball (of a point, one), and the tables. What `places` reads comes before AT.
 """
 
-from lqrsim.kernels.declarations import ROW, stack
+from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
 from lqrsim.kernels.exponential import exponential
-from lqrsim.kernels.linear_algebra import clear
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
-AXES = (0, 1, 2)  # which states are the position; two of them in a plane, whose third coordinate is 0
-BLOCK = 8
+AT = 0
+BALLS = 0  # 0 for a point
+AXES = (0, 1, 2)  # states that are the position, two in a plane, whose third coordinate is 0; or that move the balls
+BLOCK = 8  # obstacles whose exponentials are computed together, as vectors
 
 
 def value(x, u, t, data):
-    """The cost; none at the first step, whose state is given."""
+    """The cost; zero at the first step, whose state is given."""
     total = 0.0
     if t > 0:
-        costs, count = stack(BLOCK), int(data[3])
-        first = 5 + ROW * count * min(t, int(data[4]) - 1)
-        for block in range(0, count, BLOCK):
-            size = min(BLOCK, count - block)
-            for i in range(BLOCK):
-                costs[i] = 0.0
-            for i in range(size):
-                at = first + ROW * (block + i)
-                distance = signed_distance(data, at, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0)
-                costs[i] = -data[1] * (distance - data[0])
-            for i in range(BLOCK):
-                costs[i] = exponential(costs[i])
-            for i in range(size):
-                total += costs[i]
-    return data[2] * total
+        tables = tables_at(t, data)
+        if BALLS:
+            centres = stack(3 * BALLS)
+            places(x, data, centres)
+            for k in range(BALLS):
+                c = 3 * k
+                total += cost_of_ball(centres[c], centres[c + 1], centres[c + 2], data[AT + 4 + k], tables, data)
+        else:
+            height = x[AXES[2]] if len(AXES) == 3 else 0.0
+            total = cost_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + 4], tables, data)
+    return data[AT + 1] * total
 
 
 def derivatives(x, u, t, data, hessian, gradient):
-    """Add the Hessian and the gradient, and return the cost."""
+    """Add the Hessian (W, W) and the gradient (W,), and return the cost. The curvature of the centres is left out."""
     total = 0.0
     if t > 0:
-        slope, curve, slopes, curves = stack(BLOCK, 3), stack(BLOCK, 3, 3), stack(3), stack(3, 3)
-        costs, count = stack(BLOCK), int(data[3])
-        clear(curves, 3, 3)
-        for j in range(3):
-            slopes[j] = 0.0
-        first = 5 + ROW * count * min(t, int(data[4]) - 1)
-        for block in range(0, count, BLOCK):
-            size = min(BLOCK, count - block)
-            for i in range(BLOCK):
-                costs[i] = 0.0
-            for i in range(size):
-                at = first + ROW * (block + i)
-                distance = signed_distance_derivatives(
-                    data, at, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0, slope[i], curve[i]
+        sharpness, tables = data[AT], tables_at(t, data)
+        force, stiffness, product = stack(3), stack(3, 3), stack(3)
+        if BALLS:
+            centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
+            places_jacobian(x, data, centres, jacobian)
+            for k in range(BALLS):
+                c = 3 * k
+                total += derivatives_of_ball(
+                    centres[c], centres[c + 1], centres[c + 2], data[AT + 4 + k], tables, data, force, stiffness
                 )
-                costs[i] = -data[1] * (distance - data[0])
-            for i in range(BLOCK):
-                costs[i] = exponential(costs[i])
-            for i in range(size):
-                cost = data[2] * costs[i]
-                total += cost
-                for j in range(3):
-                    slopes[j] -= cost * slope[i, j]
-                    for k in range(3):
-                        curves[j, k] += cost * (data[1] * slope[i, j] * slope[i, k] - curve[i, j, k])
-        for j in range(len(AXES)):
-            gradient[AXES[j]] += data[1] * slopes[j]
-            for k in range(len(AXES)):
-                hessian[AXES[j], AXES[k]] += data[1] * curves[j, k]
+                for a in range(len(AXES)):
+                    for j in range(3):
+                        product[j] = 0.0
+                        for m in range(3):
+                            product[j] += sharpness * stiffness[j, m] * jacobian[c + m, AXES[a]]
+                    for j in range(3):
+                        gradient[AXES[a]] += sharpness * force[j] * jacobian[c + j, AXES[a]]
+                    for b in range(len(AXES)):
+                        for j in range(3):
+                            hessian[AXES[a], AXES[b]] += jacobian[c + j, AXES[b]] * product[j]
+        else:
+            height = x[AXES[2]] if len(AXES) == 3 else 0.0
+            total = derivatives_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + 4], tables, data, force, stiffness)
+            for j in range(len(AXES)):
+                gradient[AXES[j]] += sharpness * force[j]
+                for k in range(len(AXES)):
+                    hessian[AXES[j], AXES[k]] += sharpness * stiffness[j, k]
+    return total
+
+
+def tables_at(t, data):
+    """Where the table of obstacles at step t begins."""
+    radii = BALLS if BALLS else 1
+    return AT + 4 + radii + ROW * int(data[AT + 2]) * min(t, int(data[AT + 3]) - 1)
+
+
+def cost_of_ball(a, b, c, radius, table, data):
+    """The cost of a ball at (a, b, c), divided by the weight."""
+    costs, count, total = stack(BLOCK), int(data[AT + 2]), 0.0
+    for block in range(0, count, BLOCK):
+        size = min(BLOCK, count - block)
+        for i in range(BLOCK):
+            costs[i] = 0.0
+        for i in range(size):
+            distance = signed_distance(data, table + ROW * (block + i), a, b, c)
+            costs[i] = -data[AT] * (distance - radius)
+        for i in range(BLOCK):
+            costs[i] = exponential(costs[i])
+        for i in range(size):
+            total += costs[i]
+    return total
+
+
+def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
+    """The cost of a ball at (a, b, c); write its gradient (3,) and Hessian (3, 3) there, divided by the sharpness."""
+    slope, curve, slopes, curves = stack(BLOCK, 3), stack(BLOCK, 3, 3), zeros(3), zeros(3, 3)
+    costs, count, total = stack(BLOCK), int(data[AT + 2]), 0.0
+    for block in range(0, count, BLOCK):
+        size = min(BLOCK, count - block)
+        for i in range(BLOCK):
+            costs[i] = 0.0
+        for i in range(size):
+            distance = signed_distance_derivatives(data, table + ROW * (block + i), a, b, c, slope[i], curve[i])
+            costs[i] = -data[AT] * (distance - radius)
+        for i in range(BLOCK):
+            costs[i] = exponential(costs[i])
+        for i in range(size):
+            cost = data[AT + 1] * costs[i]
+            total += cost
+            for j in range(3):
+                slopes[j] -= cost * slope[i, j]
+                for k in range(3):
+                    curves[j, k] += cost * (data[AT] * slope[i, j] * slope[i, k] - curve[i, j, k])
+    for j in range(3):
+        force[j] = slopes[j]
+        for k in range(3):
+            stiffness[j, k] = curves[j, k]
     return total

@@ -1,11 +1,11 @@
-"""The passes of LQR smoothing. The kernels' subset; see `records.py` for what they are given.
+"""The passes of LQR smoothing. The kernels' subset; `records.py` has what they are given.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
 
 from math import inf
 
-from lqrsim.kernels.control_limits import fix_controls_at_limits, riccati_backward_within
+from lqrsim.kernels.control_limits import fix_controls_at_limits, limited_control, riccati_backward_within
 from lqrsim.kernels.declarations import (
     NOISY,
     M,
@@ -18,32 +18,46 @@ from lqrsim.kernels.declarations import (
     riccati_forward,
     smoothed_state,
     stack,
+    zeros,
 )
-from lqrsim.kernels.linear_algebra import about_origin, affine, cholesky, cholesky_solve, clear, finite, offset, within
+from lqrsim.kernels.linear_algebra import (
+    about_origin,
+    cholesky,
+    cholesky_solve,
+    clear,
+    copy,
+    copy_matrix,
+    finite,
+    step_offset,
+)
 from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Linearization, LinearStep, NextStep, QuadraticStage
 
 
 def forward_pass(settings, model, about, work):
-    """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
+    """The forward extended LQR pass, Sec. V-B: cost-to-come and inverse policy, given cost-to-go and policy.
 
-    `work.x_hat` is where c_0 is quadratised, and on return the minimiser at T, where c_l was. The cost-to-go at T is
-    set. Where the linearisation is guided, it is about the plan, and not about the minimisers.
+    Linearises about the smoothed states; or, if `about.guided`, about the plan. Sets the cost-to-go at T.
+
+    Args:
+      settings: IterationSettings. model: ProblemModel. about: Linearization.
+      work: SmootherArrays. `x_hat` is where c_0 is quadratised, and on return the smoothed state at T, where c_l was.
+
+    Returns:
+      The step at which it failed, or -1, and whether all numbers there were finite.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
-    arrived = stack(N)
-    costate, u, x_hat, to_go, to_come = stack(N), stack(M), work.x_hat, work.to_go, work.to_come
-    spare = stack(N, W)
+    arrived, costate, u, spare = stack(N), stack(N), stack(M), stack(N, W)
+    steps, x_hat, to_go, to_come = settings.steps, work.x_hat, work.to_go, work.to_come
     good, _ = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
     if not good:
         return 0, finite(to_come.matrix[0], N, N)
-    for t in range(settings.steps):
+    for t in range(steps):
         if about.guided:
             copy(about.plan.states[t], N, x_hat)
             copy(about.plan.controls[t], M, u)
         else:
-            affine(work.policy.gain[t], work.policy.offset[t], x_hat, u)
-            within(u, model.limits)
+            limited_control(work.policy.gain[t], work.policy.offset[t], x_hat, model.limits, u)
         linearize(x_hat, u, model, arrived, step)
         jacobian = forward_jacobian(x_hat, u, model, arrived, step, spare)
         ahead = NextStep(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
@@ -51,13 +65,12 @@ def forward_pass(settings, model, about, work):
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
         if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
-        if t + 1 < settings.steps and not about.guided and not smoothed_state(t + 1, to_go, to_come, costate, x_hat):
+        if t + 1 < steps and not about.guided and not smoothed_state(t + 1, to_go, to_come, costate, x_hat):
             return t + 1, finite(to_go.hessian[t + 1], N, N) and finite(to_come.matrix[t + 1], N, N)
-    steps = settings.steps
     if about.guided:
         copy(about.plan.states[steps], N, x_hat)
     elif not smoothed_state(steps, to_go, to_come, costate, x_hat):
-        # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
+        # In the first iteration there may be no minimum without c_l; the state of arrival is the next best.
         copy(arrived, N, x_hat)
     final_model(x_hat, steps, model, to_go)
     if not smoothed_state(steps, to_go, to_come, costate, x_hat):
@@ -66,19 +79,22 @@ def forward_pass(settings, model, about, work):
 
 
 def backward_pass(settings, model, about, work):
-    """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
+    """The backward extended LQR pass, Sec. V-A: cost-to-go and policy, given cost-to-come and inverse policy.
 
-    `work.x_hat` is, on return, the minimiser at 0, where c_0 was quadratised anew, and `work.x_hats` has all of them.
-    What is linearised about lies a fraction `about.reach` of the way from the plan to where the minimisers lead: all of
-    it in the paper's method.
+    Linearises a fraction `about.reach` of the way from the plan to the smoothed states: all the way in the paper.
 
-    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
-    some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
+    Args:
+      work: SmootherArrays. On return `x_hat` is the smoothed state at 0, where c_0 was quadratised anew, and `x_hats`
+        has all smoothed states. The rest is as for `forward_pass`.
+
+    Returns:
+      The step at which it failed, or -1; whether all numbers there were finite; and the cost that is negligible. Where
+      the optimal cost is zero, squares of rounding errors remain of it, some 1e-13 of the constants of the stages'
+      models, which cancel.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
-    arrived = stack(N)
-    x, u, costate, x_hat, to_go, to_come = stack(N), stack(M), stack(N), work.x_hat, work.to_go, work.to_come
-    steps = settings.steps
+    arrived, x, u, costate = stack(N), stack(N), stack(M), stack(N)
+    steps, x_hat, to_go, to_come = settings.steps, work.x_hat, work.to_go, work.to_come
     if not smoothed_state(steps, to_go, to_come, costate, x_hat):
         return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N), 0.0
     size = abs(to_go.constant[steps])
@@ -94,11 +110,8 @@ def backward_pass(settings, model, about, work):
         size += abs(constant)
         good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
         if not good or not smoothed_state(t, to_go, to_come, costate, x_hat):
-            return (
-                t,
-                finite(stage.hessian, W, W) and finite(step.jacobian, N, W) and finite(to_come.matrix[t], N, N),
-                0.0,
-            )
+            good = finite(stage.hessian, W, W) and finite(step.jacobian, N, W) and finite(to_come.matrix[t], N, N)
+            return t, good, 0.0
     good = True
     if not settings.fixed:
         good, constant = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
@@ -110,14 +123,19 @@ def backward_pass(settings, model, about, work):
 
 
 def opening_pass(steps, guided, guess, prior, model, policy, to_go):
-    """A backward pass before any forward one: there is no cost-to-come, and the minimisers are of the cost-to-go alone.
+    """A backward pass before there is a cost-to-come: it linearises about minimisers of the cost-to-go alone.
 
-    Without a plan to be guided by, the dynamics run backwards from the minimiser of c_l, with the controls of the
-    guess; c_l is first quadratised at its last state.
+    From the minimiser of c_l, first quadratised at the guess, the dynamics run backwards with the guessed controls.
+    With `guided`, the pass linearises about the guess.
+
+    Args:
+      guess: Motion. prior: Prior. policy, to_go: written.
+
+    Returns:
+      The step at which it failed, or -1, and whether all numbers there were finite.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
-    arrived = stack(N)
-    x, x_hat, u = stack(N), stack(N), stack(M)
+    arrived, x, x_hat, u = stack(N), stack(N), stack(N), stack(M)
     about = Linearization(guess, guided, 1.0, 0.0, prior)
     copy(guess.states[steps], N, x_hat)
     for _ in range(2):
@@ -141,17 +159,19 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
 
 
 def linearize_forward(x, u, model, arrived, step):
-    """Write where (x, u) leads, and the step linearised there, Eq. (25): x_next = jacobian (x, u) + offset."""
+    """Write the next state (N,), and the step linearised at (x, u), Eq. (25): x_next = jacobian (x, u) + offset."""
     step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-    offset(step.jacobian, x, u, arrived, step.offset)
+    step_offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def stage_model(x, u, t, model, about, ahead, convex, stage):
-    """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant.
+    """Write the stage cost, quadratised at (x, u), about the origin, Eqs. (26)-(27); return its constant.
 
-    What noise is expected to cost belongs to it, given what lies ahead; `convex` is as in `noise_quadratic`.
-    The prior is no part of the cost, but added to its quadratic model in the first iterations, where it keeps the
-    linearisations sensible. Damping weighs how far the control moves from the plan's.
+    It includes the expected cost of noise; the prior, which is no part of the cost, but keeps the linearisations
+    sensible in the first iterations; and damping, which weighs how far the control moves from the plan's.
+
+    Args:
+      ahead: NextStep. convex: as in `noise_quadratic`. stage: QuadraticStage, written.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
     value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
@@ -159,32 +179,35 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
         value += noise_quadratic(x, u, model.noise, ahead, convex, stage)
     if t > 0:
         for i in range(N):
-            weight, error = prior.weight[i], x[i] - prior.about[t, i]
-            hessian[i, i] += weight
-            gradient[i] += weight * error
-            value += 0.5 * weight * error * error
+            value += add_square(i, prior.weight[i], x[i] - prior.about[t, i], hessian, gradient)
     if about.damping > 0:
         for i in range(M):
-            weight, error = about.damping * hessian[N + i, N + i], u[i] - about.plan.controls[t, i]
-            hessian[N + i, N + i] += weight
-            gradient[N + i] += weight * error
-            value += 0.5 * weight * error * error
+            weight = about.damping * hessian[N + i, N + i]
+            value += add_square(N + i, weight, u[i] - about.plan.controls[t, i], hessian, gradient)
     return about_origin(hessian, gradient, x, u, value)
 
 
+def add_square(i, weight, error, hessian, gradient):
+    """Add `1/2 weight error^2`, the error of entry i, to a quadratic model; return its value."""
+    hessian[i, i] += weight
+    gradient[i] += weight * error
+    return 0.5 * weight * error * error
+
+
 def final_model(x, steps, model, to_go):
-    """Write the cost-to-go at T: c_l quadratised at x. Paper: Eq. (31)."""
-    hessian, gradient, none = stack(W, W), stack(W), stack(M)
+    """Write the cost-to-go at T: c_l quadratised at x, Eq. (31)."""
+    hessian, gradient, none = stack(W, W), stack(W), zeros(M)
     value = cost_quadratic(x, none, steps, model.final, hessian, gradient)
     to_go.constant[steps] = end_model(hessian, gradient, value, x, to_go.hessian[steps], to_go.gradient[steps])
 
 
 def initial_model(x, fixed, model, about, to_go, to_come):
-    """Write the cost-to-come at 0, with c_0 quadratised at x, Eq. (23); or of a start that is given.
+    """Write the cost-to-come at 0: c_0 quadratised at x, Eq. (23), or that of a fixed start.
 
-    Returns whether there is one, and what the quadratic of c_0 is at the origin.
+    Returns:
+      Whether it exists, and the constant of c_0's model about the origin.
     """
-    hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), stack(M)
+    hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), zeros(M)
     if fixed:
         clear(to_come.matrix[0], N, N)
         copy(x, N, to_come.vector[0])
@@ -193,36 +216,29 @@ def initial_model(x, fixed, model, about, to_go, to_come):
     value = cost_quadratic(x, none, 0, model.initial, hessian, gradient)
     if about.damping > 0:
         for i in range(N):
-            weight, error = about.damping * hessian[i, i], x[i] - about.plan.states[0, i]
-            hessian[i, i] += weight
-            gradient[i] += weight * error
-            value += 0.5 * weight * error * error
+            value += add_square(i, about.damping * hessian[i, i], x[i] - about.plan.states[0, i], hessian, gradient)
     constant = end_model(hessian, gradient, value, x, Q, q)
     to_come.constant[0], good = initial_cost_to_come(Q, q, constant, x, to_go, to_come)
     return good, constant
 
 
 def end_model(hessian, gradient, value, x, S, s):
-    """Write an initial or final cost, quadratised at x, as (S, s) about the origin; return its constant."""
-    none = stack(M)
-    for i in range(M):
-        none[i] = 0.0
+    """Write an initial or final cost, quadratised at x, about the origin: S (N, N), s (N,); return its constant."""
+    none = zeros(M)
     constant = about_origin(hessian, gradient, x, none, value)
-    for i in range(N):
-        s[i] = gradient[i]
-        for j in range(N):
-            S[i, j] = hessian[i, j]
+    copy(gradient, N, s)
+    copy_matrix(hessian, N, N, S)
     return constant
 
 
 def towards(z, fraction, origin, size):
-    """Draw a vector towards another, so that only that fraction of the difference is left."""
+    """Move a vector towards an origin until this fraction of the distance is left."""
     for i in range(size):
         z[i] = origin[i] + fraction * (z[i] - origin[i]) if fraction > 0 else origin[i]
 
 
 def smoothed_states(steps, to_go, to_come, x_hats):
-    """Write the states of least total cost; False if one has none."""
+    """Write all smoothed states, (T+1, N); False if one does not exist."""
     costate, good = stack(N), True
     for t in range(steps + 1):
         good = smoothed_state(t, to_go, to_come, costate, x_hats[t]) and good
@@ -230,18 +246,11 @@ def smoothed_states(steps, to_go, to_come, x_hats):
 
 
 def minimize_cost_to_go(S, s, x):
-    """Write the minimiser of a cost-to-go, if it has one; leave x as it is if not."""
+    """Write the minimiser of a cost-to-go; leave x as it is if there is none."""
     factor, least = stack(N, N), stack(N)
     for i in range(N):
         least[i] = -s[i]
-        for j in range(N):
-            factor[i, j] = S[i, j]
+    copy_matrix(S, N, N, factor)
     if cholesky(factor, N):
         cholesky_solve(factor, N, least)
         copy(least, N, x)
-
-
-def copy(source, size, target):
-    """Copy a vector."""
-    for i in range(size):
-        target[i] = source[i]

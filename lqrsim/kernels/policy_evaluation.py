@@ -1,48 +1,52 @@
-"""Feedback laws of many measured states at once. The kernels' subset. `AffinePolicy` has the same in NumPy."""
+"""Feedback policies at many measured states. The kernels' subset. `AffinePolicy` has the same in NumPy."""
 
 from math import floor, pi, sqrt
 
+from lqrsim.kernels.control_limits import limited_control
 from lqrsim.kernels.declarations import outline
-from lqrsim.kernels.linear_algebra import affine, within
 
 
-def apply_policy(count, near, law, nominal, turning, limits, out) -> None:
-    """Controls (count, M) within the limits, of states (count, N), which become those nearest to the nominal (N,)."""
+def apply_policy(count, states, policy, nominal, angular, limits, out):
+    """Write the controls (count, M), within their limits, at states (count, N).
+
+    The states are overwritten by their representatives nearest to the nominal (N,).
+    """
     for k in range(count):
-        apply_one(near[k], law, nominal, turning, limits, out[k])
+        apply_one(states[k], policy, nominal, angular, limits, out[k])
 
 
 @outline
-def apply_one(x, law, nominal, turning, limits, u) -> None:
-    """One of these."""
-    to_nearest(x, nominal, turning)
-    affine(law.gain, law.offset, x, u)
-    within(u, limits)
+def apply_one(x, policy, nominal, angular, limits, u):
+    """Write the control (M,) at one state (N,)."""
+    to_nearest(x, nominal, angular)
+    limited_control(policy.gain, policy.offset, x, limits, u)
 
 
-def all_to_nearest(steps, count, states, nominal, turning) -> None:
-    """Takes each of the states (steps count, N) to its representative nearest to its step's nominal (steps, N)."""
+def all_to_nearest(steps, count, states, nominal, angular):
+    """Replace states (steps count, N) by their representatives nearest to the nominal of their step, (steps, N)."""
     for t in range(steps):
         for k in range(count):
-            to_nearest(states[t * count + k], nominal[t], turning)
+            to_nearest(states[t * count + k], nominal[t], angular)
 
 
 @outline
-def to_nearest(x, nominal, turning) -> None:
-    """Takes a state to its representative nearest to the nominal: its angles and its rotation vectors."""
-    for k in range(turning.angle_count):
-        nearest_angle(x, nominal, int(turning.angles[k]))
-    for k in range(turning.rotation_count):
-        nearest_rotation(x, nominal, int(turning.rotations[k]))
+def to_nearest(x, nominal, angular):
+    """Replace a state by its representative nearest to the nominal: its angles and its rotation vectors."""
+    for k in range(angular.angle_count):
+        nearest_angle(x, nominal, int(angular.angles[k]))
+    for k in range(angular.rotation_count):
+        nearest_rotation(x, nominal, int(angular.rotations[k]))
 
 
-def nearest_angle(x, nominal, i: int) -> None:
-    """Takes whole turns out of what an angle differs by."""
+def nearest_angle(x, nominal, i):
+    """Replace angle i by its representative within half a turn of the nominal."""
     x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)
 
 
-def nearest_rotation(x, nominal, first: int) -> None:
-    """Of the vectors (angle + 2 pi k) axis, which are one rotation, the nearest to the nominal; see coordinates.py."""
+def nearest_rotation(x, nominal, first):
+    """Replace the rotation vector at x[first] by the nearest to the nominal of (angle + 2 pi k) axis, all of which are
+    the same rotation; see coordinates.py.
+    """
     a, b, c = x[first], x[first + 1], x[first + 2]
     u, v, w = nominal[first], nominal[first + 1], nominal[first + 2]
     angle, distance = sqrt(a * a + b * b + c * c), sqrt(u * u + v * v + w * w)

@@ -1,11 +1,11 @@
 """`1/2 (z - about)' weight (z - about)`, z the state or the control. The kernels' subset.
 
-`data` has about (size,), then weight (size, size), row by row.
+`data` has `about` (size,), then `weight` (size, size), row by row.
 """
 
 from lqrsim.kernels.declarations import M, N
 
-CONTROL = False  # whether it is of the control
+CONTROL = False  # whether z is the control
 
 
 def value(x, u, t, data):
@@ -21,7 +21,7 @@ def value(x, u, t, data):
 
 
 def derivatives(x, u, t, data, hessian, gradient):
-    """Add the Hessian and the gradient, in which the states come first, and return the cost."""
+    """Add the Hessian (W, W) and the gradient (W,), and return the cost."""
     z, size, first = (u, M, N) if CONTROL else (x, N, 0)
     total = 0.0
     for i in range(size):

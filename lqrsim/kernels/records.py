@@ -1,7 +1,7 @@
-"""What kernels are given: named tuples of arrays and numbers, and rows with fields for what is remembered or logged.
+"""Arguments of kernels: named tuples of arrays and numbers, and rows with named fields for states and logs.
 
-T is the number of steps. Kernels see an array as a pointer to blocks of constant shape, and a tuple of vectors as one
-of addresses; see `codegen/language.py`. An address is a float64, which has all integers up to 2^53.
+T is the number of steps. Kernels see an array as a pointer to blocks of constant shape, and a tuple of vectors as a
+table of addresses; see `codegen/language.py`. An address is a float64, which represents all integers up to 2^53.
 """
 
 from typing import Any, NamedTuple
@@ -10,20 +10,20 @@ import numpy as np
 import numpy.typing as npt
 
 Arrays = Any  # an ndarray for Python, a pointer for compiled code
-StructuredArray = npt.NDArray[np.void]  # with fields by name, of one of the types below
+StructuredArray = npt.NDArray[np.void]  # of one of the dtypes at the end
 
 
 class Limits(NamedTuple):
-    """Of the controls, (M,) each; infinite where there is none."""
+    """Limits of the controls, (M,) each; infinite where there is none."""
 
     low: Arrays
     high: Arrays
 
 
 class DynamicsModel(NamedTuple):
-    """The addresses of what dynamics bring, and their parameters (any,).
+    """Addresses of the functions of the dynamics, and their parameters (any,).
 
-    `step_curvature` is the place of the second derivatives of a step against a costate; 0 where there are none.
+    `step_curvature` is that of a step's second derivatives; 0 where they vanish or are not wanted.
     """
 
     advance: float
@@ -36,8 +36,8 @@ class Constraints(NamedTuple):
     """The constraints that act on a cost.
 
     Attributes:
-      functions: (C, 6) of each the addresses of its functions, and whether it uses the control; see
-        `model_functions.py`. data, multipliers: what these take, a vector each; see `augmented_lagrangian.py`.
+      functions: (C, 5) addresses of each one's functions, and 1 if it uses the control; see `model_functions.py`.
+      data, multipliers: a vector for each; see `augmented_lagrangian.py`.
       size: C.
     """
 
@@ -48,12 +48,12 @@ class Constraints(NamedTuple):
 
 
 class CostModel(NamedTuple):
-    """A cost, as the sum of its terms, and the constraints that act where it does.
+    """A cost as the sum of its terms, and the constraints that act with it.
 
     Attributes:
-      functions: (K, 2) of each term the addresses of its value and its derivatives; those that may be indefinite come
-        first. data: what these take, a vector each. size: K. indefinite: how many may be.
-      project: the address of the projection of their sum; 0 where none may be indefinite.
+      functions: (K, 2) addresses of each term's value and derivatives; terms that may be indefinite come first.
+      data: a vector for each term. size: K. indefinite: number of terms that may be indefinite.
+      project: address of the projection of their sum; 0 if there are none.
     """
 
     functions: Arrays
@@ -65,7 +65,7 @@ class CostModel(NamedTuple):
 
 
 class NoiseModel(NamedTuple):
-    """The addresses of what noise brings; what its function reads (any,); the risk, and if it was too high, (2,)."""
+    """Addresses of the functions of noise; what they read (any,); and (2,) the risk, and 1 if it was too high."""
 
     value: float
     quadratic: float
@@ -74,7 +74,7 @@ class NoiseModel(NamedTuple):
 
 
 class ProblemModel(NamedTuple):
-    """A problem as numbers and addresses; the time step is in s, and `noise` is empty where there is none."""
+    """A problem as numbers and addresses; dt is in s, and `noise` is () if there is none."""
 
     dynamics: DynamicsModel
     dt: float
@@ -93,14 +93,14 @@ class Motion(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """The law u = L x + l: gain L (T, M, N) and offset l (T, M)."""
+    """The policy u = L x + l: gains L (T, M, N) and offsets l (T, M)."""
 
     gain: Arrays
     offset: Arrays
 
 
 class CostToGo(NamedTuple):
-    """1/2 x'S x + s'x + s0: S (T+1, N, N), s (T+1, N) and the constants (T+1,)."""
+    """1/2 x'S x + s'x + s0: S (T+1, N, N), s (T+1, N) and s0 (T+1,)."""
 
     hessian: Arrays
     gradient: Arrays
@@ -108,7 +108,7 @@ class CostToGo(NamedTuple):
 
 
 class CostToCome(NamedTuple):
-    """In the dual form covariances and means, in the primal form Sbar and sbar; (T+1, N, N), (T+1, N), (T+1,)."""
+    """Covariances and means in the dual form, Sbar and sbar in the primal form: (T+1, N, N), (T+1, N), (T+1,)."""
 
     matrix: Arrays
     vector: Arrays
@@ -116,10 +116,10 @@ class CostToCome(NamedTuple):
 
 
 class SmootherGains(NamedTuple):
-    """What leads from the minimiser at t + 1 to that at t.
+    """What leads from the smoothed state at t + 1 to the state and control at t.
 
-    In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`; in the
-    primal form, the inverse policy: the control is `control_gain x + control`, and the others are not used.
+    In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`. In the
+    primal form the control is `control_gain x + control`, the inverse policy, and the others are not used.
     """
 
     state_gain: Arrays
@@ -136,9 +136,9 @@ class Prior(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """What a pass linearises about: a fraction `reach` of the way from the plan to the minimisers.
+    """Where a pass linearises: a fraction `reach` of the way from the plan to the smoothed states.
 
-    With `guided`, the forward pass stays at the plan. `damping` weighs changes of the controls, in units of the
+    With `guided`, the forward pass linearises about the plan. `damping` weighs changes of the controls, relative to the
     control's own curvature.
     """
 
@@ -150,11 +150,13 @@ class Linearization(NamedTuple):
 
 
 class ModelOrder(NamedTuple):
-    """What the models of a pass about a plan are made of.
+    """The models of a pass about a plan.
 
-    `damping` is a weight on changes of the controls. `share` is how much of the second order there is: 0 for the models
-    of iLQR, with costs projected and dynamics linearised; 1 for those of Newton's method, the Hessians of costs as they
-    are and that of the dynamics times the costate. Noise is then weighed by a cost-to-go that is `known`.
+    Attributes:
+      damping: weight on changes of the controls.
+      share: of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for Newton's,
+        with true Hessians of the costs, and those of the dynamics times the costate.
+      known: the cost-to-go that weighs noise, if `share` is above 0.
     """
 
     damping: float
@@ -170,8 +172,8 @@ class LinearStep(NamedTuple):
 
 
 class NextStep(NamedTuple):
-    """What lies ahead of a step: its Jacobian [A B] (N, W), where it leads (N,), and the cost-to-go there, Hessian
-    (N, N) and gradient at the origin (N,).
+    """What follows a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there, Hessian (N, N) and
+    gradient at the origin (N,).
     """
 
     jacobian: Arrays
@@ -187,12 +189,20 @@ class QuadraticStage(NamedTuple):
     gradient: Arrays
 
 
+class WeightedStep(NamedTuple):
+    """A step of dynamics with parameters (any,) and a duration in s, whose result is summed with weights (N,)."""
+
+    parameters: Arrays
+    duration: float
+    weights: Arrays
+
+
 class ConstraintRows(NamedTuple):
-    """The numbers of all constraints, row by row, of which there are `size` at each step.
+    """All values of all constraints, `size` rows at each step.
 
     Attributes:
-      first: (C,) the row with which each constraint begins. support: (size, W) 0 where a row does not depend on that
-        state or control. multipliers: ((T+1) size,); those of up to `least` are as good as none.
+      first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
+      multipliers: ((T+1) size,); those up to `least` count as zero.
     """
 
     size: int
@@ -203,12 +213,12 @@ class ConstraintRows(NamedTuple):
 
 
 class StageModels(NamedTuple):
-    """Of all stages, at a plan that need not be a motion.
+    """Models of all stages at a plan, which need not satisfy the dynamics.
 
     Attributes:
-      hessian: (T+1, W, W) of the cost and of steps and constraints times costates and multipliers. convex: (T+1, W, W)
-        of the cost alone, projected. gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps.
-      arrived: (T, N) where these lead. slopes: ((T+1) size, W) of the constraints, row by row.
+      hessian: (T+1, W, W) of the Lagrangian. convex: (T+1, W, W) of the cost alone, projected.
+      gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps. arrived: (T, N) next states.
+      slopes: ((T+1) size, W) gradients of the constraints' rows.
     """
 
     hessian: Arrays
@@ -220,12 +230,13 @@ class StageModels(NamedTuple):
 
 
 class ActiveRows(NamedTuple):
-    """The rows of a plan of which some are held at zero, `size` at each step, limits of controls among them.
+    """An active set: the rows of all constraints and control limits, `size` at each step.
 
     Attributes:
-      table: (size, 6) of each row what it is; see `active_set.py`. live, held: ((T+1) size,) 1 for those that act, and
-        that are held, else 0. numbers: what they have to spare. force: their multipliers. pressing: those that a step
-        leads to. wrong: by how much a row is on the wrong side there, relative; 0 where it is not.
+      table: (size, 6) properties of each row; see `active_set.py`.
+      live, held: ((T+1) size,) 1 for rows that act, and for those in the active set, else 0.
+      numbers: their values. force: their multipliers. pressing: their multipliers after a step.
+      wrong: how far a row is on the wrong side after a step, relative, negative; else 0.
     """
 
     size: int
@@ -241,8 +252,8 @@ class ActiveRows(NamedTuple):
 class EliminatedControl(NamedTuple):
     """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
 
-    `factor` (M, M) is that of R, AT (N, N) and BT (M, N) the step's matrices transposed, Q (N, N) and q (N,) the cost
-    of the state, `size` (N,) the diagonal of its Hessian before.
+    `factor` (M, M) is the Cholesky factor of R, AT (N, N) and BT (M, N) are the step's matrices transposed, Q (N, N)
+    and q (N,) the cost of the state, and `size` (N,) the diagonal of its Hessian before.
     """
 
     factor: Arrays
@@ -256,11 +267,13 @@ class EliminatedControl(NamedTuple):
 
 
 class IterationSettings(NamedTuple):
-    """Of a solve: how long, and when it has converged.
+    """How long a solve iterates, and when it has converged.
 
-    `optimal` asks for more than a cost that has settled; with `fixed` the start is given; with `guided` the first
-    iteration linearises about the guess; the prior acts in the first `prior_iterations`. `valley` is the gap below
-    which smoothing leaves the rest to Newton's method; 0 where it does not.
+    Attributes:
+      steps: T. tolerance, gap_tolerance: of relative changes of cost, and of the gap.
+      optimal: whether a settled cost must be optimal, too. fixed: whether the start is given exactly.
+      guided: whether the first iteration linearises about the guess. prior_iterations: in which the prior acts.
+      valley: the gap below which smoothing leaves the rest to Newton's method; 0 for never.
     """
 
     steps: int
@@ -275,14 +288,13 @@ class IterationSettings(NamedTuple):
 
 
 class SmootherArrays(NamedTuple):
-    """All that a smoother reads and writes.
+    """All arrays of a smoother.
 
     Attributes:
-      start: (N,) where it begins. x_hat: (N,) the minimiser that a pass has come to. x_hats: (T+1, N) all of them.
-      homotopy_scaled: the stage cost as the passes see it, which is not yet the true one in the first iterations of a
-        continuation.
-      guess: what the first pass can be guided by. plan: the best so far. rollout: where the last policy leads.
-      kept: that policy. certificate: (1,) rows of `CERTIFICATE`.
+      start: (N,) the first state. x_hat: (N,) the smoothed state that a pass has reached. x_hats: (T+1, N) all of them.
+      homotopy_scaled: the stage cost of the passes; not the true one in the first iterations of a homotopy.
+      guess: guides the first pass. plan: the best trajectory so far. rollout: that of the last policy, `kept`.
+      certificate: (1,) row of `CERTIFICATE`.
     """
 
     start: Arrays
@@ -302,7 +314,7 @@ class SmootherArrays(NamedTuple):
 
 
 class RiccatiArrays(NamedTuple):
-    """What the passes of a linear-quadratic problem write; x_hats (T+1, N) are the minimisers."""
+    """Results of the passes of a linear-quadratic problem; x_hats (T+1, N) are the smoothed states."""
 
     policy: Policy
     to_go: CostToGo
@@ -312,9 +324,11 @@ class RiccatiArrays(NamedTuple):
 
 
 class IlqrArrays(NamedTuple):
-    """All that iLQR reads and writes: the plan is the best so far, `trial` what a line search tries.
+    """All arrays of iLQR.
 
-    `damping` (1,) is the weight on changes of the controls; `certificate` (1,) rows of `CERTIFICATE`.
+    Attributes:
+      plan: the best trajectory so far. trial: that of a line search. damping: (1,) weight on changes of the controls.
+      certificate: (1,) row of `CERTIFICATE`.
     """
 
     start: Arrays
@@ -327,12 +341,12 @@ class IlqrArrays(NamedTuple):
 
 
 class Predictor(NamedTuple):
-    """What takes estimates a control period on: see `estimation.py`.
+    """What predicts estimates over a control period; see `estimation.py`.
 
     Attributes:
-      dynamics, dt: as in `ProblemModel`. places: which of the parameters are unknown, (P,).
-      lag: how much is left of the distance to a command at the end of a period, and in the mean over it, (2,).
-      transition: of the unknowns' states, (D, D). output: from these to the unknowns' values, (V, D).
+      dynamics, dt: as in `ProblemModel`. places: (P,) indices of the unknown parameters.
+      lag: (2,) share of the difference to a command that is left at the end of a period, and on average over it.
+      transition: (D, D) of the unknowns' states. output: (V, D) from these to the unknowns.
     """
 
     dynamics: DynamicsModel
@@ -344,7 +358,7 @@ class Predictor(NamedTuple):
 
 
 class SensorModel(NamedTuple):
-    """The addresses of what is measured of a state and of its slope, and what these read (any,)."""
+    """Addresses of the measurement and of its Jacobian, and what these read (any,)."""
 
     measure: float
     slope: float
@@ -352,14 +366,14 @@ class SensorModel(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """What is shown of the states (count, N), and 1 where that was lost, else 0, (count,)."""
+    """Measured states (count, N), and (count,) 1 where a measurement was lost, else 0."""
 
     shown: Arrays
     lost: Arrays
 
 
 class AngularStates(NamedTuple):
-    """Which states are angles, and where rotation vectors begin: their places, (any,), and how many there are."""
+    """Which states are angles, and where rotation vectors begin: indices (any,), and how many there are."""
 
     angles: Arrays
     angle_count: int
@@ -371,23 +385,22 @@ def _row(*names: str) -> np.dtype[np.void]:
     return np.dtype([(name, np.float64) for name in names])
 
 
-# What one iteration of the safeguard leaves to the next: cost of the plan, and its merit, to which what the augmented
-# Lagrangian adds belongs; how far the next iteration reaches, and the weight on changes of the controls; how many small
-# changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many there will be the next
-# time, and how many others there were since. At the end, how far the states of least total cost are from the plan; at
-# the beginning, whether that was made. `watched` is 1 where undamped iterations are to end when they make no progress,
-# because there is a safeguard to go on. Of Newton's method: the share of the second order that the next pass may have;
-# the step at which the last one failed; what it promised, as the slope of the merit and as a share of it; a cost that
-# is as good as none; and the weight on changes of controls without which it has no minimum.
+# The state of the iterations between calls.
+# plan_cost, merit: of the plan; the merit includes the augmented Lagrangian. started: 1 once the start was rolled out.
+# watched: 1 where undamped iterations end without progress, because the safeguard can take over.
+# Of the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row; of
+# iterations at reach 0, iLQR's, how many are left, how many there will be the next time, and how many others there were
+# since; final_gap: between smoothed states and plan at the end.
+# Of Newton's method: share of the second order of the next pass; the step at which the last pass failed; its predicted
+# slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible cost; and
+# the damping without which the pass has no minimum.
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
     "started", "watched", "share", "failed", "decrease", "promised", "negligible", "damping",
 )  # fmt: skip
 
-# A line of the log: NaN where something was not worked out.
+# A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")
 
 # What `certificate.certify` writes; see there.
-CERTIFICATE = _row("cost", "scale", "motion", "law", "limits", "decrease")
-
-ROWS = {"MEMORY": MEMORY, "LOG": LOG, "CERTIFICATE": CERTIFICATE}
+CERTIFICATE = _row("cost", "scale", "dynamics_residual", "policy_residual", "beyond_limits", "decrease")

@@ -1,19 +1,13 @@
-"""Sweeps along a trajectory: running a policy, and what a linear-quadratic model about the plan says.
+"""Sweeps along a trajectory: rollouts of a policy, costs, line searches, and the backward pass of iLQR.
 
 The kernels' subset. Shapes and names are those of `passes.py`.
 """
 
 from math import isnan, nan
 
-from lqrsim.kernels.control_limits import minimize_within
-from lqrsim.kernels.declarations import (
-    NOISY,
-    M,
-    N,
-    W,
-    stack,
-)
-from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, congruence, finite, within
+from lqrsim.kernels.control_limits import limited_control, minimize_within
+from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
+from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, congruence, copy, copy_matrix, finite
 from lqrsim.kernels.model_functions import (
     advance,
     cost_added,
@@ -24,27 +18,25 @@ from lqrsim.kernels.model_functions import (
     step_jacobian,
     step_second_order,
 )
-from lqrsim.kernels.passes import copy, end_model
+from lqrsim.kernels.passes import end_model
 from lqrsim.kernels.records import Limits, NextStep, QuadraticStage
 
 
 def rollout(steps, x0, policy, model, plan):
-    """Run the policy from x0 under the true dynamics; write the trajectory and return its true cost."""
+    """Run the policy from x0 (N,) under the true dynamics; write the trajectory, and return its true cost."""
     x, u = plan.states[0], stack(M)
-    for i in range(N):
-        x[i] = x0[i]
+    copy(x0, N, x)
     cost = cost_value(x, u, 0, model.initial)
     for t in range(steps):
         x, u = plan.states[t], plan.controls[t]
-        affine(policy.gain[t], policy.offset[t], x, u)
-        within(u, model.limits)
+        limited_control(policy.gain[t], policy.offset[t], x, model.limits, u)
         cost += cost_value(x, u, t, model.stage)
         advance(x, u, model, model.dt, plan.states[t + 1])
     return cost + cost_value(plan.states[steps], u, steps, model.final)
 
 
 def noise_cost(steps, plan, model, to_go):
-    """What noise is expected to cost along a trajectory, with the cost-to-go of the policy that makes it."""
+    """The expected cost of noise along a trajectory, given the cost-to-go of the policy that makes it."""
     total, none = 0.0, stack(N, W)
     for t in range(steps):
         ahead = NextStep(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
@@ -53,7 +45,7 @@ def noise_cost(steps, plan, model, to_go):
 
 
 def plan_cost(steps, plan, model, to_go):
-    """Cost of a trajectory, with what noise is expected to cost, and what the augmented Lagrangian adds to it."""
+    """The cost of a trajectory with the expected cost of noise, and what the augmented Lagrangian adds to it."""
     states, controls = plan.states, plan.controls
     cost, added = cost_value(states[0], controls[0], 0, model.initial), 0.0
     for t in range(steps):
@@ -65,29 +57,26 @@ def plan_cost(steps, plan, model, to_go):
 
 
 def differential_pass(steps, plan, model, order, keep, policy, to_go):
-    """The backward pass of iLQR about a feasible trajectory; the policy is relative to it, the cost-to-go is about the
-    origin.
+    """The backward pass of iLQR or DDP about a trajectory.
 
-    With `keep` of 1 all steps are written; with 0 each overwrites the one after it, for those who only ask what the
-    model predicts.
+    Args:
+      plan: a Motion that satisfies the dynamics. order: ModelOrder.
+      keep: 1 to write all steps; 0 to overwrite one, where only the predicted decrease is wanted.
+      policy: relative to the plan, written. to_go: about the origin, written.
 
-    Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
+    Returns:
+      The step at which it failed, or -1; whether all numbers there were finite; and the decrease of cost that the model
+      predicts.
     """
     share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
-    jacobian, none, no_change = stack(N, W), stack(M), stack(N)
+    jacobian, none, no_change = stack(N, W), zeros(M), zeros(N)
     slope, curve = stack(N), stack(N, N)
     hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
     states, controls, S, s, k = plan.states, plan.controls, to_go.hessian, to_go.gradient, to_go.constant
-    for i in range(N):
-        no_change[i] = 0.0
-    for i in range(M):
-        none[i] = 0.0
     value = cost_of_order(states[steps], none, steps, model.final, share, hessian, gradient)
     predicted, ahead = 0.0, value
-    for i in range(N):
-        slope[i] = gradient[i]
-        for j in range(N):
-            curve[i, j] = hessian[i, j]
+    copy(gradient, N, slope)
+    copy_matrix(hessian, N, N, curve)
     last = steps * keep
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
@@ -114,23 +103,21 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
         predicted += decrease
         constant = ahead - predicted
         for i in range(N):
-            moved = slope[i]
+            gradient_at_origin = slope[i]
             for j in range(N):
                 S[at, i, j] = curve[i, j]
-                moved -= curve[i, j] * x[j]
-            s[at, i] = moved
-            constant -= 0.5 * (slope[i] + moved) * x[i]
+                gradient_at_origin -= curve[i, j] * x[j]
+            s[at, i] = gradient_at_origin
+            constant -= 0.5 * (slope[i] + gradient_at_origin) * x[i]
         k[at] = constant
     return -1, True, predicted
 
 
 def initial_step(x0, model, share, to_go, direction):
-    """Write where the soft start x0 would best move, given the cost-to-go at 0; return what that promises, or NaN."""
+    """Write the best move (N,) of a soft start x0, given the cost-to-go at 0; return its predicted decrease, or NaN."""
     S, s = to_go.hessian[0], to_go.gradient[0]
-    hessian, gradient, none = stack(W, W), stack(W), stack(M)
+    hessian, gradient, none = stack(W, W), stack(W), zeros(M)
     total, slope = stack(N, N), stack(N)
-    for i in range(M):
-        none[i] = 0.0
     cost_of_order(x0, none, 0, model.initial, share, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
@@ -138,7 +125,7 @@ def initial_step(x0, model, share, to_go, direction):
             slope[i] += S[i, j] * x0[j]
             total[i, j] = hessian[i, j] + S[i, j]
         direction[i] = -slope[i]
-        if slope[i] == 0 and total[i, i] == 0:  # a state that nothing weighs may stay
+        if slope[i] == 0 and total[i, i] == 0:  # a state without weight need not move
             total[i, i] = 1.0
     if not cholesky(total, N):
         return nan
@@ -150,50 +137,50 @@ def initial_step(x0, model, share, to_go, direction):
 
 
 def largest_gap(steps, x_hats, states):
-    """The largest difference between two sequences of states, each state relative to its range (at least 1)."""
+    """The largest difference between two sequences of states, each state relative to its range, or to 1."""
     gap = 0.0
     for i in range(N):
         low, high, worst = states[0, i], states[0, i], 0.0
         for t in range(steps + 1):
-            difference = abs(x_hats[t, i] - states[t, i])
-            if difference > worst or isnan(difference):  # and then it stays
-                worst = difference
+            worst = larger(worst, abs(x_hats[t, i] - states[t, i]))
             low, high = min(low, states[t, i]), max(high, states[t, i])
-        relative = worst / max(high - low, 1.0)
-        if relative > gap or isnan(relative):
-            gap = relative
+        gap = larger(gap, worst / max(high - low, 1.0))
     return gap
 
 
 def dynamics_residual(steps, x_hats, policy, model, states):
-    """The largest step x_{t+1} - g(x_t, u_t) of a sequence of states under a policy, relative as the gap is."""
-    u, ahead, least, most, worst = stack(M), stack(N), stack(N), stack(N), stack(N)
-    for i in range(N):
-        least[i], most[i], worst[i] = states[0, i], states[0, i], 0.0
+    """The largest x_{t+1} - g(x_t, u_t) of a sequence of states under a policy, relative as `largest_gap` is."""
+    u, arrived, least, most, worst = stack(M), stack(N), stack(N), stack(N), zeros(N)
+    copy(states[0], N, least)
+    copy(states[0], N, most)
     for t in range(steps):
-        affine(policy.gain[t], policy.offset[t], x_hats[t], u)
-        within(u, model.limits)
-        advance(x_hats[t], u, model, model.dt, ahead)
+        limited_control(policy.gain[t], policy.offset[t], x_hats[t], model.limits, u)
+        advance(x_hats[t], u, model, model.dt, arrived)
         for i in range(N):
-            difference = abs(x_hats[t + 1, i] - ahead[i])
-            if difference > worst[i] or isnan(difference):
-                worst[i] = difference
+            worst[i] = larger(worst[i], abs(x_hats[t + 1, i] - arrived[i]))
             least[i], most[i] = min(least[i], states[t + 1, i]), max(most[i], states[t + 1, i])
     residual = 0.0
     for i in range(N):
-        relative = worst[i] / max(most[i] - least[i], 1.0)
-        if relative > residual or isnan(relative):
-            residual = relative
+        residual = larger(residual, worst[i] / max(most[i] - least[i], 1.0))
     return residual
 
 
-def line_search(steps, shift, work, model, bound, slope, smallest, trial):
-    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `bound`, by that
-    part of `slope` too.
+def larger(a, b):
+    """The larger of two numbers; NaN if one of them is."""
+    return b if b > a or isnan(b) else a
 
-    The changes are from the plan, by the policy in the workspace. The merit is the true cost, expected where there is
-    noise, and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit, its cost, and the
-    step, which is 0 if none down to `smallest` lowers the merit.
+
+def line_search(steps, shift, work, model, bound, slope, smallest, trial):
+    """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
+
+    The merit is the true cost, expected where there is noise, and what the augmented Lagrangian adds to it.
+
+    Args:
+      shift: (N,) of the start. work: its policy has the changes of the controls, about its plan.
+      smallest: fraction. trial: Motion, written.
+
+    Returns:
+      The merit, the cost, and the fraction: `bound`, `bound` and 0 if none down to `smallest` will do.
     """
     fraction, plan, policy = 1.0, work.plan, work.policy
     while fraction >= smallest:
@@ -207,7 +194,7 @@ def line_search(steps, shift, work, model, bound, slope, smallest, trial):
                 for j in range(N):
                     total += policy.gain[t, i, j] * (x[j] - plan.states[t, j])
                 u[i] = total
-            within(u, model.limits)
+            clamp(u, model.limits)
             cost += cost_value(x, u, t, model.stage)
             added += cost_added(x, u, t, model.stage)
             advance(x, u, model, model.dt, trial.states[t + 1])
@@ -232,14 +219,12 @@ def copy_plan(steps, source, target):
 def copy_policy(steps, source, target):
     """Copy a policy."""
     for t in range(steps):
-        for i in range(M):
-            target.offset[t, i] = source.offset[t, i]
-            for j in range(N):
-                target.gain[t, i, j] = source.gain[t, i, j]
+        copy(source.offset[t], M, target.offset[t])
+        copy_matrix(source.gain[t], M, N, target.gain[t])
 
 
 def shorten_step(steps, fraction, plan, x_hats):
-    """Make of the states that a whole step was to lead to those that a part of it was."""
+    """Turn the states (T+1, N) that a whole step leads to into those that a fraction of it leads to."""
     if fraction < 1:
         for t in range(steps + 1):
             for i in range(N):
@@ -247,9 +232,9 @@ def shorten_step(steps, fraction, plan, x_hats):
 
 
 def policy_about_plan(steps, plan, policy):
-    """Make the policy relative to the plan: l becomes L x + l - u, the change of the controls that it asks for."""
+    """Make a policy relative to the plan: its offsets become L x + l - u, the changes of the controls."""
     u = stack(M)
     for t in range(steps):
-        affine(policy.gain[t], policy.offset[t], plan.states[t], u)
+        affine(policy.gain[t], policy.offset[t], plan.states[t], M, N, u)
         for i in range(M):
             policy.offset[t, i] = u[i] - plan.controls[t, i]

@@ -1,7 +1,8 @@
-"""The ratios of a rotation vector's angle that are smooth at zero, and their derivatives; see `rotations.py`.
+"""Ratios of a rotation vector's angle that are smooth at zero, and their derivatives; see `rotations.py`.
 
-Series: sin x / x = sum (-s)^k / (2k + 1)!, and so on; the last one's coefficients
-are |Bernoulli(2k + 2)| / (2k + 2)!. Below s = 1/4 the first dropped term is under 1e-16 relative.
+They are functions of s, the squared angle. Near zero they are series, such as sin x / x = sum (-s)^k / (2k + 1)!; the
+coefficients of the last one are |Bernoulli(2k + 2)| / (2k + 2)!. Below s = 1/4 the first term that is left out is
+under 1e-16, relatively.
 """
 
 from math import cos, sin, sqrt
@@ -78,6 +79,6 @@ def cotangent_ratio_d2(s: float) -> float:
 
 
 def _half_cotangent_d1(s: float) -> float:
-    """Derivative in s of |r|/2 cot(|r|/2) = sine_ratio / (2 cosine_ratio)."""
+    """The derivative in s of |r|/2 cot(|r|/2) = sine_ratio / (2 cosine_ratio)."""
     a, b = sine_ratio(s), cosine_ratio(s)
     return (sine_ratio_d1(s) * b - a * cosine_ratio_d1(s)) / (2 * b * b)

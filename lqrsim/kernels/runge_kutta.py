@@ -3,12 +3,11 @@
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
 
-from lqrsim.kernels.declarations import M, N, W, rate, rate_jacobian, stack
-from lqrsim.kernels.linear_algebra import clear
+from lqrsim.kernels.declarations import M, N, W, rate, rate_jacobian, stack, zeros
 
 
 def advance(x, u, p, h, out):
-    """Write x after `h` seconds, (N,)."""
+    """Write the state (N,) after `h` seconds."""
     z, k = stack(N), stack(N)
     for i in range(N):
         out[i] = z[i] = x[i]
@@ -22,11 +21,14 @@ def advance(x, u, p, h, out):
 
 
 def chain(fx, fu, previous, a, out):
-    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the slope of one Runge-Kutta stage in (x, u).
+    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the Jacobian of one Runge-Kutta stage in (x, u).
 
-    Dynamics that know which entries are zero everywhere bring a `chain` of their own in place of this one.
+    Dynamics with known zeros bring a `chain` of their own; see `write_chain` of `codegen/symbolic.py`.
+
+    Args:
+      fx: (N, N). fu: (N, M). previous: (N, W) of the stage before. a: how far ahead of x the stage is, in s.
     """
-    row = stack(W)  # and not out[i], so that it stays in registers
+    row = stack(W)  # not out[i], so that it stays in registers
     for i in range(N):
         for j in range(N):
             row[j] = fx[i, j]
@@ -42,14 +44,12 @@ def chain(fx, fu, previous, a, out):
 
 
 def step_jacobian(x, u, p, h, out, jacobian):
-    """Write the step as above and its Jacobian `[A B]` (N, W).
+    """Write the state (N,) after `h` seconds, and its Jacobian `[A B]` (N, W).
 
-    The four stages are written out: a loop over them takes longer.
+    The four stages are written out, because a loop over them is slower.
     """
     k, z = stack(N), stack(N)
-    fx, fu, first, second = stack(N, N), stack(N, M), stack(N, W), stack(N, W)
-    clear(fx, N, N)
-    clear(fu, N, M)
+    fx, fu, first, second = zeros(N, N), zeros(N, M), stack(N, W), stack(N, W)
     rate_jacobian(x, u, p, k, fx, fu)
     for i in range(N):
         out[i] = k[i]

@@ -1,6 +1,6 @@
-"""The distance to each primitive, and the one place where it is written down. The kernels' subset.
+"""Signed distances to obstacles, and their derivatives: the only place where these formulas are. The kernels' subset.
 
-Scalars, flat arrays, no allocation. `row` is where an obstacle's numbers start in a table flattened.
+An obstacle is ROW numbers of a flat table, which begin at index `row`.
 """
 
 from math import inf, sqrt
@@ -10,7 +10,7 @@ from lqrsim.kernels.declarations import ROW, inline, outline, stack
 
 @inline
 def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
-    """Signed distance of (x, y, z) to the obstacle whose `ROW` numbers start at `data[row]`; negative inside."""
+    """The signed distance of a point to an obstacle; negative inside."""
     kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
     c = data[row + 6] * dx + data[row + 9] * dy + data[row + 12] * dz
@@ -35,22 +35,22 @@ def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
 
 @inline
 def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gradient, hessian) -> float:
-    """Signed distance as above; writes its gradient (3,) and Hessian (3, 3).
+    """The signed distance; write its gradient (3,) and Hessian (3, 3).
 
-    With `v` the vector from the nearest point (or axis) and `q` its length, the gradient is `v / q` and the Hessian
-    `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is round there. On an axis
-    or in a centre, where neither exists, both are zero.
+    With `v` the vector from the nearest point of the centre or axis and `q` its length, the gradient is `v / q` and the
+    Hessian `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is curved there. On
+    an axis or at a centre, where neither exists, both are zero.
     """
     kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
-    nx, ny, nz = data[row + 6], data[row + 9], data[row + 12]  # the axis; a plane's normal
+    nx, ny, nz = data[row + 6], data[row + 9], data[row + 12]  # the axis, or a plane's normal
     along = nx * dx + ny * dy + nz * dz
     if kind == 4:
         return box_derivatives(data, row, dx, dy, dz, gradient, hessian)
     if kind == 0:
         return flat_derivatives(along, 1.0, nx, ny, nz, gradient, hessian)
     radius, half = data[row + 13], data[row + 14]
-    # What is round in all directions has a centre, nearest on the axis at `shift`; a side is flat along the axis.
+    # The nearest point of the axis is at `shift`; a side is flat along the axis.
     shift, flat = 0.0, 0.0
     if kind == 2:
         shift = min(max(along, -half), half)
@@ -77,7 +77,7 @@ def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gr
 
 
 def flat_derivatives(distance: float, sign: float, nx: float, ny: float, nz: float, gradient, hessian) -> float:
-    """A face with the normal `sign n`, at that distance."""
+    """Write the derivatives of the distance to a face with the normal `sign n`; return the distance."""
     gradient[0], gradient[1], gradient[2] = sign * nx, sign * ny, sign * nz
     for i in range(3):
         for j in range(3):
@@ -86,9 +86,11 @@ def flat_derivatives(distance: float, sign: float, nx: float, ny: float, nz: flo
 
 
 def rim_derivatives(data, row: int, side: float, end: float, gradient, hessian) -> float:
-    """The rim of a cylinder, from `side` beyond its side, `end` (signed) along its axis, `gradient` from its axis.
+    """Write the derivatives of the distance to the rim of a cylinder; return the distance.
 
-    Round in the radial and the axial direction; along the rim it turns with the side.
+    Args:
+      side: distance beyond the side. end: signed distance beyond the end, along the axis.
+      gradient: (3,) the vector from the axis; overwritten.
     """
     vx, vy, vz = gradient[0], gradient[1], gradient[2]
     radial = sqrt(vx * vx + vy * vy + vz * vz)
@@ -106,7 +108,7 @@ def rim_derivatives(data, row: int, side: float, end: float, gradient, hessian) 
 
 
 def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, hessian) -> float:
-    """A box, from `d` from its centre: as `signed_distance_derivatives`."""
+    """As `signed_distance_derivatives`, of a box, at (dx, dy, dz) from its centre."""
     beyond, sign = stack(3), stack(3)
     deepest, face = -inf, 0
     for k in range(3):
@@ -137,35 +139,30 @@ def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, h
     return distance
 
 
-def nearest(obstacles, count, data, points, out):
-    """Write the distance to the nearest of the obstacles, of `count` points (any, 3)."""
-    nowhere = stack(3)
-    for i in range(count):
-        out[i] = nearest_to(obstacles, data, points[i], nowhere, 0)
+def nearest(obstacles, count, each, data, points, displaced, out):
+    """Write the distances (count,) of points (count, 3) to the nearest of the obstacles.
 
-
-def nearest_displaced(obstacles, count, each, data, points, displaced, out):
-    """The same with obstacles that are elsewhere, by displaced[trial], where each trial has `each` of the points."""
+    Args:
+      each: points per trial. displaced: (trials, 3 obstacles) by how much obstacles have moved.
+    """
     for i in range(count):
-        out[i] = nearest_to(obstacles, data, points[i], displaced[i // each], 1)
+        out[i] = nearest_to(obstacles, data, points[i], displaced[i // each])
 
 
 @outline
-def nearest_to(obstacles, data, point, displaced, moved):
-    """The distance of one point (3,) to the nearest; where they have moved, by displaced (3 obstacles,)."""
+def nearest_to(obstacles, data, point, displaced):
+    """The distance of one point (3,) to the nearest obstacle; these are displaced, (3 obstacles,)."""
     least = inf
     for k in range(obstacles):
-        x, y, z = point[0], point[1], point[2]
-        if moved == 1:
-            x, y, z = x - displaced[3 * k], y - displaced[3 * k + 1], z - displaced[3 * k + 2]
+        x, y, z = point[0] - displaced[3 * k], point[1] - displaced[3 * k + 1], point[2] - displaced[3 * k + 2]
         distance = signed_distance(data, ROW * k, x, y, z)
-        if not distance >= least:  # NaN, too: nowhere is not far away
+        if not distance >= least:  # a NaN stays
             least = distance
     return least
 
 
 def each_with_normal(obstacles, count, data, points, distances, normals):
-    """Write the distance to each obstacle of `count` points (any, 3), and which way it grows: (any,), (any, 3)."""
+    """Write the distances (count obstacles,) of points (count, 3) to all obstacles, and their gradients (any, 3)."""
     for i in range(count):
         for k in range(obstacles):
             at = i * obstacles + k
@@ -174,6 +171,6 @@ def each_with_normal(obstacles, count, data, points, distances, normals):
 
 @outline
 def distance_with_normal(data, row, point, normal):
-    """That of one point (3,) to one obstacle."""
+    """The distance of one point (3,) to one obstacle; write its gradient (3,)."""
     curve = stack(3, 3)
     return signed_distance_derivatives(data, row, point[0], point[1], point[2], normal, curve)

@@ -1,29 +1,27 @@
-"""Second derivatives of a Runge-Kutta step, each state's times a weight. The kernels' subset.
+"""The Hessian of a Runge-Kutta step times weights, for rates with second derivatives. The kernels' subset.
 
-One sweep backwards through the stages tells what the weights of a step are for each of its rates; what these are curved
-by is then seen in the step's own states and controls, by the slopes of the stages.
+A sweep backwards through the stages turns the weights of the next state into weights of each stage's rates. The Hessian
+of the weighted rates at a stage is then pulled back to the step's state and control by the Jacobian of the stage.
 """
 
-from lqrsim.kernels.declarations import M, N, W, rate_curvature, rate_jacobian, stack
-from lqrsim.kernels.linear_algebra import clear
+from lqrsim.kernels.declarations import M, N, W, rate_curvature, rate_jacobian, stack, zeros
 from lqrsim.kernels.runge_kutta import chain
 
-SUPPORT = (0,)  # the entries of (x, u) in which the rates are curved, states first
-K = 1  # how many these are
-STATES = 1  # how many of them are states
+SUPPORT = (0,)  # entries of (x, u) in which the rates are nonlinear, states first
+K = 1  # their number
+STATES = 1  # the number of states among them
 
 
 def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
-    """Write a step and its Jacobian as `runge_kutta.py` does; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
-    k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), stack(K, K)
-    fu, fx1, fx2, fx3, fx4 = stack(N, M), stack(N, N), stack(N, N), stack(N, N), stack(N, N)
+    """Write a step and its Jacobian as `runge_kutta.py` does; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W).
+
+    Args:
+      weights: (N,). out: (N,). jacobian: [A B] (N, W). hessian: (W, W).
+    """
+    k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), zeros(K, K)
+    fu, fx1, fx2, fx3, fx4 = zeros(N, M), zeros(N, N), zeros(N, N), zeros(N, N), zeros(N, N)
     slope1, slope2, slope3, slope4 = stack(N, W), stack(N, W), stack(N, W), stack(N, W)
     w1, w2, w3, w4 = stack(N), stack(N), stack(N), stack(N)
-    clear(fu, N, M)
-    clear(fx1, N, N)
-    clear(fx2, N, N)
-    clear(fx3, N, N)
-    clear(fx4, N, N)
     rate_jacobian(x, u, p, k, fx1, fu)
     for i in range(N):
         out[i] = k[i]
@@ -53,7 +51,6 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
     back(fx4, w4, h, h / 3, weights, w3)
     back(fx3, w3, 0.5 * h, h / 3, weights, w2)
     back(fx2, w2, 0.5 * h, h / 6, weights, w1)
-    clear(curve, K, K)
     rate_curvature(x, u, p, w1, curve)
     for a in range(K):
         for b in range(K):
@@ -64,7 +61,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 
 
 def back(fx, after, ahead, share, weights, before):
-    """Write the weights of a stage's rates, given those of the stage after it."""
+    """Write the weights (N,) of a stage's rates, given those of the next stage."""
     for j in range(N):
         total = 0.0
         for i in range(N):
@@ -73,10 +70,9 @@ def back(fx, after, ahead, share, weights, before):
 
 
 def add_curvature(z, u, p, weights, ahead, slope, total):
-    """Add that of the rates at a stage (W, W); the stage's state is `x + ahead k`, `slope` (N, W) k's."""
-    curve, rows, product = stack(K, K), stack(STATES + 1, W), stack(K, W)
-    line = stack(W)  # and not a row of a matrix, so that it stays in registers
-    clear(curve, K, K)
+    """Add the Hessian (W, W) of the weighted rates at a stage, whose state is `x + ahead k`; `slope` (N, W) is k's."""
+    curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
+    line = stack(W)  # not a row of a matrix, so that it stays in registers
     rate_curvature(z, u, p, weights, curve)
     for a in range(STATES):
         for j in range(W):
@@ -88,7 +84,7 @@ def add_curvature(z, u, p, weights, ahead, slope, total):
         for b in range(STATES):
             for j in range(W):
                 line[j] += curve[a, b] * rows[b, j]
-        for b in range(STATES, K):  # controls are held: their rows are those of the identity
+        for b in range(STATES, K):  # controls are held: their rows are the identity's
             line[SUPPORT[b]] += curve[a, b]
         for j in range(W):
             product[a, j] = line[j]

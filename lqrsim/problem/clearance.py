@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
-from lqrsim.kernels import ball_clearance, clearance, distance_constraint
+from lqrsim.kernels import clearance, distance_constraint
 from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
@@ -102,7 +102,7 @@ class Clearance(Constraint):
             return ConstraintTerm(source, data, len(world), describe)
         own = [*margins.shape, len(world), len(tables), *balls.radii, *margins.ravel(), *tables.ravel()]
         return ConstraintTerm(
-            source=source_of(ball_clearance, AT=places.numbers, BALLS=len(balls)).filled(
+            source=source_of(clearance, AT=places.numbers, BALLS=len(balls)).filled(
                 places=places.code, places_jacobian=places.code
             ),
             data=np.concatenate([places.data, own]),

@@ -26,7 +26,7 @@ from lqrsim.errors import (
     excerpt,
     vectors_of,
 )
-from lqrsim.kernels import ball_places, function_places, place_differences
+from lqrsim.kernels import differences, sphere_centers, user_functions
 from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
@@ -252,17 +252,18 @@ class CollisionSpheres:
         rest |= {"offset": 1 if self.jacobian is None else 2, "with_control": False}
         size = self._size_of(dynamics)
         unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
-        given, coordinates = size * len(self), 3 * len(self)
+        values = size * len(self)
         functions = (
-            UserFunction(function=self.function, values=given, entries=self.names, columns=size, unused=unused, **rest),
+            UserFunction(
+                function=self.function, values=values, entries=self.names, columns=size, unused=unused, **rest
+            ),
         )
-        filled = {"BALLS": len(self), "SIZE": size, "GIVEN": given}
+        source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
         if self.jacobian is not None:
             shape = len(self), size, len(names)
             functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
-            return SphereCenters(source_of(function_places, **filled), dynamics.data, axes, size == 2, functions)
-        given = source_of(function_places, **filled)
-        source = source_of(place_differences, PLACES=coordinates, AXES=axes).filled(places=given)
+        else:
+            source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
         return SphereCenters(source, dynamics.data, axes, size == 2, functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
@@ -352,7 +353,7 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))
-    _call(places, "places_of", flat, out)
+    _call(places, "centres_of", flat, out)
     return out.reshape(*given.shape[:-1], count, 3)
 
 
@@ -360,13 +361,13 @@ def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[A
     """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
-    _call(places, "slopes_of", flat, out, slopes)
+    _call(places, "jacobians_of", flat, out, slopes)
     return out.reshape(-1, count, 3), slopes.reshape(len(flat), count, 3, -1)
 
 
 def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> None:
-    """Call a function of `kernels/ball_places.py`; what a user's function raises comes through."""
-    filled = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
+    """Call a function of `kernels/sphere_centers.py`; what a user's function raises comes through."""
+    filled = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
     data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
     getattr(module, name)(len(states), states, data, *outputs)

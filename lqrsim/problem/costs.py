@@ -28,9 +28,9 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import ball_cost, cost_differences, distance_cost, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.kernels import differences, distance_cost, obstacle_cost, quadratic_cost, user_functions
 from lqrsim.problem.collision_geoms import CollisionGeoms
-from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, bind_outline, check_outline
+from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -241,12 +241,21 @@ class ObstacleCost(Cost):
             return self._bind_geoms(self.geoms, dynamics)
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
         tables = world.tables(times)
-        if self.balls is not None and places is not None:
-            return self._bind_balls(self.balls, places, tables)
-        position = dynamics.state_coordinates.position
-        first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
-        data = np.concatenate([first, tables.ravel()])
-        return CostTerm(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
+        radii = [self.radius] if self.balls is None else self.balls.radii
+        own = np.concatenate([[self.sharpness, self.weight, len(world), len(tables)], radii, tables.ravel()])
+        if self.balls is None or places is None:
+            position = dynamics.state_coordinates.position
+            return CostTerm(source_of(obstacle_cost, AXES=position), own, nonconvex_in=position, factor=1)
+        axes = places.depends_on
+        kernel = source_of(obstacle_cost, AT=places.numbers, BALLS=len(self.balls), AXES=axes)
+        return CostTerm(
+            kernel.filled(places=places.code, places_jacobian=places.code),
+            np.concatenate([places.data, own]),
+            nonconvex_in=axes or None,
+            factor=len(places.data) + 1,
+            functions=places.functions,
+            exact_hessian=False,
+        )
 
     def _bind_geoms(self, geoms: CollisionGeoms, dynamics: Dynamics) -> CostTerm:
         reach = FAR / self.sharpness
@@ -258,19 +267,6 @@ class ObstacleCost(Cost):
             nonconvex_in=tuple(range(found.moved)),
             factor=len(found.data) + 1,
             functions=found.functions,
-            exact_hessian=False,
-        )
-
-    def _bind_balls(self, balls: CollisionSpheres, places: SphereCenters, tables: Array) -> CostTerm:
-        own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])
-        count, axes = len(balls), places.depends_on
-        kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
-        return CostTerm(
-            kernel.filled(places=places.code, places_jacobian=places.code),
-            np.concatenate([places.data, own]),
-            nonconvex_in=axes or None,
-            factor=len(places.data) + 1,
-            functions=places.functions,
             exact_hessian=False,
         )
 
@@ -401,9 +397,9 @@ class FunctionCost(Cost):
         functions = (UserFunction(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
             functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
-        source = source_of(function_cost)
+        source = source_of(user_functions)
         if self.derivatives is None:
-            source = source_of(cost_differences, AXES=axes)
+            source = source_of(differences, AXES=axes).filled(value=source)
         return CostTerm(
             source,
             np.array(list(self.parameters.values()), dtype=np.float64),

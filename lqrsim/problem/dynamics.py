@@ -26,14 +26,7 @@ from lqrsim.errors import (
     excerpt,
     numbers_of,
 )
-from lqrsim.kernels import (
-    curvature_differences,
-    finite_differences,
-    function_dynamics,
-    jacobian_differences,
-    runge_kutta,
-    step_curvature,
-)
+from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
@@ -237,8 +230,8 @@ class Dynamics:
     def source(self) -> Source:
         """Source of `rate` and `rate_jacobian` of `kernels/declarations.py`; symbolic dynamics are traced, once."""
         if self.level != "symbolic":
-            given = source_of(function_dynamics)
-            return given if self.jacobian is not None else source_of(finite_differences).filled(rate=given)
+            given = source_of(user_functions)
+            return given if self.jacobian is not None else source_of(differences).filled(rate=given)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
         made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
@@ -259,18 +252,21 @@ class Dynamics:
     @cached_property
     def curvature_source(self) -> Source | None:
         """Source of `step_curvature`, as `kernels/step_curvature.py` has it; None where that is zero everywhere."""
-        if self.level != "symbolic" and self.jacobian is None:
-            return source_of(curvature_differences).filled(rate=self.source, rate_jacobian=self.source)
         kept = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
-        by_differences = source_of(jacobian_differences).filled(**dict.fromkeys(kept, self.source))
+        axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
+        by_values = source_of(differences, AXES=axes).filled(**dict.fromkeys(kept, self.source))
+        by_jacobians = source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_jacobians"))
+        if self.level != "symbolic" and self.jacobian is None:
+            by_values = by_values.filled(value=(by_values, "weighted_step"))
+            return source_of(step_curvature).filled(step_curvature=(by_values, "curvature_from_values"))
         if self.level != "symbolic":
-            return by_differences
+            return by_jacobians
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("second derivatives", LONGEST, *names, *self.constants.items())
         made = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
         support = tuple(made["support"])
         if not made["source"]:  # the formula would be too long
-            return by_differences
+            return by_jacobians
         if not support:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)

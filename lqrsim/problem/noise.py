@@ -28,7 +28,8 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
-from lqrsim.kernels import function_noise, matrix_noise, noise_differences, noise_matrices
+from lqrsim.kernels import differences, user_functions
+from lqrsim.kernels import noise as noise_kernel
 from lqrsim.problem.dynamics import Dynamics
 
 MOST = 100  # independent normal numbers
@@ -55,13 +56,14 @@ class NoiseTerm:
     functions: tuple[UserFunction, ...] = ()
 
     @property
-    def filled(self) -> dict[str, Any]:
-        """The constants that the kernels leave open."""
-        some = len(self.active)
-        return {
-            "ROWS": self.rows, "COUNT": len(self.rows), "CONTIGUOUS": int(self.rows == tuple(range(len(self.rows)))),
-            "SIZE": self.size, "ACTIVE": self.active, "ACTIVE_COUNT": some, "PADDED_COUNT": -4 * (some // -4),
-        }  # fmt: skip
+    def code(self) -> Source:
+        """The source of `kernels/noise.py` with this noise."""
+        rows, active = len(self.rows), len(self.active)
+        kernel = source_of(
+            noise_kernel, ROWS=self.rows, COUNT=rows, CONTIGUOUS=int(self.rows == tuple(range(rows))), SIZE=self.size,
+            ACTIVE=self.active, ACTIVE_COUNT=active, PADDED_COUNT=-4 * (active // -4),
+        )  # fmt: skip
+        return kernel.filled(noise_values=self.source, noise_slopes=self.source)
 
 
 class Noise:
@@ -187,7 +189,8 @@ class Noise:
         if self.matrix is not None:
             if len(self.matrix) != n:
                 raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one a state")
-            source = source_of(matrix_noise, COUNT=n, SIZE=self.size)
+            kernel = source_of(noise_kernel, COUNT=n, SIZE=self.size)
+            source = kernel.filled(noise_values=(kernel, "constant_values"), noise_slopes=(kernel, "constant_slopes"))
             return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
         if self.level != "symbolic":
             return self._bind_function(dynamics, numbers)
@@ -252,9 +255,8 @@ class Noise:
             values=n * self.size, entries=states, columns=self.size,
             unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
         )  # fmt: skip
-        given = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
-        differences = source_of(noise_differences, SIZE=self.size, ACTIVE=active, ACTIVE_COUNT=len(active))
-        source = differences.filled(noise_values=given)
+        given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
+        source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
@@ -277,8 +279,7 @@ class Noise:
         u = check_array("controls", controls, (len(x), m), infinite=True)
         term = self.bind(dynamics)
         compact = np.zeros((len(x), len(term.rows), self.size))
-        filled = source_of(noise_matrices).filled(noise_values=term.source)
-        module = module_of(filled, f"noise ({n} states, {m} controls)", N=n, M=m, W=n + m)
+        module = module_of(term.code, "noise", N=n, M=m, W=n + m)
         module.matrices_of(len(x), in_c_order(x), in_c_order(u), numbers_of(term), compact)
         for function in term.functions:
             if function.raised is not None:

@@ -355,7 +355,7 @@ class Problem:
             if term.equality or term.final_only:
                 parts.append(repr((term.equality, term.final_only)))
         if self._noise_term is not None:
-            parts += [self._noise_term.source.digest, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
+            parts += [self._noise_term.code.digest, self._noise_term.data, repr(self.risk)]
             functions += self._noise_term.functions
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight)))

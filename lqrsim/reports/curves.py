@@ -14,14 +14,14 @@ from lqrsim.view import style
 from lqrsim.view.style import RUNS
 
 SIZE = 5.2, 3.7
-# One for each policy; in grey they are told apart by lines and markers, too.
+# One for each policy; lines and markers distinguish them in grey.
 COLOURS = (*RUNS, "#e69f00", "#882255")
 LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
-    """Writes a figure (png, pdf or svg) of each policy's success over strength, with its band; returns its path."""
+    """Write a figure (png, pdf or svg) of each policy's success over strength, with a band; returns its path."""
     with style.figure(path, size=SIZE) as figure:
         axes = figure.add_subplot()
         for number, (policy, points) in enumerate(curves.items()):
@@ -35,7 +35,7 @@ def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLik
 
 
 def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.PathLike[str], *, label: str) -> Path:
-    """Writes a figure of three quantiles over strength, policy by policy; logarithmic where they span decades.
+    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades.
 
     Args:
       curves: policy -> strength -> low, middle and high.
@@ -47,7 +47,7 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
         known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
         decades = len(known) > 0 and known.max() > 100 * known.min()
         for number, (policy, of_strength) in enumerate(curves.items()):
-            # Undisturbed errors are next to nothing, which would take up most of a logarithmic axis.
+            # Undisturbed errors are tiny, and would take up most of a logarithmic axis.
             shown = {strength: band for strength, band in of_strength.items() if strength > 0 or not decades}
             if shown:
                 _draw(axes, number, policy, list(shown), np.array(list(shown.values())).T)
@@ -64,7 +64,7 @@ def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: 
     low, value, high = band
     colour = COLOURS[number % len(COLOURS)]
     axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
-    # Curves may lie on each other: those below are wider, and their markers larger.
+    # Curves may coincide: lower ones are wider, with larger markers.
     wide = max(4 - number, 1)
     axes.plot(
         strengths, value, linestyle=LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],

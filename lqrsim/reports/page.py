@@ -1,4 +1,4 @@
-"""The report of a stress test: one page that needs no network, with tables, curves and videos of the worst trials."""
+"""The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
 
 import json
 import os
@@ -22,9 +22,9 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.stress import analysis
+from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import TOLD, Campaign, Cell
-from lqrsim.stress.trials import stated_disturbances
+from lqrsim.stress.specification import Campaign, Cell
 
 MOST_VIDEOS = 100  # a page with more is too large for a browser
 
@@ -36,24 +36,24 @@ def report(
     videos: int = 4,
     progress: Callable[[int, int], object] | None = None,
 ) -> Path:
-    """Writes one HTML page of a campaign, with everything in it; returns its path.
+    """Write a campaign as one self-contained HTML page; returns its path.
 
     Args:
       results: the campaign.
       out: FILE.html.
-      videos: number of the worst trials to repeat and render. Without OpenGL the page says that there are none.
-      progress: called with the parts that are done, and all of them.
+      videos: number of the worst trials to repeat and render. Without OpenGL the page has none, and says so.
+      progress: called with the numbers of parts that are done and of all parts.
 
     Returns:
       The path of the page.
 
     Raises:
-      InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not
-        given it; or the page cannot be written.
+      InputError: no trial has been run yet; a file is damaged; `results` was not given a scenario of your own; or the
+        page cannot be written.
     """
     check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
     check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_function("progress", progress, "a function of how many parts are done, of how many", arguments=2)
+    check_function("progress", progress, "a function of the numbers of parts that are done and of all", arguments=2)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:
@@ -61,7 +61,7 @@ def report(
     begun = [cell for cell in results.cells if missing[cell] < results.campaign.trials]
     table = {cell: results.outcomes(cell, partial=True) for cell in begun}
     if not table:
-        raise InputError(f"results: got {results.folder}, in which no trial has ended yet, want some that have")
+        raise InputError(f"results: got {results.folder}, in which no trial has ended yet, want at least one")
     parts = 2 + videos
     tell = progress or (lambda done, total: None)
     tell(0, parts)
@@ -87,14 +87,14 @@ def report(
 
 
 def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, Any]:
-    """All of the page but for pictures."""
+    """All of the page except pictures."""
     campaign, manifest = results.campaign, results.manifest
     whole = {cell: one for cell, one in table.items() if len(one) == campaign.trials}
     erred = sum(int((one.outcome == "error").sum()) for one in table.values())
     done, all_trials = sum(map(len, table.values())), len(results.cells) * campaign.trials
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
-        warnings.append(f"{erred} trials did not run through; they count as failures.")
+        warnings.append(f"{erred} trials ended with an error; they count as failures.")
     warnings += [f"{line}." for line in results.came_to_nothing()]
     commands = {
         "To resume or repair the campaign": results.command,
@@ -107,28 +107,28 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
         "commands": commands,
         "asked": json.dumps(manifest.get("campaign"), indent=2, ensure_ascii=False),
         "breaks": tables.breaks_table(table),
-        "breaks_note": f"The least strength that was tried at which the 95 % interval of the success rate lies wholly"
-        f" below {100 * tables.BROKEN_BELOW:g} %, the least first.",
+        "breaks_note": f"The lowest tested strength at which the 95 % interval of the success rate is entirely"
+        f" below {100 * tables.BROKEN_BELOW:g} %, in ascending order.",
         "success_note": f"A trial succeeds if it ends within {_reach(results, scenario)}, without a collision"
         " until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are Wilson's."
-        " Where nothing is random all trials are one run, and there is no interval.",
+        " If nothing is random all trials are the same run, and there is no interval.",
         "compared": tables.comparison_tables(whole, tracking_unit(tables.state_coordinates(scenario))),
-        "compared_note": "Trials of the same number have the same random numbers, whatever the policy. What tells"
-        " policies apart are the trials that only one of them reached: p is McNemar's exact test, raised for the number"
-        " of comparisons on this page (Holm). Differences are the first less the second, with 95 % intervals: of"
-        " success Tango's score interval, of rms Student's, among the trials that both reached. Where nothing is random"
-        " there is nothing to compare.",
+        "compared_note": "Trials of the same number have the same random numbers for all policies. Policies differ in"
+        " the trials in which only one of them succeeded: p is from McNemar's exact test, corrected for the number of"
+        " comparisons on this page (Holm). Differences are first minus second, with 95 % intervals: Tango's score"
+        " interval for success, Student's for the rms of trials in which both succeeded. If nothing is random there is"
+        " nothing to compare.",
         "modes": tables.failure_table(table),
         "measures": tables.measure_tables(table, scenario),
-        "measures_note": "Median, and from 5 to 95 % of the trials in parentheses. Until a trial collides or is lost;"
-        " final error, distance from the goal and cost are of those that ran to the end.",
+        "measures_note": "Median, and 5 to 95 % quantiles in parentheses, until a trial collides or diverges. Final"
+        " error, distance from the goal and cost are those of trials that ran to the end.",
         "worst": tables.worst_table(table, tracking_unit(tables.state_coordinates(scenario))),
         "worst_note": f"Of each policy and sweep the {tables.WORST_EACH} worst. {analysis.RANKING}",
     }
 
 
 def _reach(results: Results, scenario: Scenario) -> str:
-    """Within which distance of what a trial has reached its goal."""
+    """The distance from the goal, as text, within which a trial has reached it."""
     target = next(iter(results.trials.solutions.values())).target
     campaign = results.campaign
     radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
@@ -155,15 +155,15 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
         "Plans": results.plans(),
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
-            f" numbers in each, of seed {campaign.seed}."
+            f" numbers in each combination, of seed {campaign.seed}."
         ],
     }
-    if told := [policy for policy in tables.policies(table) if policy in TOLD]:
-        stated = stated_disturbances(scenario, campaign.stated)
-        unknown = uncertainty_of(scenario.plant(), stated).left_out
-        facts["Stated"] = [
-            f"{' and '.join(told)}: made for {_describe(stated, scenario)}.",
-            *([f"Not part of it: {'; '.join(unknown)}."] if unknown else []),
+    if designed := [policy for policy in tables.policies(table) if policy in DESIGNED]:
+        disturbances = design_disturbances(scenario, campaign.design_disturbances)
+        unknown = uncertainty_of(scenario.plant(), disturbances).left_out
+        facts["Design disturbances"] = [
+            f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.",
+            *([f"Left out of the design: {'; '.join(unknown)}."] if unknown else []),
         ]
     if manifest.get("versions"):
         facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]

@@ -1,4 +1,4 @@
-"""The page of the paper's results, in Markdown, and the verdicts on the paper's statements for a terminal."""
+"""The page of the paper's results in Markdown, and verdicts on the paper's statements for a terminal."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
 
 
 def results_page(saved: Mapping[str, Any]) -> str:
-    """All results in Markdown: what holds, what was run, and each script's report."""
+    """All results in Markdown: verdicts on the paper's statements, what was run, and the report of each script."""
     results: dict[str, ScriptResult] = saved["results"]
     statements = [statement for one in results.values() for statement in one["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]
@@ -45,14 +45,14 @@ def results_page(saved: Mapping[str, Any]) -> str:
 
 
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
-    """How many hold, in words."""
+    """How many statements hold, in words."""
     counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
     said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."
 
 
 def verdicts(results: Mapping[str, ScriptResult], out: Path) -> Iterator[str]:
-    """A paragraph each of the statements, for the terminal."""
+    """Three lines for each statement, for a terminal."""
     statements = [statement for one in results.values() for statement in one["statements"]]
     for one in statements:
         yield f"{VERDICTS[one['holds']].strip('*').upper():<14} {one['where']}: {one['paper']}"

@@ -1,4 +1,4 @@
-"""The tables of a report: what breaks first, policies compared, failures, measures, and the worst trials."""
+"""The tables of a report: breaking strengths, comparisons, failures, measures, and the worst trials."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from lqrsim.stress.outcome_table import OUTCOMES
 from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import Estimate
 
-BROKEN_BELOW = 0.95  # success below which a policy counts as broken
-WORST_EACH = 3  # worst trials that are listed of each policy and sweep
+BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
+WORST_EACH = 3  # trials that are listed for each policy and sweep
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class PageTable:
 
 
 def state_coordinates(scenario: Scenario) -> Coordinates:
-    """Those of the states that are planned in."""
+    """The coordinates of the planned states."""
     return scenario.problem.dynamics.state_coordinates
 
 
@@ -38,7 +38,7 @@ def policies(table: analysis.Table) -> list[str]:
 
 
 def breaks_table(table: analysis.Table) -> PageTable:
-    """At which strength each policy breaks in each sweep."""
+    """The strength at which each policy breaks in each sweep."""
     rows = [
         [
             one.policy, one.sweep, "not at any" if one.strength is None else f"{one.strength:g}",
@@ -50,14 +50,14 @@ def breaks_table(table: analysis.Table) -> PageTable:
 
 
 def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
-    """A share with its interval, which is left out where it is known."""
+    """A share with its interval, if that has a width."""
     if one.low == one.high:
         return f"{scale * one.value:.1f}{unit}"
     return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
 
 
 def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
-    """Policies two by two on the same trials, a table for each pair and sweep; `unit` is that of tracking errors."""
+    """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is that of tracking errors."""
     found = analysis.comparisons(table)
     factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     head = (
@@ -90,7 +90,7 @@ def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
 
 
 def failure_table(table: analysis.Table) -> PageTable:
-    """How many trials of each cell ended how, and what they hit."""
+    """The numbers of failures of each kind in each cell, and the obstacles that were hit."""
     kinds = [outcome for outcome in OUTCOMES if outcome != "reached"]
     rows = []
     for cell, outcomes in table.items():
@@ -109,7 +109,7 @@ def _cell_names(cell: Cell) -> list[str]:
 
 
 def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]:
-    """Quantiles of all that is measured, a table for each sweep."""
+    """Quantiles of all measures, a table for each sweep."""
     units = dict(analysis.MEASURES)
     of_controls = set(scenario.robot.dynamics.control_coordinates.units)
     if len(of_controls) == 1:
@@ -133,14 +133,14 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]
 
 
 def policies_and_sweeps(table: analysis.Table) -> list[tuple[str, str]]:
-    """Policies and sweeps, what breaks first first, policies taking turns."""
+    """Policies and sweeps by breaking strength, alternating between policies."""
     order = [(one.policy, one.sweep) for one in analysis.breaks(table, below=BROKEN_BELOW)]
     turns = zip_longest(*([group for group in order if group[0] == policy] for policy in policies(table)))
     return [group for turn in turns for group in turn if group is not None]
 
 
 def worst_trials(table: analysis.Table, group: tuple[str, str]) -> list[analysis.Trial]:
-    """The worst of a policy and a sweep, the worst first."""
+    """The worst trials of a policy and a sweep, the worst first."""
     return analysis.worst({cell: one for cell, one in table.items() if (cell.policy, cell.sweep) == group}, WORST_EACH)
 
 
@@ -162,7 +162,7 @@ def worst_table(table: analysis.Table, unit: str) -> PageTable:
 
 
 def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) -> PageTable:
-    """How many trials of each policy reached their goal, a strength a row; curves are those of the policies."""
+    """The numbers of trials of each policy that reached the goal, a row for each strength."""
     points = [point for of_policy in curves.values() for point in of_policy]
     strengths = sorted({point.cell.strength for point in points})
     of_cell = {(point.cell.policy, point.cell.strength): point for point in points}

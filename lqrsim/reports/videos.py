@@ -1,4 +1,4 @@
-"""The videos of a report: the worst trial of each policy and sweep, run again and rendered, as text for the page."""
+"""The videos of a report: the worst trial of each policy and sweep, repeated and rendered, as text for the page."""
 
 import base64
 from collections.abc import Iterator
@@ -12,12 +12,12 @@ from lqrsim.stress.results import Results, replay
 from lqrsim.view import gl
 
 LARGEST = 1_500_000  # bytes of a video
-SIZES = (640, 360), (480, 270), (320, 180)  # the first with which a video is small enough
+SIZES = (640, 360), (480, 270), (320, 180)  # of which the first is taken whose video is small enough
 FPS = 15
 
 
 def videos_of_worst(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
-    """What there is to say of them all, and then each of them."""
+    """A remark on all videos, and then each video."""
     chosen = [
         next((one for one in tables.worst_trials(table, group) if one.outcome != "error"), None)
         for group in tables.policies_and_sweeps(table)
@@ -32,11 +32,11 @@ def videos_of_worst(results: Results, table: analysis.Table, count: int, folder:
     if not chosen:
         yield "No videos were requested." if count == 0 else "There is no trial to render."
     elif problem:
-        yield f"There are none, for no pictures can be drawn here: {problem}"
+        yield f"There are none, for this machine cannot draw pictures: {problem}"
     else:
         yield (
-            "The worst trial of a policy and a sweep, policies taking turns, run again from its number alone. Line:"
-            " the plan; trace: what was driven, coloured by tracking error."
+            "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
+            " Line: the plan; trace: the path, coloured by tracking error."
         )
     for one in chosen:
         video = {
@@ -57,7 +57,7 @@ def _label(one: analysis.Trial) -> str:
 
 
 def _video(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
-    """The video as text, or why there is none."""
+    """The video as text, or the reason for which there is none."""
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 
     try:
@@ -73,5 +73,5 @@ def _video(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any
 
 
 def base64_text(path: Path) -> str:
-    """A file as a page has it, within itself."""
+    """A file in base64, for a page."""
     return base64.b64encode(path.read_bytes()).decode("ascii")

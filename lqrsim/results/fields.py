@@ -111,11 +111,12 @@ def declared(annotation: Any) -> Declared:
 
 @cache
 def _in_order(kind: type) -> list[tuple[str, Declared]]:
-    """Records first, which say what sizes are, then arrays, then tuples of a length."""
+    """Records first, which say what sizes are, then arrays, then optional records and tuples of a length."""
 
     def order(item: tuple[str, Declared]) -> int:
         said = item[1]
-        return 2 if get_origin(said.kinds[0]) is tuple and said.letters else int(said.dtype is not None)
+        last = said.letters if get_origin(said.kinds[0]) is tuple else said.optional and is_dataclass(said.kinds[0])
+        return 2 if last else int(said.dtype is not None)
 
     return sorted(declarations(kind).items(), key=order)
 

@@ -17,12 +17,12 @@ import numpy as np
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results.archive import Arrays, Header, opened, write
 from lqrsim.results.archive import replacing as replacing
-from lqrsim.results.fields import Declared, Sizes, check_sizes, check_string, declarations, declared
+from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.schema import canonical, parse
+from lqrsim.results.schema import anything, canonical, parse
 from lqrsim.results.solution import Solution
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel
@@ -37,7 +37,6 @@ FORMATS: dict[type, tuple[str, int]] = {
     Funnel: ("funnel", 2),
 }
 VERSIONS = dict(FORMATS.values())
-DEEPEST = 6  # nested lists and objects, in a field that may hold anything
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
@@ -194,20 +193,7 @@ def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
         return kind(check_name(path, tree[:100] if isinstance(tree, str) else tree, [str(one.value) for one in kind]))
     if said.dtype is not None:
         raise InputError(f"{path}: got {excerpt(tree)} in meta, want an array")
-    return _anything(path, tree)
-
-
-def _anything(field: str, value: Any, depth: int = DEEPEST) -> Any:
-    """Any JSON value, with a limit to nested lists and objects."""
-    if isinstance(value, str):
-        return check_string(field, value)
-    if not isinstance(value, list | dict):
-        return value
-    if depth == 0:
-        raise InputError(f"{field}: got more nested lists or objects, want at most {DEEPEST}")
-    if isinstance(value, list):
-        return [_anything(f"{field}[{i}]", one, depth - 1) for i, one in enumerate(value)]
-    return {check_string(f"{field}: a name", k): _anything(f"{field}.{k}", one, depth - 1) for k, one in value.items()}
+    return anything(path, tree)
 
 
 def _join(path: str, name: str | int) -> str:

@@ -7,10 +7,10 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from lqrsim.errors import InputError, check_name, check_number, excerpt
+from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
+from lqrsim.results.fields import LARGEST_COUNT, LINE, check_string
 
 Check = Callable[[str, Any], Any]
-LINE = 1000  # characters of a name or another line; more is no name
 _DEPTH = 6  # nested lists and objects in `anything`
 
 
@@ -36,53 +36,27 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def text(field: str, value: Any) -> str:
     """Any text that can be encoded."""
-    if not isinstance(value, str):
-        raise InputError(f"{field}: got {excerpt(value)}, want text")
-    if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise InputError(f"{field}: got {excerpt(value)}, want text without halves of surrogate pairs")
-    return value
+    return check_string(field, value)
 
 
 def line(field: str, value: Any) -> str:
-    """One line of text, not too long for a name."""
-    text(field, value)
-    if len(value) > LINE or any(
-        letter < " " or "\x7f" <= letter <= "\x9f" or letter in "\u2028\u2029" for letter in value
-    ):
-        raise InputError(f"{field}: got {excerpt(value)}, want one line of at most {LINE} characters")
-    return value
+    """One printable line of text, not too long for a name."""
+    return check_string(field, value, LINE)
 
 
 def number(*, at_least: float | None = None, above: float | None = None, at_most: float | None = None) -> Check:
     """The check for a finite number within bounds."""
 
-    def check(field: str, value: Any) -> float:
-        check_number(field, _real(field, value), at_least=at_least, above=above, at_most=at_most)
-        return value
+    def check(field: str, value: Any) -> Any:
+        check_number(field, value, at_least=at_least, above=above, at_most=at_most)
+        return value  # as it was, for a hash depends on whether it is a whole number
 
     return check
 
 
-def any_number(field: str, value: Any) -> float:
-    """A number, infinite ones and NaN too."""
-    return _real(field, value)
-
-
-def _real(field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{field}: got {excerpt(value)}, want a number")
-    try:
-        float(value)
-    except OverflowError:
-        raise InputError(f"{field}: got {excerpt(value)}, want a number that is not so large") from None
-    return value
-
-
 def count(field: str, value: Any) -> int:
     """A whole number >= 0."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= 0")
-    return value
+    return check_count(field, value, at_least=0, at_most=LARGEST_COUNT)
 
 
 def one_of(names: Iterable[str]) -> Check:

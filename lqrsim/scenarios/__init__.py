@@ -1,4 +1,4 @@
-"""Problems ready to solve: the packaged ones by name, and one's own by reference."""
+"""Scenarios: problems with a robot and a scene, ready to solve."""
 
 import lazy_loader
 

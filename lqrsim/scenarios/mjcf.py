@@ -1,4 +1,4 @@
-"""A scenario of any MJCF, from its path and what to do: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
+"""A scenario from any MJCF: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,29 +25,29 @@ def mjcf(
     obstacles: bool | Sequence[str] = True,
     parameters: Mapping[str, float] | None = None,
 ) -> Scenario:
-    """From a start to a goal in so many steps, with the limits of the actuators and clear of obstacles.
+    """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
 
     Args:
       path: of the MJCF.
-      start: the name of a keyframe, or states by name, {"pole": 3.14}; a keyframe among them is {"keyframe": "home",
-        "pole": 3.14}. States that are not named are at rest as in the MJCF.
-      goal: likewise.
-      weights: of what misses the goal at the end: of all states, by name, or by unit, as {"m": 100, "rad": 100}; what
-        is not named then has none.
-      effort: of the controls, a number, by name or by unit, about those that hold the robot still; by default as in
-        `MjcfRobot.problem`.
-      dt: seconds of a control period, by default about 0.02.
-      steps: how many.
+      start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
+        "pole": 3.14}. Other states are at rest, as in the MJCF.
+      goal: in the same form.
+      weights: of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the others
+        then have none.
+      effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a
+        control at its limit, or at 1 without one, costs 1; see `MjcfRobot.problem`.
+      dt: control period in s, by default about 0.02.
+      steps: number of control periods.
       body: as in `MjcfRobot`.
       floors: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
-      parameters: other numbers of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
+      parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Returns:
       The Scenario.
 
     Raises:
-      InputError: no such file, keyframe, state, unit or number; or as `MjcfRobot` and `Problem` do.
+      InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
     robot = MjcfRobot(path, body=body, floors=floors, obstacles=obstacles)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
@@ -61,19 +61,19 @@ def mjcf(
         effort=None if effort is None else per_entry("effort", effort, controls, above=0.0),
     )  # fmt: skip
     return Scenario(
-        name=Path(path).stem, summary=f"{robot.name}, by MuJoCo's own steps", robot=robot, scene=robot.scene,
+        name=Path(path).stem, summary=f"{robot.name}, with the dynamics of MuJoCo", robot=robot, scene=robot.scene,
         problem=problem, tracking_bound=robot.radius or 0.1,
     )  # fmt: skip
 
 
 def _state(robot: MjcfRobot, field: str, place: Place) -> Array:
-    """The state that is meant. Raises InputError if there is none such."""
+    """The state for `start` or `goal`. Raises InputError for an unknown keyframe or state."""
     check_kind(field, place, (str, Mapping, type(None)), "a keyframe's name, or states by name: {'x': 1.0}")
-    stated = {"keyframe": place} if isinstance(place, str) else dict(place or {})
-    keyframe = stated.pop("keyframe", None)
+    named = {"keyframe": place} if isinstance(place, str) else dict(place or {})
+    keyframe = named.pop("keyframe", None)
     if not isinstance(keyframe, str | None):
         raise InputError(f"{field}: keyframe: got {excerpt(keyframe)}, want its name")
     try:
-        return robot.at(keyframe, **stated)  # pyright: ignore[reportArgumentType]
+        return robot.at(keyframe, **named)  # pyright: ignore[reportArgumentType]
     except TypeError:
         raise InputError(f"{field}: got {excerpt(place)}, want states by name: {{'x': 1.0}}") from None

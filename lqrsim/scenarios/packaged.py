@@ -1,4 +1,4 @@
-"""The named problems: a robot in a scene, with start, goal and weights. Adding one is adding a function here."""
+"""The registered scenarios. To add one, add a function here."""
 
 import inspect
 import sys
@@ -23,20 +23,19 @@ from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, r
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A robot in a scene with something to do.
+    """A robot in a scene with a problem.
 
     Attributes:
-      name: what the command line calls it.
-      summary: what it is, in a line.
+      name: its name on the command line.
+      summary: a line of description.
       robot: the robot.
       scene: its scene.
-      problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
-      tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
-      disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
-      start: what to begin with, as in `smooth`, wherever the scenario is solved by its name; by default several starts
-        are tried.
-      paper_start: how the paper begins, for `smooth(problem, start=...)`, or to become the `start`.
-      goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
+      problem: the problem to solve; change it with `dataclasses.replace(scenario.problem, ...)`.
+      tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
+      disturbances: those of the demo: clearly visible, but within the reach of the policy.
+      start: for the solver, as in `smooth`, whenever the scenario is solved; by default several starts are tried.
+      paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
+      goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
     """
 
@@ -53,7 +52,7 @@ class Scenario:
     goal_tolerance: float | None = None
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
-        """These options of `simulate`, or the scenario's own if neither is given.
+        """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
 
         Args:
           goal_radius: in metres, or None.
@@ -85,7 +84,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_text("Scenario: name", self.name, "a name")
-        check_text("Scenario: summary", self.summary, "what it is", at_most=1000, empty=True)
+        check_text("Scenario: summary", self.summary, "a line of description", at_most=1000, empty=True)
         check_kind("Scenario: robot", self.robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
         check_kind("Scenario: problem", self.problem, Problem, "a Problem")
@@ -96,17 +95,17 @@ class Scenario:
         wanted = "disturbances, such as ControlNoise(0.05)"
         found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
         object.__setattr__(self, "disturbances", found)
-        if not is_function(self.start):  # which is called when it is solved
+        if not is_function(self.start):  # a function is called when the scenario is solved
             resolve(self.start, self.problem)
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
-        """The robot in its scene as a MuJoCo model that is ready to run."""
+        """The robot in its scene, ready to run in MuJoCo."""
         return Plant(self.robot, self.scene)
 
 
 def names() -> list[str]:
-    """Names of the scenarios.
+    """The names of the registered scenarios.
 
     Returns:
       The names, sorted.
@@ -115,7 +114,7 @@ def names() -> list[str]:
 
 
 def get(name: str) -> Scenario:
-    """The scenario of that name, with its default settings.
+    """The registered scenario of a name, with its default settings.
 
     Args:
       name: one of `names()`.
@@ -130,7 +129,7 @@ def get(name: str) -> Scenario:
 
 
 def _functions() -> dict[str, Callable[..., Scenario]]:
-    """Every public function of this module that returns a Scenario."""
+    """The public functions of this module that return a Scenario."""
     functions = inspect.getmembers(sys.modules[__name__], inspect.isfunction)
     return {
         name: f
@@ -174,8 +173,8 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
 
     Args:
-      query: which of the random starts and goals, from 0; see `quadrotor_queries`.
-      seed: from which the starts and goals are drawn.
+      query: number of the random start and goal, from 0; see `quadrotor_queries`.
+      seed: of the random starts and goals.
 
     Returns:
       The Scenario.
@@ -211,14 +210,14 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
 
 
 def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Random starts and goals, each (count, 12), at rest. The first `count` of a seed do not depend on `count`.
+    """Draw random starts and goals at rest, (count, 12) each. The first ones of a seed do not depend on `count`.
 
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
 
     Args:
-      count: how many.
-      seed: from which they are drawn.
+      count: number of pairs.
+      seed: of the random numbers.
 
     Returns:
       Starts and goals, each (count, 12).

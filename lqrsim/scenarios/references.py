@@ -1,10 +1,15 @@
-"""A scenario by what someone types: a registered name, or a function of their own, with settings.
+"""Scenarios and sets of disturbances from what a user types.
 
-quadrotor                     a name that `lqrsim list` prints
-quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
-my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario
-my_package.robots:hallway     a function in a module of yours
-my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
+A scenario is the name of a registered one, a function of the user's own or an MJCF, with settings:
+
+  quadrotor                     a name that `lqrsim list` prints
+  quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
+  my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario
+  my_package.robots:hallway     a function in a module of yours
+  my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
+
+A set of disturbances is `scenario`, those of the scenario's own demo, or the name of a preset. NAME:Kind is one kind of
+disturbance of a set.
 """
 
 import ast
@@ -24,17 +29,19 @@ from lqrsim.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from lqrsim.scenarios.packaged import Scenario
+    from lqrsim.simulation.disturbances import Disturbance
 
 
 def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     """The scenario that `reference` names; see the top of this file for its forms.
 
     Args:
-      registered_only: refuse a function that is not lqrsim's own. For references that come out of a file: a file is
-        data, and may not choose which code runs.
+      reference: what the user typed.
+      registered_only: refuse a user's own function. For references that are read from a file, which must not choose the
+        code that runs.
 
     Raises:
-      InputError: nothing of that name, a setting that it does not have, or something that is not a Scenario.
+      InputError: there is no such scenario or setting, or the function does not return a Scenario.
     """
     from lqrsim.scenarios.packaged import Scenario
 
@@ -56,8 +63,27 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     return scenario
 
 
+def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]":
+    """The disturbances of a set at strength 1; see the top of this file for its names.
+
+    Raises:
+      InputError: there is no such set or kind, or the set is empty.
+    """
+    from lqrsim.simulation.disturbances import PRESETS, preset
+
+    whole, colon, kind = name.partition(":")
+    check_name("disturbances", whole, ["scenario", *PRESETS])
+    found = scenario.disturbances if whole == "scenario" else tuple(preset(whole, scenario.plant()))
+    if not found:
+        raise InputError(f"disturbances: got {name!r}, which is empty, want a set with disturbances")
+    if not colon:
+        return found
+    check_name(f"kind of disturbance in {whole}", kind, dict.fromkeys(type(one).__name__ for one in found))
+    return tuple(one for one in found if type(one).__name__ == kind)
+
+
 def from_anywhere(reference: str) -> str:
-    """The same reference, as it can be given in any working directory: a file's path is made absolute."""
+    """The same reference with absolute paths, so that it works in any working directory."""
     target, settings = _parts(reference)
     place, colon, name = target.rpartition(":")
     if colon and place.endswith(".py"):
@@ -68,12 +94,12 @@ def from_anywhere(reference: str) -> str:
 
 
 def folder_name(scenario: "Scenario") -> str:
-    """The scenario's name, as a folder may be called on any system."""
+    """The scenario's name as a folder name that is valid on any system."""
     return re.sub(r"[^\w.-]+", "_", scenario.name)[:100].strip("._ ") or "scenario"
 
 
 def _parts(reference: str) -> tuple[str, list[str]]:
-    """What is named, and its settings; a comma inside a value, as in `goal=(1, 2)`, does not part them."""
+    """The target and its settings. A comma inside a value, as in `goal=(1, 2)`, does not separate settings."""
     target, *settings = re.split(r",(?=\s*\w+=)", reference)
     return target, settings
 
@@ -92,21 +118,22 @@ def _own_function(target: str) -> Callable[..., object]:
 
 
 def _load_file(path: Path) -> ModuleType:
-    if not os.path.isfile(path):  # not the method, which raises for names that are too long
+    if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise InputError(f"scenario: got {path}, want a Python file that exists")
-    name = str(path.resolve())  # not the stem, which may be that of another module
+    name = str(path.resolve())  # the stem may be the name of another module
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up while it is being run
+    sys.modules[name] = module  # dataclasses look up their module while it runs
     spec.loader.exec_module(module)
     return module
 
 
 def _import(name: str) -> ModuleType:
     if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())  # as `python -m` does; an installed command does not
+        sys.path.insert(0, os.getcwd())  # `python -m` does this, an installed command does not
+
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Solutions of scenarios: one way to solve, what was stored to begin with, and what is given in place of a solve."""
+"""Solutions of scenarios: computed, begun with a stored start, or given instead of solving."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -26,8 +26,8 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
     """Solve a scenario's problem from the scenario's start.
 
     Args:
-      scenario: what to solve.
-      solver: one of SOLVERS. "ilqr", which has no prior, begins with the controls of an InitialPrior.
+      scenario: with the problem and the start.
+      solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
       **options: of the solver; a `start` among them replaces the scenario's.
 
     Returns:
@@ -45,23 +45,23 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
 
 
 def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution | AffinePolicy | Trajectory:
-    """What a file has for a solver of the scenario to begin with.
+    """Load a start for a solve of the scenario from a file.
 
     Args:
-      scenario: what is to be solved.
-      path: of a solution, a policy, or a rollout or funnel, of which the plan is taken.
+      scenario: to solve.
+      path: of a solution, a policy, or a rollout or funnel, for its plan.
 
     Returns:
       The solution, the policy or the plan.
 
     Raises:
-      InputError: the file holds something else, or it is of another system or of another number of steps.
+      InputError: the file has something else, or it is for another system or number of steps.
     """
     found = load(path)
     if isinstance(found, OutputFeedbackPolicy):
         raise InputError(
-            f"start: got {path}, a policy that needs estimates, want a solution, a policy of the state, or a rollout or"
-            " a funnel, whose plan is taken"
+            f"start: got {path}, a policy with an estimator, want a solution, a policy of the state, a rollout or a"
+            " funnel"
         )
     if isinstance(found, Solution | AffinePolicy):
         policy = found if isinstance(found, AffinePolicy) else found.policy
@@ -73,17 +73,19 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 
 
 def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> Solution:
-    """A solution in place of a solve of the scenario. It need not have converged, or be of the very problem: `remarks`.
+    """Check a solution that is given instead of solving the scenario.
+
+    It may be without convergence, or of another problem: `remarks` says so.
 
     Args:
       scenario: in which it is to run.
-      solution: as it is, or the path of one.
+      solution: a Solution, or the path of one.
 
     Returns:
       The solution, with the scenario's goal radius.
 
     Raises:
-      InputError: it cannot be read, is of another system, number of steps, control period or goal, or its plan is not
+      InputError: it cannot be read, has another system, number of steps, control period or goal, or its plan is not
         finite.
     """
     stored = isinstance(solution, str | os.PathLike)
@@ -111,11 +113,11 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
 
 
 def remarks(scenario: Scenario, solution: Solution) -> list[str]:
-    """What is to be said of a solution that is run in a scenario, in lines; none if it is a success of its problem."""
+    """Lines of warning about a solution that runs in a scenario; none if it solves the scenario's problem."""
     lines: list[str] = []
     if not solution.success:
         lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
-    # A free duration is settled by the solve, in a problem of its own.
+    # With a free duration the solution is of a problem with the duration that was found.
     if scenario.problem.duration is None and solution.problem_digest != scenario.problem.digest:
         solved = f" (solved as {solution.scenario})" if solution.scenario else ""
         lines.append(f"is of another problem than that of {scenario.name}{solved}; its plan is run as it is")
@@ -125,7 +127,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
 def _check_fits(
     field: str, what: object, scenario: Scenario, states: Coordinates, controls: Coordinates, steps: int
 ) -> None:
-    """Raise InputError unless these are the states, controls and number of steps of the scenario's problem."""
+    """Raise InputError unless states, controls and number of steps are those of the scenario's problem."""
     problem = scenario.problem
     wanted = problem.dynamics.state_coordinates, problem.dynamics.control_coordinates
     for kind, got, want in zip(("states", "controls"), (states, controls), wanted, strict=True):
@@ -139,5 +141,5 @@ def _check_fits(
 
 
 def digest_of_start(scenario: Scenario) -> str | None:
-    """Hash of everything that the scenario has its solver begin with; None where that is left to the solver."""
+    """Hash of the scenario's start; None if it has none."""
     return None if scenario.start is None else resolve(scenario.start, scenario.problem).digest

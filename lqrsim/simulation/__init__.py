@@ -1,1 +1,1 @@
-"""Execution in MuJoCo: a plant, disturbances, and the closed loop of the two with a policy."""
+"""Simulation in MuJoCo: plants, disturbances, and the closed loop with a controller."""

@@ -1,8 +1,7 @@
-"""Running a policy on a plant: one code path for one trial and for many.
+"""Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` is the loop over the control periods; `Loop` has a method for each phase of one. What the disturbances do in
-them is in `effects.py`, MuJoCo's part in `physics.py`, what counts as a collision in `collisions.py`, and what is kept
-in `recorder.py`.
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py` applies
+the disturbances, `physics.py` is MuJoCo's part, `collisions.py` detects collisions, and `recorder.py` records.
 """
 
 import copy
@@ -13,14 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.control.controllers import ControllerLike, ControllerRun
-from lqrsim.errors import Array, InputError, check_kind, excerpt, told
+from lqrsim.errors import Array, InputError, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
@@ -49,63 +47,62 @@ def simulate(
 ) -> Rollout:
     """Run a policy, or anything else that controls, closed-loop in MuJoCo, from the first state of a plan.
 
-    In each control period: read the true state, measure it, ask the controller, disturb its command, saturate, push,
-    step, kick.
+    In each control period: read the true state, measure it, compute the control, disturb it, saturate it, apply
+    disturbing forces, step the physics, and let the state jump.
 
-    A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, when the filter of
-    its controller diverges, or when the controller fails: raises an exception, which ends all the trials that it was
-    asked for, or returns what are no controls of theirs. What is recorded after a collision does not count; after the
-    others it is NaN.
+    A trial ends with its first collision, as `collisions.py` defines it, when its simulation becomes unstable, when the
+    filter of its controller diverges, or when the controller fails: it raises an exception, which ends all trials that
+    it computes together, or returns invalid controls. Records after a collision do not count; in the other cases they
+    are NaN.
 
     Args:
       plant: robot and scene to run.
-      plan: a solution or another plan: where the run begins, for how long it goes on, and what it is compared with. By
-        default the controller's own, if it has one, as an `OffsetFree` and a `Replanner` have.
-      controller: what decides on the controls, by default the plan's policy: another policy, with or without a filter;
-        a `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
-      disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
-        A `Noise`, with which problems are stated, is one, too.
+      plan: a solution or another plan, which gives the first state, the duration, and the reference for comparisons. By
+        default the controller's own plan, which an `OffsetFree` and a `Replanner` have.
+      controller: computes the controls; by default the plan's policy. Another policy, with or without a filter; a
+        `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
+      disturbances: in the order in which they act. Each has its own stream of random numbers. A `Noise` of a problem is
+        one, too.
       seed: of all random numbers.
-      trials: how many runs.
-      first_trial: number of the first; trial `i` of a seed is the same to the last bit whatever runs beside it.
-      goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
+      trials: number of trials.
+      first_trial: number of the first one; trial `i` of a seed is bit-identical whatever trials run beside it.
+      goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
-        `results/goal.py` says of what.
-      frames: whether to record what drawing needs, between the control periods too; without it there is no video.
-      contacts: whether obstacles stop the robot, from the control period of its first collision on; or it goes through
-        them, which takes a quarter less time and is the same to the bit until then, with the same outcome.
-      threads: of MuJoCo's; by default as many as there are processors.
-      generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
-      progress: called after each control period with the number of periods done and of all.
-      watch: called with each frame as it comes: its time, MuJoCo's qpos (K, nq), and who has become unstable (K,).
+        `results/goal.py` has the details.
+      frames: whether to record what drawing needs, between the control periods, too; without it there is no video.
+      contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
+        through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome.
+      threads: of MuJoCo; by default one per processor.
+      generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
+      progress: called after each control period with the number of finished periods and that of all.
+      watch: called with each frame: its time, MuJoCo's qpos (K, nq), and which trials are unstable (K,).
 
     Returns:
-      A Rollout of the trials. Its `controller_run` is the run of the controller, with what that recorded.
+      A Rollout of the trials. Its `controller_run` is the run of the controller, with its records.
 
     Raises:
-      InputError: there is no plan, or it is not finite; plan or policy are for another robot; the control period is no
-        multiple of the physics step; a disturbance does not fit; or an option is out of range.
+      InputError: there is no plan, or it is not finite; plan or policy are for another robot; the control period is not
+        a multiple of the physics step; a disturbance does not fit; or an option is out of range.
     """
-    stated = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
+    given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     settings = RunSettings(
-        plant=plant, plan=plan, disturbances=stated, controller=controller, seed=seed, trials=trials,
+        plant=plant, plan=plan, disturbances=given, controller=controller, seed=seed, trials=trials,
         first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
         contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
     )  # fmt: skip
-    loop = Loop(settings)
+    loop = ClosedLoop(settings)
     with unlogged():
         loop.run()
     return loop.rollout()
 
 
-class Loop:
-    """The closed loop of K trials: what happens in a control period, phase by phase.
+class ClosedLoop:
+    """The closed loop of K trials, with a method for each phase of a control period.
 
-    The states (K, n) and what is recorded of them are those of all trials at once. `run` runs all of it; `begin` and
-    `period` run it step by step.
+    All trials are advanced together. `run` runs the whole loop; `begin` and `period` run it step by step.
 
     Attributes:
-      step: number of the control period that comes next. shown: (K, n) what the controller is shown then.
+      step: number of the next control period. measured: (K, n), the measured states at its beginning.
       controller_run: the run of the controller.
     """
 
@@ -126,10 +123,10 @@ class Loop:
         self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
-        self.step, self.shown = 0, self.states
+        self.step, self.measured = 0, self.states
 
     def run(self) -> None:
-        """All control periods; fewer if no trial is left."""
+        """Run all control periods; fewer if all trials have ended."""
         settings, steps = self.settings, self.settings.trajectory.steps
         self.begin()
         while self.step < steps and self.period():
@@ -139,59 +136,59 @@ class Loop:
 
     def begin(self) -> None:
         """Measure the states at the first knot."""
-        self.step, self.shown = 0, self.measure(0)
+        self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:
-        """One control period, to the measurement at its end; False, and nothing moves, if no trial is left."""
+        """Run one control period, up to the measurement at its end. Returns False if all trials have ended."""
         step = self.step
-        commands = self.decide(step, self.shown)
+        commands = self.decide(step, self.measured)
         controls = self.actuate(step, commands)
         wrench = self.push(step)
         if self.records.over(step).all():
             return False
         self.advance(step, controls, wrench)
-        self.step, self.shown = step + 1, self.measure(step + 1)
+        self.step, self.measured = step + 1, self.measure(step + 1)
         return True
 
     def measure(self, step: int) -> Array:
-        """The states (K, n) that the controller is shown."""
-        shown = self.effects.measure(step, self.states)
-        self.records.knot(step, self.states, shown, self.collisions.clearance)
-        self.records.lose(step, self.physics.unstable | _not_finite(shown))
+        """Measure the states, (K, n)."""
+        measured = self.effects.measure(step, self.states)
+        self.records.knot(step, self.states, measured, self.collisions.clearance)
+        self.records.lose(step, self.physics.unstable | _not_finite(measured))
         over = self.records.over(step)
-        if over.any():  # these go on with the plan's state, for the others' sake
-            shown[over] = self.settings.trajectory.states[step]
-        return shown
+        if over.any():  # trials that have ended continue in the plan's states, so that they do not disturb the others
+            measured[over] = self.settings.trajectory.states[step]
+        return measured
 
-    def decide(self, step: int, shown: Array) -> Array:
-        """The controller's commands (K, m); where it fails, the plan's are what the actuators get."""
+    def decide(self, step: int, measured: Array) -> Array:
+        """The controller's commands (K, m); if it fails, the plan's controls."""
         shape = self.settings.trials, len(self._names)
         try:
-            commands = _checked_commands(self.controller_run.control(step, shown), shape)
+            commands = _checked_commands(self.controller_run.control(step, measured), shape)
             failed = _not_finite(commands)
             reasons = [_not_a_number(row, self._names) for row in commands[failed]]
-        except Exception as error:  # of a controller, whatever it is: these trials failed
-            commands, failed = np.zeros(shape), np.ones(len(shown), dtype=bool)
-            reasons = [told(error)] * len(shown)
+        except Exception as error:  # a controller may raise anything; its trials have failed
+            commands, failed = np.zeros(shape), np.ones(len(measured), dtype=bool)
+            reasons = [format_error(error)] * len(measured)
         self.records.estimator_diverged(step, self.controller_run.estimator_diverged())
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
         return np.where(failed[:, None], self.settings.trajectory.controls[step], commands)
 
     def actuate(self, step: int, commands: Array) -> Array:
-        """What the actuators get (K, m): the commands as disturbed on their way, within the robot's limits."""
+        """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
         controls = np.clip(self.effects.actuate(step, commands), self._low, self._high)
         self.records.applied[:, step] = controls
         return controls
 
     def push(self, step: int) -> Array:
-        """Disturbing forces in N and torques in N m, (K, 6)."""
+        """The disturbing forces in N and torques in N m, (K, 6)."""
         wrench = self.effects.push(step, self.states)
         self.records.wrench[:, step] = wrench
         return wrench
 
     def advance(self, step: int, controls: Array, wrench: Array) -> None:
-        """Take the physics to the next knot; obstacles stop who collides, from this period on."""
+        """Advance the physics to the next knot. Obstacles stop a trial from the period of its first collision on."""
         physics, over = self.physics, self.records.over(step)
         period, kick = physics.advance(controls, wrench), self.effects.kick(step, self.states, controls)
         if kick is not None:
@@ -209,7 +206,7 @@ class Loop:
             self._show(physics.drawn(period))
 
     def _show(self, frames: Sequence[Array]) -> None:
-        """Record frames, and have them watched."""
+        """Record frames, and pass them to `watch`."""
         records, physics, watch = self.records, self.physics, self.settings.watch
         for frame in frames:
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
@@ -218,7 +215,7 @@ class Loop:
                 watch(time, frame, physics.unstable)
 
     def detect_contacts_at_end(self) -> None:
-        """Contacts at the last knot, which no period comes after."""
+        """Detect contacts at the last knot, after which there is no period."""
         if not self.physics.senses_contacts:
             return
         plan, touching = self.settings.trajectory, self.physics.touching_now()
@@ -227,7 +224,7 @@ class Loop:
             self.collisions.touch(int(row), plan.horizon, touching[row])
 
     def so_far(self) -> Rollout:
-        """What was recorded up to now; NaN after it, with a controller that failed. The loop can go on."""
+        """A Rollout of the records so far, as if the controller had failed now. The loop can go on."""
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
         if self.step < self.settings.trajectory.steps:
@@ -236,7 +233,7 @@ class Loop:
         return twin.rollout()
 
     def rollout(self) -> Rollout:
-        """All that was recorded."""
+        """A Rollout of all records."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
         records.turn_to_plan(settings.states)
@@ -280,7 +277,7 @@ class Loop:
 
 
 def _checked_commands(given: Any, shape: tuple[int, int]) -> Array:
-    """What a controller returned. Raises InputError for what are no controls of all trials."""
+    """The commands that a controller returned. Raises InputError unless they are (K, m) numbers."""
     try:
         command = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
@@ -296,8 +293,8 @@ def _not_a_number(command: Array, names: Sequence[str]) -> str:
 
 
 def _not_finite(rows: Array) -> npt.NDArray[np.bool_]:
-    """Which rows (K,) have a number that is not finite."""
+    """Whether each row has a number that is not finite, (K,)."""
     finite = np.isfinite(rows)
-    if finite.all():  # a look at all at once is far quicker
+    if finite.all():  # far quicker than looking at each row
         return np.zeros(len(rows), dtype=bool)
     return ~np.all(finite, axis=1)

@@ -1,9 +1,9 @@
-"""The one definition of a collision: the first moment at which a robot touches an obstacle, of each trial.
+"""The definition of a collision: the first moment at which the robot of a trial touches an obstacle.
 
-It touches one where the signed distance of its position less its radius is negative, or that of one of its balls or
-geoms, or where MuJoCo sees a contact of any of its geoms with one. All of it is looked for in runs without obstacle
-contacts, so that it is the same to the bit whether an obstacle then stops the robot or not: at the knots, and between
-them at each part of the control period, as `Physics` has them; and between these along the straight line.
+It touches one if the signed distance of its position, minus its radius, is negative, or that of one of its balls or
+geoms; or if MuJoCo detects a contact of one of its geoms with it. Detection uses states without obstacle contacts, so
+that it is bit-identical whether an obstacle then stops the robot or not. It checks the knots, the parts of a control
+period that `Physics` has, and straight lines between them.
 """
 
 import numpy as np
@@ -13,19 +13,19 @@ from lqrsim.errors import Array
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
-FINEST = 0.02  # of the radius: along a line no two looks are further apart than what is clear there and this
-MOST = 1000  # looks along a line, at most
+FINEST = 0.02  # smallest step along a line, relative to the radius; a step is the clearance if that is larger
+MOST = 1000  # steps along a line
 
 
 class Collisions:
     """The first collisions of K trials.
 
     Args:
-      displaced: (K, obstacles, 3) metres. dt: of a control period.
+      displaced: (K, obstacles, 3), in metres. dt: control period in s.
 
     Attributes:
-      at: (K,) seconds; infinite where there was none. obstacles: (K) names of what was hit; empty where nothing was.
-      clearance: (K,) signed distance to the nearest obstacle less the radius now, in metres.
+      at: (K,) times in s; infinite without a collision. obstacles: names of the obstacles; empty without one.
+      clearance: (K,) current signed distance to the nearest obstacle, minus the radius, in metres.
     """
 
     def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float) -> None:
@@ -39,10 +39,10 @@ class Collisions:
             self._hit(int(row), 0.0, self._last[row])
 
     def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-        """The trials that collide for the first time in a period, by their rows.
+        """Find the trials that collide for the first time in a period. Returns their rows.
 
         Args:
-          step: its number. ignored: (K,) trials that are over already.
+          step: number of the period. period: its states and contacts. ignored: (K,) trials that have ended.
         """
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
@@ -53,26 +53,26 @@ class Collisions:
             if len(self.plant.world):
                 self._search_line(step, part, parts, self.plant.middles(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
-        # What is computed of a time in the period may be rounded to beyond its end.
+        # A time in the period may be rounded to beyond its end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
         return found
 
     def touch(self, row: int, time: float, touching: npt.NDArray[np.bool_]) -> None:
-        """A contact that MuJoCo saw, with which obstacles (obstacles,)."""
+        """Record a contact that MuJoCo detected, with these obstacles (obstacles,)."""
         self.at[row] = time
         self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching))]
 
     def relocate(self, states: Array) -> None:
-        """The trials are elsewhere, as obstacles have stopped some of them."""
+        """Replace the current states: obstacles have stopped some of the trials."""
         self._last = self.plant.middles(states)
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Look along the lines from where the robot was last to these places, (K, B, 2 or 3) or (K, 1, n)."""
+        """Check the lines from the robot's last places to these, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
         length = self.plant.travel(last, there)
-        # No place of a line is nearer to an obstacle than its ends allow.
+        # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
         if not len(rows):
@@ -91,12 +91,12 @@ class Collisions:
             looking &= (clear >= 0) & ~at_end
 
     def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
-        """Clearance (k,) with the balls of these trials at places (k, B, 2 or 3)."""
+        """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3)."""
         if not self._moved:
             return self.plant.clearance_at(places)
         return self.plant.clearance_at(places, self.displaced if rows is None else self.displaced[rows])
 
     def _hit(self, row: int, time: float, places: Array) -> None:
-        """A collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
+        """Record a collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
         self.obstacles[row] = self.plant.nearest(places, self.displaced[row])

@@ -1,4 +1,4 @@
-"""What the disturbances of a run do to it, one after the other; what they return is checked."""
+"""The effects of a run's disturbances, applied one after the other, with checks of what they return."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,14 +18,14 @@ class Effects:
     """The effects of disturbances on K trials, started.
 
     Args:
-      plan: of the run. trials: their numbers.
-      generators: (trial, number of the disturbance) -> where its numbers come from.
+      plan: of the run. trials: numbers of the trials.
+      generators: (trial, number of the disturbance) -> its random generator.
 
     Attributes:
-      displaced: (K, obstacles, 3), by how much each obstacle is elsewhere, in metres, along the world's axes.
+      displaced: (K, obstacles, 3), displacement of each obstacle in metres, along the world's axes.
 
     Raises:
-      InputError: a disturbance does not fit the plant or the plan, or starts with what is no `Effect`.
+      InputError: a disturbance does not fit the plant or the plan, or its `start` does not return an `Effect`.
     """
 
     def __init__(
@@ -46,34 +46,34 @@ class Effects:
             if effect.displaced is not None:
                 self.displaced += shaped(f"{name}: displaced", effect.displaced, self.displaced.shape)
         if not np.isfinite(self.displaced).all():
-            raise InputError("disturbances: got obstacles that are displaced infinitely far, want finite numbers")
+            raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._pushes = [(slice(0, 3), *hook) for hook in self._hooks("force")]
         self._pushes += [(slice(3, 6), *hook) for hook in self._hooks("torque")]
         self._kicks = self._hooks("kick")
 
     def _hooks(self, kind: str) -> list[tuple[str, Any]]:
-        """What is called in each period, and what messages call it."""
+        """The hooks of one kind, each with its label for messages."""
         given = [(name, getattr(effect, kind)) for name, effect in self._effects]
         return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
 
     @property
     def alters_models(self) -> bool:
-        """Whether any trial has a model of its own."""
+        """Whether a trial has a model of its own."""
         return bool(self.displaced.any()) or any(effect.alter for _, effect in self._effects)
 
     def initial_states(self, states: Array) -> Array:
-        """Where the trials start (K, n), of where the plan does. Raises InputError for what is not finite."""
+        """The first states of the trials (K, n), from those of the plan. Raises InputError unless they are finite."""
         shape = states.shape
         for name, effect in self._effects:
             if effect.initial_states is not None:
                 states = shaped(f"{name}: initial_states: returned", effect.initial_states(states), shape)
         if not np.isfinite(states).all():
-            raise InputError("disturbances: got a start that is infinitely far away, want finite numbers")
+            raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
 
     def alter_models(self, plant: Plant, simulations: batch.Batch) -> None:
-        """Give the trials models of their own; `Physics.prepare` must follow."""
+        """Alter the models of the trials; `Physics.prepare` must follow."""
         for _, effect in self._effects:
             if effect.alter is not None:
                 effect.alter(simulations)
@@ -81,33 +81,33 @@ class Effects:
             plant.displace(simulations, self.displaced)
 
     def measure(self, step: int, states: Array) -> Array:
-        """The states (K, n) that the controller is shown, of the true ones."""
-        shown = states.copy()
+        """The measured states (K, n), from the true ones."""
+        measured = states.copy()
         for name, measure in self._measures:
-            shown = shaped(name, measure(step, shown), shown.shape)
-        return shown
+            measured = shaped(name, measure(step, measured), measured.shape)
+        return measured
 
     def actuate(self, step: int, controls: Array) -> Array:
-        """What of the controls (K, m) comes to the actuators, which then saturate."""
+        """The disturbed controls (K, m), before they saturate."""
         for name, actuate in self._actuations:
             controls = shaped(name, actuate(step, controls), controls.shape)
         return controls
 
     def push(self, step: int, states: Array) -> Array:
-        """Forces in N and torques in N m on the robots, (K, 6), along the world's axes, in the true states (K, n)."""
+        """The forces in N and torques in N m in the true states (K, n), along the world's axes, (K, 6)."""
         wrench = np.zeros((len(states), 6))
         for which, name, push in self._pushes:
             wrench[:, which] += shaped(name, push(step, states), (len(states), 3))
         return wrench
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:
-        """By how much the states (K, n) jump at a period's end, given what the actuators got; None if by nothing."""
+        """The jump of the states at the end of a period, (K, n), for the applied controls; None for none."""
         jumps = [shaped(name, kick(step, states, controls), states.shape) for name, kick in self._kicks]
         return sum(jumps[1:], start=jumps[0]) if jumps else None
 
 
 class _Streams(Sequence[np.random.Generator]):
-    """The generator of each trial, made when it is asked for: some disturbances draw nothing."""
+    """The generator of each trial, made on demand: some disturbances draw nothing."""
 
     def __init__(self, make: MakeGenerator, trials: range, stream: int) -> None:
         self._make, self._trials, self._stream = make, trials, stream
@@ -122,7 +122,7 @@ class _Streams(Sequence[np.random.Generator]):
         trial = self._trials[place]
         if trial not in self._made:
             made = self._make(trial, self._stream)
-            for draw in ("standard_normal", "random"):  # splitting gives objects that only draw, no Generators
+            for draw in ("standard_normal", "random"):  # TrialScore uses objects that draw but are no Generators
                 if not callable(getattr(made, draw, None)):
                     raise InputError(f"generators: got {excerpt(made)}, want a numpy.random.Generator of each trial")
             self._made[trial] = made
@@ -130,10 +130,10 @@ class _Streams(Sequence[np.random.Generator]):
 
 
 def seeded(seed: int) -> MakeGenerator:
-    """The generators of a seed: (trial, number of the disturbance) -> a stream that is theirs alone."""
+    """The generators of a seed: (trial, number of the disturbance) -> a generator of its own."""
 
     def make(trial: int, stream: int) -> np.random.Generator:
-        # Of NumPy's generators the quickest to make and to draw from, which shows in the time of the loop.
+        # The quickest of NumPy's generators, which shows in the time of the loop.
         return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
 
     return make

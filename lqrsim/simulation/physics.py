@@ -1,4 +1,4 @@
-"""MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
+"""MuJoCo's part of the closed loop: the simulations of all trials, advanced by one control period at a time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from lqrsim.errors import Array
 from lqrsim.machine import processors
 from lqrsim.simulation.plant import Indices, Plant
 
-FRAME_PERIOD = 1 / 30  # s; positions are looked at and recorded at least this often, if the physics step is not longer
-AWAY = 2.0**20  # m; how deep a robot must be within an obstacle that is only sensed, before it is pushed
+FRAME_PERIOD = 1 / 30  # s; positions are checked and recorded at least this often, unless the physics step is longer
+AWAY = 2.0**20  # m; depth inside an obstacle up to which it exerts no force while contacts are only sensed
 
 _WARNINGS = mujoco.mjtWarning
-# What MuJoCo does not go on with: it resets the state, or the controls, and only warns.
+# Warnings after which MuJoCo resets the state or the controls.
 UNSTABLE = [
     int(warning)
     for warning in (
@@ -27,13 +27,13 @@ UNSTABLE = [
 
 @dataclass
 class Period:
-    """What a control period came to, in S parts of equal length.
+    """The result of a control period, in S parts of equal length.
 
     Attributes:
       states: S arrays (K, n), at the end of each part; angles in any representative.
-      frames: S arrays (K, nq), MuJoCo's qpos then.
-      touching: S arrays (K, obstacles), whether MuJoCo saw a contact; S empty ones where none could be sensed.
-      stable: (K,) in how many of the parts, from the first on, the simulation was stable.
+      frames: S arrays (K, nq), MuJoCo's qpos at these times.
+      touching: S arrays (K, obstacles), whether MuJoCo detected a contact; empty arrays if contacts are not sensed.
+      stable: (K,) number of parts, from the first on, in which the simulation was stable.
     """
 
     states: list[Array]
@@ -43,20 +43,20 @@ class Period:
 
 
 class Physics:
-    """K simulations of a plant, in which the robot goes through the obstacles until it is told to run into them.
+    """K simulations of a plant. Robots pass through obstacles until `rerun_with_contacts` makes these solid for them.
 
-    Until then each is the same to the bit whether it will be told or not. Of a robot that can touch something at a
-    clearance above 0 the contacts are sensed, without a force. `prepare` must follow `place`.
+    Until then a simulation is bit-identical with and without later contacts. If the robot can touch something at a
+    clearance above 0, contacts are sensed without a force. `prepare` must follow `place`.
 
     Args:
-      substeps: physics steps of a control period.
-      contacts: whether any of them will be told to run into obstacles; without it, a quarter of the time is saved.
-      threads: by default as many as there are processors.
+      substeps: physics steps per control period.
+      contacts: whether obstacles may become solid; without, it takes a quarter less time.
+      threads: by default one per processor.
 
     Attributes:
       simulations: MuJoCo's. senses_contacts: whether contacts are sensed without a force.
-      parts: S, parts of a control period. drawn_parts: how many of them end with a frame to draw.
-      unstable: (K,) who blew up. solid: (K,) who runs into obstacles.
+      parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
+      unstable: (K,) whether a simulation has become unstable. solid: (K,) whether its obstacles are solid.
     """
 
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
@@ -66,7 +66,7 @@ class Physics:
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
         self._sensors = self.simulations.bind("sensordata") if sensing and plant.obstacles else None
         short = part_of(plant, substeps)
-        self._part = 1 if self.senses_contacts else short  # what is sensed, is sensed at each step
+        self._part = 1 if self.senses_contacts else short  # contacts are sensed at each step
         self.parts = substeps // self._part
         self._every = short // self._part
         self.drawn_parts = self.parts // self._every
@@ -81,16 +81,16 @@ class Physics:
         self._quaternions = _quaternions(plant)
 
     def place(self, states: Array) -> None:
-        """Put the robots where analytic states (K, n) say."""
+        """Put the robots into analytic states (K, n)."""
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
         self._act[:] = states[:, states.shape[1] - self._act.shape[1] :]
 
     def prepare(self, *, altered: bool) -> None:
-        """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
+        """Make obstacles passable, and update what depends on `altered` fields of the models."""
         model = self.simulations.model
         if altered:
-            # While obstacles are still such: MuJoCo works out here, too, which bodies can collide at all.
+            # While obstacles are still solid: MuJoCo also determines here which bodies can collide at all.
             self.simulations.set_const()
         geoms = np.array([model.geom(name).id for name in self.plant.obstacles], dtype=np.intp)
         if self.senses_contacts:
@@ -112,21 +112,21 @@ class Physics:
         values[:, ids] = change(values[:, ids])
 
     def frame(self) -> Array:
-        """MuJoCo's qpos now, (K, nq)."""
+        """MuJoCo's current qpos, (K, nq)."""
         return self._qpos.copy()
 
     def state(self) -> Array:
-        """The analytic states (K, n), angles in any representative."""
+        """The current analytic states (K, n), angles in any representative."""
         return self.plant.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel], self._act)
 
     def touching_now(self) -> npt.NDArray[np.bool_]:
-        """Who touches which obstacle now, (K, obstacles); of no use to simulations that go on."""
+        """Whether each robot touches each obstacle now, (K, obstacles). The simulations must not go on after it."""
         assert self._sensors is not None
         self.simulations.forward()
         return self._sensors[:, self.plant.contact] > 0
 
     def advance(self, controls: Array, wrench: Array) -> Period:
-        """One control period under controls (K, m), forces and torques (K, 6)."""
+        """Run one control period with controls (K, m), forces and torques (K, 6)."""
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
         if self._contacts:
@@ -134,9 +134,9 @@ class Physics:
         return self._run(None)
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
-        """Have the states jump by (K, n) at the end of a period, those of some trials or of all.
+        """Let the states of some or all trials jump by (K, n) at the end of a period.
 
-        What is no state, such as the wheels' angles or a small tilt, stays as it is.
+        Positions of MuJoCo that are not in the state, such as the wheels' angles or a small tilt, do not change.
         """
         which = np.arange(len(jumps)) if rows is None else rows
         states, robot = period.states[-1][which], self.plant.robot
@@ -152,7 +152,7 @@ class Physics:
         period.states[-1][which], period.frames[-1][which] = self.state()[which], self.frame()[which]
 
     def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
-        """From the period's start on, let these simulations run into the obstacles; replaces what it came to."""
+        """Make obstacles solid for these simulations, and repeat the period for them; replaces its result."""
         self.simulations.state[rows] = self._before[rows]
         self.simulations.warning[rows] = 0
         self.unstable[rows] = self._was_unstable[rows]
@@ -169,13 +169,13 @@ class Physics:
         period.stable[rows] = again.stable[rows]
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
-        """Who of those that run into obstacles touched one, (K,)."""
+        """Whether each trial with solid obstacles touched one, (K,)."""
         if not self.solid.any():
             return np.zeros(len(self.solid), dtype=bool)
         return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     def drawn(self, period: Period) -> list[Array]:
-        """Those of the frames that are needed for drawing."""
+        """The frames that are needed for drawing."""
         return period.frames[self._every - 1 :: self._every]
 
     def _run(self, rows: npt.NDArray[np.intp] | None) -> Period:
@@ -186,7 +186,7 @@ class Physics:
                 self.simulations.step(rows, nstep=self._part)
             except batch.SimulationError as error:
                 self.unstable[error.ids] = True
-            # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
+            # MuJoCo resets an unstable simulation and goes on; only its warnings show it.
             warned = self.simulations.warning[..., 1]
             if warned.any():
                 self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
@@ -202,7 +202,7 @@ class Physics:
 
 
 def _quaternions(plant: Plant) -> list[int]:
-    """Where quaternions begin in the robot's own qpos."""
+    """The indices at which quaternions begin in the robot's own qpos."""
     found, first = [], 0
     for name in plant.robot.joints:
         joint = plant.model.joint(name)
@@ -215,14 +215,14 @@ def _quaternions(plant: Plant) -> list[int]:
 
 
 def _turned(after: Array, before: Array, now: Array) -> Array:
-    """Quaternions (K, 4) turned by what leads from one to another, in the world's axes."""
+    """Quaternions `now` (K, 4), rotated by the rotation from `before` to `after`, in the world's axes."""
     back = before * np.array([1.0, -1.0, -1.0, -1.0])
     turned = _product(_product(after, back), now)
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Of quaternions (K, 4)."""
+    """The product of quaternions (K, 4)."""
     (w, x, y, z), (s, i, j, k) = a.T, b.T
     return np.stack(
         [w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i,
@@ -231,12 +231,12 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def part_of(plant: Plant, substeps: int) -> int:
-    """Physics steps of a frame: the longest equal parts of the control period that are short enough to draw."""
+    """Physics steps per frame: the longest equal parts of the control period that are at most FRAME_PERIOD long."""
     longest = min(substeps, int((FRAME_PERIOD + 1e-9) / plant.timestep))
     return max((part for part in range(1, longest + 1) if substeps % part == 0), default=1)
 
 
 def _span(indices: Indices) -> slice | Indices:
-    """The same place in an array; as a slice, which copies nothing, where they follow each other."""
+    """The indices as a slice, which copies nothing, if they are consecutive; else as they are."""
     first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices

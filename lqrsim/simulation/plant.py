@@ -1,4 +1,4 @@
-"""A robot in a scene: the MuJoCo model that is run, and where the robot is in it."""
+"""A robot in a scene: the MuJoCo model of both, and the places of the robot's states and actuators in it."""
 
 import copy
 import math
@@ -20,8 +20,8 @@ from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import ROW, World, signed_distance
 from lqrsim.simulation import plant_validation
 
-MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
-MOST_SUBSTEPS = 20_000  # physics steps in a control period; with more of them a run takes for ever
+MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
+MOST_SUBSTEPS = 20_000  # physics steps in a control period
 
 Indices = npt.NDArray[np.intp]
 
@@ -30,23 +30,23 @@ class Plant:
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot: whose dynamics and limits the plant has.
-      scene: whose MJCF is simulated, with its obstacles.
-      geoms: the robot's geoms that collide, where MuJoCo's distances are those that count; else None.
-      balls, places: the robot's balls, and where they are; None where it is one ball at its position.
-      world: the obstacles that bound the robot's geoms, its balls or its position; none without any.
-      obstacles: names of what the robot can collide with: those; without a position all that the MJCF lets it touch,
-        but level planes if a free joint, or a slide that is not level, lets the robot stand on them. For balls in space
-        it is the same.
+      robot: with the dynamics and the limits.
+      scene: with the MJCF and the obstacles.
+      geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
+      balls, places: the robot's balls and their centres; None if it is one ball at its position.
+      world: the obstacles for the robot's geoms, its balls or its position; none without any.
+      obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
+        balls in space, all that the MJCF lets it touch, except level planes on which a free joint, or a slide that is
+        not level, lets it stand.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body.
-      qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
-      contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
+      qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
+      contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: of the physics, in seconds.
 
     Raises:
-      InputError: there is no such robot in the scene: its body, a joint, an actuator or a wheel is missing; its maps to
-        MuJoCo's arrays do not fit them; or its position is not where MuJoCo has its body.
+      InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
+        do not fit these; or its position is not that of its body in MuJoCo.
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
@@ -55,7 +55,7 @@ class Plant:
         plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
         self.robot, self.scene = robot, scene
-        self._step: float | None = None  # s, in place of the MJCF's
+        self._step: float | None = None  # s, instead of the MJCF's
         self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
         self.geoms = geoms_in(robot, scene)
         self.world = World()
@@ -86,9 +86,9 @@ class Plant:
         return float(self.model.opt.timestep)
 
     def for_period(self, period: float) -> "Plant":
-        """The same plant with a physics step of which a control period is a multiple: the longest up to its own.
+        """The same plant with the longest physics step, up to its own, that divides a control period.
 
-        A plan whose duration was free has a period that no MJCF foresees.
+        A plan with a free duration has a period that the MJCF cannot know.
 
         Args:
           period: seconds, such as `solution.trajectory.dt`.
@@ -97,7 +97,7 @@ class Plant:
           A Plant.
 
         Raises:
-          InputError: the period is no time above 0.
+          InputError: the period is not positive.
         """
         period = check_number("control period", period, above=0.0)
         other = copy.copy(self)
@@ -136,27 +136,27 @@ class Plant:
 
     @cached_property
     def without_contacts(self) -> mujoco.MjModel:
-        """The same model, but that the robot goes through the obstacles, and nothing says whether it touches them."""
+        """The same model, but the robot passes through obstacles, and contacts are not sensed."""
         return self._compile(contacts=False)
 
     @cached_property
     def enclosed(self) -> bool:
-        """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius.
+        """Whether all parts of the robot that collide are within its radius, so that it touches nothing before.
 
-        Of balls and geoms it is not known.
+        For balls and geoms this is not known.
         """
         if self.balls is not None or self.geoms is not None:
             return not self.obstacles
         return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
-        """The analytic state (..., n) of the robot's `qpos`, `qvel` and the actuators' `act`; see `Robot.state`.
+        """The analytic state for the robot's `qpos` and `qvel` and the actuators' `act`; see `Robot.state`.
 
         Args:
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
           act: (..., na), activations of the actuators.
-          near: (..., n), to which angles are taken nearest; None for any representative.
+          near: (..., n), for angles in the nearest representative; None for any representative.
 
         Returns:
           (..., n).
@@ -167,14 +167,14 @@ class Plant:
         return np.concatenate([state, vectors_of("act", act, self.robot.activations)], axis=-1)
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
-        """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
+        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls the least of all.
 
-        Of balls it is the least of theirs; of geoms that of the nearest, by MuJoCo.
+        For geoms it is that of the nearest one, by MuJoCo.
 
         Args:
           states: (..., n).
-          displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial, along the world's axes;
-            states are then (K, k, n).
+          displaced: (K, obstacles, 3), displacements of the obstacles in each trial, along the world's axes; states are
+            then (K, k, n).
 
         Returns:
           (...), in metres.
@@ -192,13 +192,13 @@ class Plant:
 
     @property
     def radii(self) -> Array:
-        """Of the robot's balls in metres, (B,); of the one that it is without any; of geoms that of the largest."""
+        """Radii of the robot's balls in metres, (B,); the robot's radius without any; that of the largest geom."""
         if self.geoms is not None:
             return np.array([self.geoms.size])
         return np.array([self.robot.radius]) if self.balls is None else self.balls.radii
 
     def middles(self, states: Array) -> Array:
-        """The centres of the robot's balls, in the coordinates in which it sees the world; of geoms, the states.
+        """The centres of the robot's balls, in the coordinates of `world`; for geoms the states.
 
         Args:
           states: (..., n).
@@ -216,7 +216,7 @@ class Plant:
         """The clearance for given centres of the balls.
 
         Args:
-          middles: (..., B, 2 or 3), as of `middles`.
+          middles: (..., B, 2 or 3), as `middles` returns them.
           displaced: as in `clearance`.
 
         Returns:
@@ -282,7 +282,7 @@ class Plant:
         return found
 
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
-        """The places of the robot's balls along a plan and in runs, for pictures.
+        """The centres of the robot's balls along a plan and in runs, for pictures.
 
         Args:
           planned: states (T+1, n).
@@ -305,7 +305,7 @@ class Plant:
         )
 
     def across(self, vectors: Array) -> Array:
-        """Vectors along the axes of `world`, of vectors along those of the scene.
+        """Convert vectors from the axes of the scene to those of `world`.
 
         Args:
           vectors: (..., 3).
@@ -336,13 +336,13 @@ class Plant:
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         try:
             spec = mujoco.MjSpec.from_string(self.scene.xml)
-            # The sensors need names; geoms without one get the obstacle's. A geom's id is its place once compiled.
+            # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
             again = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
         if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
-            raise InputError(f"scene {self.scene.name}: got a model that is not of its xml, want one of load_scene")
+            raise InputError(f"scene {self.scene.name}: got a model that differs from its xml, want one of load_scene")
         if self._step is not None:
             spec.option.timestep = self._step
         geoms = {geom.id: geom for geom in spec.geoms}
@@ -370,16 +370,16 @@ class Plant:
 
 
 def extent(plant: Plant) -> float:
-    """How far from its position the robot can touch something, at most, in metres; a bound, and exact for balls.
+    """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
 
-    Seen from above if the robot is; else in space, whatever its plane. Parts that move count wherever they can get,
-    whatever their joints' limits.
+    From above for a robot that is seen from above; else in space, whatever its plane. Moving parts count in all places
+    that their joints allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
     space, rng = dynamics.state_coordinates, np.random.default_rng(0)
-    axes = [0, 1] if space.from_above else [0, 1, 2]  # of the world, along which distances are measured
+    axes = [0, 1] if space.from_above else [0, 1, 2]  # of the world, for distances
     off, states = 0.0, rng.standard_normal((9, len(space)))
-    states[-1] = 0.0  # the last, in which the geoms are looked at below
+    states[-1] = 0.0  # the last state, for the geoms below
     for state in states:
         data.qpos[plant.qpos], data.qvel[plant.qvel] = plant.robot.configuration(state)
         mujoco.mj_kinematics(model, data)
@@ -423,9 +423,9 @@ def geoms_in(robot: Robot, scene: Scene) -> CollisionGeoms | None:
 
 
 def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
-    """Names of the obstacles of a robot without a position: what it can touch, but the floor if it may stand on one.
+    """Names of the obstacles of a robot without a position: all that it can touch, except its floor.
 
-    It may if a joint lets it sink to level planes, which are its floor: a free one, or a slide that is not level.
+    Level planes are its floor if a joint lets it sink to them: a free joint, or a slide that is not level.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
@@ -443,7 +443,7 @@ def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
 
 
 def _can_be_touched(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether MuJoCo lets anything that moves collide with it, by the bits of both or as a pair."""
+    """Whether MuJoCo lets a moving geom collide with this one, by their contact bits or as a pair."""
     moves = model.body_weldid[model.geom_bodyid] != 0
     bits = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_conaffinity & model.geom_contype[geom])
     pairs = np.concatenate([model.pair_geom2[model.pair_geom1 == geom], model.pair_geom1[model.pair_geom2 == geom]])

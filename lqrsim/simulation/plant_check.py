@@ -1,4 +1,4 @@
-"""Whether MuJoCo moves a robot as its dynamics say."""
+"""A comparison of a robot's dynamics with its MJCF in MuJoCo."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -24,28 +24,28 @@ from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 
-MOST_STEPS = 1_000_000  # of the physics in a check, which makes them one by one
-SHOWN = 8  # pairs of geoms in contact that are printed
+MOST_STEPS = 1_000_000  # physics steps in a check, which runs them one by one
+PRINTED = 8  # pairs of geoms in contact
 
 
 @dataclass(frozen=True)
 class PlantCheck:
-    """How far MuJoCo moves a robot from where its dynamics say, over one control period.
+    """The differences between a robot's dynamics and MuJoCo over one control period.
 
     Attributes:
       names: of the states.
       units: of the states.
-      errors: (n,) the largest difference of each over the samples, in its unit.
-      changes: (n,) the largest change that the dynamics predict for it.
+      errors: (n,) the largest difference of each state over the samples, in its unit.
+      changes: (n,) the largest change of each state that the dynamics predict.
       period: in seconds.
-      state: (n,), where the worst state of all was furthest off.
-      control: (m,), there.
-      simulated: (n,), the change of the state in MuJoCo there.
-      predicted: (n,), the change by the dynamics there.
-      tolerance: what `relative` must not exceed.
-      samples: how many random states were compared.
-      contacts: pairs of geoms that touched, and in how many of the `samples`, most often first: contacts that were not
-        taken away, which the dynamics may know nothing of.
+      state: (n,), the sample with the largest error of the worst state.
+      control: (m,), of this sample.
+      simulated: (n,), the state after this sample in MuJoCo.
+      predicted: (n,), the state after this sample by the dynamics.
+      tolerance: largest allowed value of `relative`.
+      samples: number of random states.
+      contacts: pairs of geoms that touched, each with its number of samples, the most frequent first. The dynamics may
+        not know of these contacts.
     """
 
     names: tuple[str, ...]
@@ -84,12 +84,12 @@ class PlantCheck:
 
     @property
     def relative(self) -> Array:
-        """(n,) errors relative to the changes; where next to nothing changes, to the largest change of all."""
+        """(n,) errors relative to the changes, or to a thousandth of the largest change if that is more."""
         return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
 
     @property
     def worst(self) -> str:
-        """The name of the state that is furthest off, relative to its change."""
+        """The name of the state with the largest error relative to its change."""
         return self.names[int(np.argmax(self.relative))]
 
     @property
@@ -111,10 +111,10 @@ class PlantCheck:
             f" from x = {np.array2string(self.state, precision=3)}, u = {np.array2string(self.control, precision=3)}"
         )
         lines += [
-            f"touching in {count} of {self.samples} samples: {a} and {b}" for a, b, count in self.contacts[:SHOWN]
+            f"touching in {count} of {self.samples} samples: {a} and {b}" for a, b, count in self.contacts[:PRINTED]
         ]
-        if len(self.contacts) > SHOWN:
-            lines.append(f"and {len(self.contacts) - SHOWN} pairs of geoms more")
+        if len(self.contacts) > PRINTED:
+            lines.append(f"and {len(self.contacts) - PRINTED} more pairs of geoms")
         return "\n".join(lines)
 
 
@@ -131,25 +131,24 @@ def check_plant(
     tolerance: float = 0.02,
     seed: int = 0,
 ) -> PlantCheck:
-    """Compare a robot's dynamics with its MJCF: from random states, one control period of each.
+    """Compare a robot's dynamics with its MJCF over one control period, from random states.
 
-    A mass, a sign or a unit that differs shows in the states that it acts on. For it, what the robot can
-    collide with is taken away: `Plant.obstacles`, floors too. What stays is what runs do not count as an obstacle: the
-    floor that it stands on, or planes parallel to its own. Contacts with what stays, and of parts that move with each
-    other, are in the result, by the names of the geoms.
+    A different mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
+    What runs do not count as an obstacle stays: the floor that the robot stands on, or planes parallel to its own.
+    Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
-      robot: whose dynamics are compared.
+      robot: with the dynamics.
       scene: with the robot in its MJCF.
-      period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
-      around: (n,) the middle of the random states, zero by default.
-      spread: their standard deviation in each unit.
-      controls: lowest and highest random control (m,); by default the dynamics' limits.
-      settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
-        (those of wheels, say); by default 0.5 where MuJoCo has more of them than the dynamics have states, else 0.
-      samples: how many states.
-      tolerance: of an error, relative to the largest change of that state.
-      seed: of all.
+      period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
+      around: (n,) mean of the random states, zero by default.
+      spread: their standard deviation, in each state's unit.
+      controls: lowest and highest random control, (m,) each; by default the dynamics' limits.
+      settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as those of
+        wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
+      samples: number of random states.
+      tolerance: largest allowed error, relative to the largest change of the state.
+      seed: of all random numbers.
 
     Returns:
       The PlantCheck.
@@ -174,8 +173,8 @@ def check_plant(
     samples = check_count("samples", samples, at_most=100_000)
     if not samples * (waiting + substeps) <= MOST_STEPS:
         raise InputError(
-            f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
-            f" {MOST_STEPS}: fewer samples, or a shorter period and time to settle"
+            f"samples: got {samples}, which take {samples * (waiting + substeps):.3g} physics steps, want at most"
+            f" {MOST_STEPS}: fewer samples, or a shorter period or time to settle"
         )
     tolerance = check_number("tolerance", tolerance, above=0.0)
     found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
@@ -189,7 +188,7 @@ def check_plant(
 
 
 class _Sample(NamedTuple):
-    """One control period, from the state (n,) before it, under a control (m,): what comes of it, (n,)."""
+    """One control period: the state (n,) before it, the control (m,), and the states (n,) after it."""
 
     before: Array
     control: Array
@@ -198,7 +197,7 @@ class _Sample(NamedTuple):
 
 
 def _control_range(robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] | None) -> tuple[Array, Array]:
-    """The lowest and the highest control (m,); by default the dynamics' limits. Raises InputError."""
+    """The lowest and the highest control, (m,) each. Raises InputError unless they are finite and in order."""
     space = robot.dynamics.control_coordinates
     m = len(space)
     if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
@@ -216,7 +215,7 @@ def _control_range(robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] |
 def _sample(
     plant: Plant, data: mujoco.MjData, state: Array, control: Array, waiting: int, period: float
 ) -> tuple[_Sample, set[tuple[str, str]]]:
-    """One control period after so many physics steps of waiting, and which geoms touched in it. Raises InputError."""
+    """Run one control period after `waiting` physics steps. Returns it with the pairs of geoms that touched."""
     robot = plant.robot
     mujoco.mj_resetData(plant.model, data)
     data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
@@ -244,7 +243,7 @@ def _sample(
 def _worst_of(
     found: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
 ) -> PlantCheck:
-    """The check of all samples, with the one in which the worst state was furthest off."""
+    """The check of all samples, with the sample that has the largest error of the worst state."""
     errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in found])
     changes = np.array([np.abs(sample.predicted - sample.before) for sample in found])
     space, first = robot.dynamics.state_coordinates, found[0]
@@ -261,7 +260,7 @@ def _worst_of(
 
 
 def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:
-    """The pairs of geoms that touch, of which one is the robot's or of what it is attached to."""
+    """The pairs of touching geoms, one of which belongs to the robot's kinematic tree."""
     model = plant.model
     own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]
     pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
@@ -269,6 +268,6 @@ def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:
-    """The geom's name, or that of its body with its number, if it has none."""
+    """The geom's name; without one, its number and the name of its body."""
     body = model.body(int(model.geom_bodyid[geom])).name
     return model.geom(geom).name or f"geom {geom}" + (f" of {body}" if body else "")

@@ -1,4 +1,4 @@
-"""Whether a robot fits a scene: its names are there, its maps have MuJoCo's sizes, and it is where its states say."""
+"""Checks that a robot fits a scene: its names exist, its maps fit MuJoCo's arrays, and its position is its body's."""
 
 import itertools
 from typing import TYPE_CHECKING, Any
@@ -16,15 +16,15 @@ from lqrsim.scenes.world import PLANES, SPACE
 if TYPE_CHECKING:
     from lqrsim.simulation.plant import Plant
 
-OFF = 1e-4  # metres, or of a metre's move, by which the body may be elsewhere: less than six digits in an MJCF leave
-UNLIMITED = 1e9  # stands for an infinite limit of a control
-MIXED = 10  # of so many controls at most, all corners of their limits are looked at
+OFF = 1e-4  # allowed error of positions in m, and of moves by a metre; numbers in an MJCF have six digits
+UNLIMITED = 1e9  # used for an infinite limit of a control
+MIXED = 10  # largest number of controls for which all corners of the limits are checked
 
 
 def check_names(robot: Robot, scene: Scene) -> None:
-    """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
+    """Raise InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
 
-    Its radius and its drag must be numbers that are not negative, and its balls CollisionSpheres.
+    Its radius and its drag must not be negative, and its balls must be CollisionSpheres.
     """
     check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
@@ -58,7 +58,7 @@ def check_names(robot: Robot, scene: Scene) -> None:
 
 
 def _present(kind: str, names: list[str]) -> str:
-    """The names, and which of the elements have none and are in need of one."""
+    """A list of the names, and of the elements that have none, for a message."""
     named, unnamed = list(filter(None, names)), [str(number) for number, name in enumerate(names) if not name]
     if kind not in ("joint", "actuator") or not unnamed:
         return ", ".join(named) or "none"
@@ -67,7 +67,7 @@ def _present(kind: str, names: list[str]) -> str:
 
 
 def check_maps(plant: "Plant") -> None:
-    """Raises InputError unless the robot's maps have the sizes of its joints and actuators, and put it where it is."""
+    """Raise InputError unless the robot's maps fit its joints and actuators, and its position is that of its body."""
     robot = plant.robot
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
@@ -88,15 +88,15 @@ def check_maps(plant: "Plant") -> None:
 
 
 def _check_limits(plant: "Plant") -> None:
-    """Raises InputError if a control within its limits asks an actuator for what its ctrlrange cuts off.
+    """Raise InputError if a control within its limits gives a command that exceeds an actuator's ctrlrange.
 
-    MuJoCo would say nothing of it, and records of what was applied would not be true.
+    MuJoCo would clip it silently, and records of applied controls would be wrong.
     """
     robot, space, model = plant.robot, plant.robot.dynamics.control_coordinates, plant.model
     m = len(space)
     limits = np.array([space.low, space.high])
     finite = np.clip(limits, -UNLIMITED, UNLIMITED)
-    if m <= MIXED:  # every corner, for actuation may mix controls
+    if m <= MIXED:  # every corner, because actuation may mix controls
         which = np.array(list(itertools.product((0, 1), repeat=m)))
         corners = np.take_along_axis(finite, which, axis=0)
     else:
@@ -105,7 +105,7 @@ def _check_limits(plant: "Plant") -> None:
             corners[2 * k : 2 * k + 2, k] = finite[:, k]
     asked = np.asarray(robot.actuation(corners), dtype=np.float64)
     if asked.shape != (len(corners), len(plant.ctrl)):
-        return  # a map of one control only, which says so when it is run
+        return  # the map takes one control only; running it raises an error
     low, high = model.actuator_ctrlrange[plant.ctrl].T
     spare = 1e-9 * np.maximum(np.abs(low), np.abs(high))
     beyond = model.actuator_ctrllimited[plant.ctrl].astype(bool) & ~((asked >= low - spare) & (asked <= high + spare))
@@ -113,17 +113,14 @@ def _check_limits(plant: "Plant") -> None:
         row, k = (int(place) for place in np.argwhere(beyond)[0])
         given = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
         raise InputError(
-            f"robot {robot.name}: control_limits: got controls ({given}) within them, of which actuation() makes"
-            f" {asked[row, k]:g} for actuator {robot.actuators[k]!r}, want at most what its ctrlrange in the MJCF lets"
-            f" through, {low[k]:g} to {high[k]:g}"
+            f"robot {robot.name}: control_limits: got controls ({given}), for which actuation() commands"
+            f" {asked[row, k]:g} of actuator {robot.actuators[k]!r}, want its ctrlrange in the MJCF, {low[k]:g} to"
+            f" {high[k]:g}"
         )
 
 
 def _check_position(plant: "Plant") -> None:
-    """Raises InputError unless the body's origin is where the position is, and moves with it.
-
-    Whatever the joints are: it is MuJoCo's kinematics that say where the body goes.
-    """
+    """Raise InputError unless the body's origin is at the position, and moves with it, by MuJoCo's kinematics."""
     robot, space = plant.robot, plant.robot.dynamics.state_coordinates
     n, data = len(space), mujoco.MjData(plant.model)
 
@@ -132,7 +129,7 @@ def _check_position(plant: "Plant") -> None:
         mujoco.mj_kinematics(plant.model, data)
         return data.xpos[plant.body].copy()
 
-    # About a state in which nothing is zero, so that angles and the like are seen to turn what they turn.
+    # About a state without zeros, so that angles have an effect.
     middle = 0.1 + 0.01 * np.arange(n)
     moves = np.array([(body(middle + step) - body(middle - step)) / 2 for step in np.eye(n)[list(space.position)]])
     wanted = np.eye(3)[list(space.world_axes)]
@@ -145,7 +142,7 @@ def _check_position(plant: "Plant") -> None:
         there, said = body(state), space.in_world(place)
         off = there - said
         if space.from_above:
-            off[2] = 0.0  # it has no certain height
+            off[2] = 0.0  # its height is not known
         if np.abs(off).max() <= OFF:
             continue
         across = 3 - sum(space.world_axes) if len(names) == 2 else -1
@@ -161,7 +158,7 @@ def _check_position(plant: "Plant") -> None:
 
 
 def anchor_of(model: mujoco.MjModel, site: str) -> Array:
-    """The body that a site, or a geom, of that name is on, by its number, and where it is in the axes of that, (4,)."""
+    """The body id of a site or geom, and its position in the axes of that body, (4,)."""
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
     if number >= 0:
         return np.array([model.site_bodyid[number], *model.site_pos[number]])
@@ -170,7 +167,7 @@ def anchor_of(model: mujoco.MjModel, site: str) -> Array:
 
 
 def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
-    """Raises InputError unless each ball that names a site or a geom has its middle where MuJoCo has that."""
+    """Raise InputError unless the centre of each ball that names a site or a geom is there in MuJoCo."""
     robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
     who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
     names = [model.site(number).name for number in range(model.nsite)]
@@ -189,7 +186,7 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
             there = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
             off = there - centres[k]
             if plant.places is not None and plant.places.in_plane and robot.dynamics.state_coordinates.from_above:
-                off[2] = 0.0  # it has no certain height
+                off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 raise InputError(
                     f"{who}: got {balls.names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
@@ -198,20 +195,20 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
 
 
 def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:
-    """What moves the body where, and what would be right."""
+    """How each position state moves the body, and how to mend it."""
     exact = np.abs(np.round(moves) - moves).max() <= OFF
     rows = np.round(moves)
     directions = [_direction(row) for row in (rows if exact else moves)]
-    told = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
-    told = f"MuJoCo moves body {plant.robot.body!r} by a metre of {told}"
+    moved = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
+    found = f"MuJoCo moves body {plant.robot.body!r} by a metre of {moved}"
     if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():
         axes = "".join(SPACE[int(row.argmax())] for row in rows)
         if axes in PLANES:
-            return f"{told}; want plane={axes!r}"
+            return f"{found}; want plane={axes!r}"
         if sorted(axes) == sorted(SPACE):
             order = ", ".join(repr(names[axes.index(letter)]) for letter in SPACE)
-            return f"{told}; want position=({order})"
-    return f"{told}; want it to move by a metre along its own axis, and not otherwise: check joints and configuration()"
+            return f"{found}; want position=({order})"
+    return f"{found}; want each to move it by a metre along its own axis: check the joints and configuration()"
 
 
 def _of(space: Coordinates) -> str:

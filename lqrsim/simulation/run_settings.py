@@ -1,4 +1,4 @@
-"""What `simulate` is asked for, checked: the options, and whether controller, plan and plant belong together."""
+"""The options of `simulate`, checked, also whether controller, plan and plant fit together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -38,11 +38,11 @@ class RunSettings:
     """The arguments of `simulate`, and what follows from them.
 
     Attributes:
-      law: what controls, by default the plan's policy.
-      followed: the plan that the run is about: the given one, or else the controller's own.
-      states, controls: what the law's are; the controls within the robot's limits too.
-      radius: within which the goal counts as reached, in `Target.unit`.
-      substeps: physics steps of a control period.
+      law: the controller; by default the plan's policy.
+      followed: the plan of the run: the given one, or else the controller's own.
+      states, controls: coordinates of the controller, with limits that are within the robot's.
+      radius: distance from the goal within which it counts as reached, in `Target.unit`.
+      substeps: physics steps per control period.
 
     Raises:
       InputError: as `simulate` does.
@@ -72,15 +72,15 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         check_kind("plant", self.plant, Plant, "a Plant, such as scenario.plant()")
-        wanted = "disturbances, such as ControlNoise(0.05)"
-        self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
         self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
         self.trials, self.threads = check_count("trials", self.trials), check_threads(self.threads)
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
         wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
         check_function("generators", self.generators, wanted, arguments=2)
-        check_function("progress", self.progress, "a function of how many periods are done, of how many", arguments=2)
-        check_function("watch", self.watch, "a function of the time, MuJoCo's qpos and who is unstable", arguments=3)
+        wanted = "a function of the number of finished periods and of all"
+        check_function("progress", self.progress, wanted, arguments=2)
+        wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
+        check_function("watch", self.watch, wanted, arguments=3)
         self.law, self.followed = as_controller(self.controller, self.plan, self.plant.robot.dynamics)
         self.states, self.controls = _check_coordinates(self.law, self.plant)
         _check_plan(self.followed, self.plant)
@@ -91,22 +91,22 @@ class RunSettings:
 
     @property
     def trajectory(self) -> Trajectory:
-        """What is to be followed."""
+        """The plan's trajectory."""
         return self.followed.trajectory
 
     @property
     def numbers(self) -> range:
-        """The trials' numbers."""
+        """The numbers of the trials."""
         return range(self.first_trial, self.first_trial + self.trials)
 
     @property
     def random_streams(self) -> MakeGenerator:
-        """(trial, number of the disturbance) -> where its numbers come from."""
+        """(trial, number of the disturbance) -> its random generator."""
         return self.generators or seeded(self.seed)
 
 
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """What the controller's states and controls are. Raises InputError unless they are the plant's."""
+    """The coordinates of the controller's states and controls. Raises InputError unless they are the plant's."""
     dynamics = plant.robot.dynamics
     wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     kind = type(controller).__name__
@@ -127,14 +127,14 @@ def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinate
             f"controller: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
-    # A command that the robot cuts off is at a limit, whatever the policy took the limits to be.
+    # A command that the robot clips is at a limit, whatever limits the policy assumed.
     own = dynamics.control_coordinates
     low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
     return spaces[0], spaces[1].limited(low, high)
 
 
 def _check_plan(given: Plan, plant: Plant) -> None:
-    """Raises InputError unless the plan is finite, of the plant's states and controls."""
+    """Raise InputError unless the plan is finite, and has the plant's states and controls."""
     plan, dynamics = given.trajectory, plant.robot.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
@@ -145,10 +145,10 @@ def _check_plan(given: Plan, plant: Plant) -> None:
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
-    """Raises InputError for a run that would not end, or does not fit into memory."""
+    """Raise InputError for a run that takes too many physics steps or too much memory."""
     if plan.steps * substeps > MOST_STEPS:
         raise InputError(
-            f"plan: got one of {plan.steps} control periods of {plan.dt:g} s, which are {plan.steps * substeps}"
+            f"plan: got one with {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
             f" physics steps, want at most {MOST_STEPS}"
         )
     n, m = plan.states.shape[1], plan.controls.shape[1]
@@ -158,7 +158,7 @@ def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, f
 
 
 def _place(space: Coordinates) -> str:
-    """What the position is, for a message."""
+    """The position states and the plane, for a message."""
     names = ", ".join(space.names[index] for index in space.position) or "of no states"
     plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
     return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")

@@ -1,27 +1,33 @@
-"""From disturbances, as `simulate` takes them, to what filters, tracking laws and tubes are made of."""
+"""Disturbances as filters, tracking laws and predicted tubes take them: as numbers."""
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from lqrsim.control.controllers import ControllerLike
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty, gathered
-from lqrsim.errors import check_kind
+from lqrsim.errors import InputError, check_kind
 from lqrsim.problem.noise import Noise
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Solution
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.plant import Plant
 
 
 def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) -> Uncertainty:
-    """What disturbances are to a plan, in numbers: zero-mean and Gaussian, or left out by name.
+    """Convert disturbances to zero-mean Gaussian uncertainty; those that do not fit are left out by name.
 
-    What is stated as fixed (`MeanWind`, a mismatch's `factor`) counts as unknown, with its size as the standard
-    deviation. What is drawn from a normal distribution that is cut counts with the standard deviation of what is left.
-    Losses in bursts count as if each were on its own, and obstacles as displaced by the same along all axes. What
-    nothing stands for is in `left_out`, with the reason: what the robot's dynamics do not declare, and what is not
-    small, not lasting or not linear, as a push, narrower limits or the loss of an actuator.
+    A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation. A
+    truncated normal distribution counts with its own standard deviation. Losses in bursts count as independent ones,
+    and displaced obstacles as displaced by the same along all axes. `left_out` has, with the reasons, what the robot's
+    dynamics do not declare, and what is not small, lasting and linear: pushes, narrower limits, the loss of an
+    actuator.
 
     Args:
       plant: what is run.
-      disturbances: as in `simulate`; those of one's own have a method `uncertainty`.
+      disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
 
     Returns:
       The Uncertainty.
@@ -38,3 +44,36 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     total = gathered(parts)
     total.check(plant.robot.dynamics)
     return total
+
+
+def tube_under(
+    problem: Problem,
+    solution: Solution,
+    plant: Plant,
+    disturbances: Sequence[Disturbance],
+    controller: ControllerLike | None = None,
+) -> tuple[Tube | None, str]:
+    """Predict the tube of a run if possible. Returns it with a line that says what it leaves out, or why there is none.
+
+    Without disturbances there is neither a tube nor a line.
+
+    Args:
+      problem: that was solved. solution: its solution. plant, disturbances, controller: as in `simulate`.
+    """
+    if not disturbances:
+        return None, ""
+    try:
+        uncertainty = uncertainty_of(plant, disturbances)
+        if not problem.dynamics.state_coordinates.position:
+            raise InputError("the robot has no position")
+        # The filter has the states of the disturbances for which it was designed, and no others.
+        if isinstance(controller, OffsetFree) and repr(controller.uncertainty) != repr(uncertainty):
+            raise InputError("the controller was designed for other disturbances")
+        with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop overflows; it is refused below
+            tube = predict_tube(problem, solution, uncertainty, controller)
+        if not np.isfinite(tube.covariance).all():
+            raise InputError("the loop is not stable, its covariance is not finite")
+    except InputError as error:
+        return None, f"no predicted tube: {error}"
+    left_out = uncertainty.left_out
+    return tube, f"the predicted tube leaves out {'; '.join(left_out)}" if left_out else ""

@@ -1,13 +1,13 @@
-"""Newton steps with constraints to an optimum that is near, as that of a problem that was solved a moment ago.
+"""Newton steps with an active set, to a constrained optimum nearby, such as that of a problem solved a moment ago.
 
-Each step goes to the optimum of the quadratic problem that models of second order make about the plan, with linearised
-dynamics and constraints; gaps between the steps of the plan are closed on the way. The interior point would find it
-from inside; here the rows that press are known but for a few, and are held at zero. Pivoting finds the others: rows
-that pull are let go and rows that are missed are held, of neighbouring steps only the worst, for what holds one holds
-them all. Where that does not bring fewer wrong ones, they change one at a time, which ends if the models are convex.
+Each step solves the quadratic problem of second-order models about the plan, with linearised dynamics and constraints;
+gaps between the steps of the plan close on the way. Most active rows are known from the last solve, and are held at
+zero. Pivoting finds the others: rows with a multiplier of the wrong sign are released, and violated rows are held, of
+neighbouring steps only the worst, since holding one usually keeps them all. Where the number of wrong rows does not
+fall, they change one at a time, which terminates for convex models.
 
-Models of second order have a minimum only where the right rows are held. So which these are is first asked of convex
-models, where those that pressed before do not do; the step itself is of second order as far as that has a minimum.
+Second-order models have a minimum only with the right rows held. Where the known rows do not suffice, convex models
+choose the rows first; the step itself uses as much of the second order as leaves a minimum.
 """
 
 import time
@@ -21,26 +21,26 @@ from lqrsim.kernels.records import Motion
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
 from lqrsim.solvers.settings import INSIDE
 
-STEPS = 12  # at most: what takes more does not get there
-PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be
-PATIENCE = 3  # pivots that do not bring fewer wrong rows, before they change one at a time
-SHARES = (0.0, 0.3)  # of the convex models in those of a step, tried in turn
-PENALTY = 8.0  # that holds the policy to the constraints, in cost for a change by a row's size
+STEPS = 12  # at most: a solve that needs more does not converge
+PIVOTS, FEW = 15, 4  # most pivots of a convex problem, and of one that need not be convex
+PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
+SHARES = (0.0, 0.3)  # fractions of the convex models in a step, tried in turn
+PENALTY = 8.0  # penalty that makes the policy keep the constraints, in cost per squared row size
 
 
 class ActiveSet:
-    """The steps from one plan.
+    """Steps from one plan.
 
     Args:
       stages: of the problem.
-      plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion; the first state is the start.
+      plan: states (T+1, n) and controls (T, m), not necessarily a motion; the first state is the start.
       multipliers: of the constraints, (T+1, rows) each, or none.
-      violation: by how much equalities may be missed; a share of that is what inequalities are to have to spare.
+      violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
-      plan: where the steps have come to. measures: of that. force, held: (T+1, R) the rows' multipliers, and 1 for
-        those that are held at zero, else 0. sizes: by how much things change. hopeless: whether it is an optimum but
-        for rows that no multiplier brings to be kept. looking: how long models of a plan took, in s.
+      plan: the current plan. measures: of that. force, held: (T+1, R) the rows' multipliers, and 1 for rows held at
+        zero, else 0. sizes: typical sizes. hopeless: whether the plan is stationary but violates rows that no
+        multiplier corrects. looking: seconds that the models of a plan took.
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
@@ -69,13 +69,12 @@ class ActiveSet:
         self._measure(cost)
 
     def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
-        """Go on until the measures are within tolerance; whether they are.
+        """Take steps until the measures are within tolerance; return whether they are.
 
         Args:
           tolerance: of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
-          late: called with so many seconds before what takes about that long, in a step; True ends it where the plan
-            was before that step.
+          late: called with a duration in seconds before work that takes about that long; True abandons the step.
         """
         self._late = late
         ended = False
@@ -84,16 +83,16 @@ class ActiveSet:
             if self._within(tolerance) or ended or not self._step():
                 break
             ended = watch(self.measures) or not np.isfinite(self.measures.cost)
-            # Where all else is right, what is still missed cannot be kept.
+            # If everything else is within tolerance, a remaining violation cannot be removed.
             idle = max(before.stationarity, before.gap) < tolerance
             self.hopeless = idle and self.measures.violation > 0.5 * before.violation > self._violation
             ended = ended or self.hopeless
         return self._within(tolerance)
 
     def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
-        """The motion that the plan comes to with gains about it (T, m, n); these; its cost; the constraints' numbers.
+        """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values.
 
-        The gains are those of a step with a price on missing the rows that press, and zero at limits.
+        The gains are those of a step with a penalty on the active rows, and zero at limits.
         """
         stages = self.stages
         for share in MIXES:
@@ -106,14 +105,14 @@ class ActiveSet:
         return plan, gain, cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
-        """Of each constraint the multipliers (T+1, rows), and the price that the policy has."""
+        """Multipliers (T+1, rows) and penalty of each constraint."""
         owners = self.stages.owners
         sizes = [self.sizes.rows[owners == k] for k in range(len(self.stages.problem.constraint_terms))]
         prices = [PENALTY * self._scale / float(np.median(size**2)) if len(size) else 1.0 for size in sizes]
         return [(self.force[:, owners == k].copy(), price) for k, price in enumerate(prices)]
 
     def _measure(self, cost: float) -> None:
-        """Work out the measures of a plan about which the models are."""
+        """Compute the measures of the plan that the models are about."""
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
         steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._gaps, self.sizes)
         self._kept = missed <= 0 and unequal <= self._violation
@@ -124,11 +123,11 @@ class ActiveSet:
 
     def _within(self, tolerance: float) -> bool:
         found = self.measures
-        # What leads from the plan to a motion must not take constraints beyond what they have to spare.
+        # The rollout of the plan must not use up the margin of the constraints.
         return self._kept and max(found.stationarity, found.gap / INSIDE, found.complementarity) < tolerance
 
     def _step(self) -> bool:
-        """One step; False where there is none."""
+        """Take a step; return False if there is none."""
         before = self.held.copy()
         if (self._pivoted(0.0, 0) != 0 and not self._from_convex()) or self._due():
             self.held[...] = before
@@ -145,11 +144,11 @@ class ActiveSet:
         return True
 
     def _due(self) -> bool:
-        """Whether a pivot and models of a plan would be there too late, with as much to spare as the models take."""
+        """Whether a pivot and new models would end too late, with the time of another such pair to spare."""
         return self._late(2 * self.looking)
 
     def _from_convex(self) -> bool:
-        """A step with the rows that press in the convex models, or some others; whether there is one."""
+        """Find a step with the active rows of the convex models, or nearly these; return whether there is one."""
         if self._pivoted(1.0, PIVOTS) is None:
             return False
         convex = self.held.copy()
@@ -163,12 +162,12 @@ class ActiveSet:
         return False
 
     def _pivoted(self, share: float, most: int) -> int | None:
-        """Solve the quadratic problem by so many pivots at most, from the rows that are held.
+        """Solve the quadratic problem by at most `most` pivots from the held rows.
 
         The change of the plan is in `stages`.
 
         Returns:
-          How many of the rows are wrong; None without a minimum.
+          The number of wrong rows; None if there is no minimum.
         """
         fewest, patience = self.held.size + 1, PATIENCE
         for pivot in range(most + 1):
@@ -184,7 +183,7 @@ class ActiveSet:
         return None
 
     def _solve(self, share: float, price: float = 1.0) -> tuple[bool, int]:
-        """Solve it with the rows that are held; whether there is a minimum, and how many rows are wrong."""
+        """Solve the problem with the held rows; return whether there is a minimum, and the number of wrong rows."""
         if share > 0 and not self._convex:
             self.stages.convexify(self.plan)
             self._convex = True

@@ -183,6 +183,8 @@ def refine(run: SolveRun) -> RunResult:
     if not run.problem.constraints:
         run.work.memory["merit"] = cost
         damped = run.damped()
+        if run.second_order and damped.success and not run.budget.over:  # damped ones do not come to all digits
+            return run.certified(run.newton())
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
     lagrangian.evaluate(*run.work.plan)

@@ -77,7 +77,7 @@ def _parts(value: Quadratic) -> tuple[Array, Array, Array]:
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
     """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
-    cost, scale, motion, law, limits, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
+    cost, scale, motion, law, beyond, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
         start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
@@ -85,7 +85,7 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
         decrease = np.inf
     optimality = decrease / max(abs(cost), 1e-26 * scale, 1e-300) if np.isfinite(decrease) else np.inf
     return Certificate(
-        cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(limits, 0.0),
+        cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
         violation=violation, optimality=optimality,
     )  # fmt: skip
 

@@ -17,15 +17,12 @@ from lqrsim.codegen.user_functions import address_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
-    ball_constraint,
     cost_to_come_dual,
     cost_to_come_primal,
     entry_points,
-    linear_quadratic_passes,
     model_functions,
     projection,
 )
-from lqrsim.kernels import noise as noise_kernel
 from lqrsim.kernels.records import (
     Constraints,
     CostModel,
@@ -55,19 +52,19 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
     sizes = _sizes(problem.dynamics)
     what = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
     what += "" if form == "dual" else f", {form} form"
-    return module_of(_with_form(form, "entry_points"), what, **sizes, NOISY=int(noisy))
+    return module_of(with_form(form), what, **sizes, NOISY=int(noisy))
 
 
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
-    """The compiled passes for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
+    """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/entry_points.py`."""
     what = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(_with_form(form, "linear_quadratic_passes"), what, N=n, M=m, W=n + m, NOISY=0)
+    return module_of(with_form(form), what, N=n, M=m, W=n + m, NOISY=0)
 
 
 @functools.cache
-def _with_form(form: str, which: str) -> Source:
-    module = {"entry_points": entry_points, "linear_quadratic_passes": linear_quadratic_passes}[which]
-    return source_of(module).filled(**dict.fromkeys(_OF_FORM, source_of(FORMS[form])))
+def with_form(form: str) -> Source:
+    """The entry points with a form of the cost-to-come."""
+    return source_of(entry_points).filled(**dict.fromkeys(_OF_FORM, source_of(FORMS[form])))
 
 
 def _sizes(dynamics: Dynamics) -> dict[str, int]:
@@ -80,7 +77,7 @@ def structure(problem: Problem) -> tuple[Any, ...]:
     costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
     constraints = tuple((one.code, one.uses_control, one.equality, one.shared) for one in problem.constraint_terms)
     term = problem.noise_term
-    noise = None if term is None else (term.source, tuple(term.filled.items()))
+    noise = None if term is None else term.code
     return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
 
 
@@ -149,7 +146,7 @@ def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], si
     support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     project = 0.0
     if support:
-        source = source_of(projection, SUPPORT=support, K=len(support))
+        source = source_of(projection, SUPPORT=support)
         (project,) = module_of(source, "the projection of a cost", **dict(sizes)).addresses("project")
     return np.array(rows, dtype=np.float64).reshape(-1, 2), project
 
@@ -160,19 +157,17 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
     rows = []
     for code, shared, equality, uses_control in constraints:
         pairs = {"constraint_value": (code, "value"), "constraint_slope": (code, "slope")}
-        source = source_of(augmented_lagrangian)
+        source = source_of(augmented_lagrangian, SHARED=shared)
         if shared:
-            source = source_of(ball_constraint, PLACES=shared)
             pairs |= {name: (code, name) for name in ("places", "places_jacobian")}
         module = module_of(source.filled(**pairs), f"a constraint: {code.what}", **dict(sizes), EQUALITY=int(equality))
         found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
-        rows.append([*found, 0.0, float(uses_control)])
-    return np.array(rows, dtype=np.float64).reshape(-1, 6)
+        rows.append([*found, float(uses_control)])
+    return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
 
 def _noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
-    source = source_of(noise_kernel, **term.filled).filled(noise_values=term.source, noise_slopes=term.source)
-    return module_of(source, "noise", **_sizes(problem.dynamics))
+    return module_of(term.code, "noise", **_sizes(problem.dynamics))
 
 
 def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:

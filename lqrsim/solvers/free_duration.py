@@ -1,8 +1,8 @@
-"""A final time that is free: the duration as one more state, which no control changes and whose start is free.
+"""A free final time: the duration is one more state, constant along the plan, with a free initial value.
 
-Over a duration other than the stated one the same steps take longer or shorter: the dynamics are scaled by the share,
-so that a Runge-Kutta step over `dt` is one over `share * dt`. The interior point finds states, controls and duration at
-once. With the duration that it comes to the problem is an ordinary one, about whose optimum the plan already is.
+The number of steps is fixed and their length varies: the dynamics are scaled by duration / stated duration, so that a
+Runge-Kutta step over `dt` becomes one over `share * dt`. The interior point finds states, controls and duration at
+once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
 """
 
 import copy
@@ -23,7 +23,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
 
-STATE, STATED = "duration", "stated_duration"  # the state that is added, and the parameter that it is relative to
+STATE, STATED = "duration", "stated_duration"  # the added state, and the parameter that it is relative to
 MOST = 300  # iterations
 
 Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
@@ -32,10 +32,10 @@ Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
 def find_duration(
     problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, watch: Callable[[Measures], bool]
 ) -> tuple[Problem, Found] | None:
-    """The problem with the best duration near a plan of the stated one, and what there is to know about its optimum.
+    """Find the best duration near that of a plan. Return the problem with it, and the optimum; None if none was found.
 
-    None where none was found. `violation` is by how much constraints may be missed; `watch` is called with the measures
-    after each iteration, and True ends it.
+    `violation` is the tolerance of the constraints; `watch` is called with the measures after each iteration, and ends
+    the search by returning True.
     """
     assert problem.duration is not None
     freed, n = with_duration(problem), len(problem.dynamics.state_coordinates)
@@ -48,7 +48,7 @@ def find_duration(
         found = point.run(tolerance=tolerance, violation=violation, most=MOST, watch=watch)
     if not found.solved:
         return None
-    # Of all that belongs to the duration nothing is left.
+    # Remove everything that belongs to the duration.
     rows = found.row_size[stages.owners != len(problem.constraint_terms)]
     found = dataclasses.replace(
         found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
@@ -59,7 +59,7 @@ def find_duration(
 
 
 def settled(problem: Problem, duration: float) -> Problem:
-    """The problem with that duration, in s, which is no longer free."""
+    """The problem with a fixed duration, in seconds."""
     return dataclasses.replace(problem, dt=duration / problem.steps, duration=None, time_weight=0.0)
 
 
@@ -67,7 +67,7 @@ def with_duration(problem: Problem) -> Problem:
     """The problem with its duration as the last state.
 
     Raises:
-      InputError: a part of it cannot be stated with one more state.
+      InputError: a part of the problem cannot be stated with one more state.
     """
     assert problem.duration is not None
     dynamics, n = problem.dynamics, len(problem.dynamics.state_coordinates)
@@ -92,7 +92,7 @@ def with_duration(problem: Problem) -> Problem:
 
 
 def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
-    """The dynamics with the duration for a last state; at the stated one they are what they were."""
+    """The dynamics with the duration as last state; at the stated duration they are unchanged."""
     space, controls, n = dynamics.state_coordinates, dynamics.control_coordinates, len(dynamics.state_coordinates)
     names = space.names
 
@@ -112,7 +112,7 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
 
 
 def _longer_cost(cost: Cost, n: int) -> Cost:
-    """A cost of n states for one more, on which it does not depend."""
+    """A cost of n states as a cost of n + 1, independent of the last."""
     if isinstance(cost, QuadraticCost):
         return QuadraticCost(np.pad(cost.weight, (0, 1)), about=np.append(cost.about, 0.0))
     if isinstance(cost, SymbolicCost):
@@ -126,7 +126,7 @@ def _longer_cost(cost: Cost, n: int) -> Cost:
 
 
 def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
-    """The same for a constraint."""
+    """A constraint of n states as a constraint of n + 1, independent of the last."""
     names = dynamics.state_coordinates.names
     if isinstance(constraint, GoalState):
         return GoalState(constraint.goal, states=names if constraint.states is None else constraint.states)
@@ -141,7 +141,7 @@ def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
 
 
 def _of_fewer(stated: Stated, n: int) -> Stated:
-    """What is stated as a formula of n states, of more of them."""
+    """A formula of n states as a formula of more."""
     other, function = copy.copy(stated), stated.function
     other.function = lambda x, u, p: function(x[:n], u, p)
     return other

@@ -1,9 +1,9 @@
-"""Evidence that constraints cannot be kept, at least not near a plan: no change lessens what is missed.
+"""Evidence that constraints are infeasible near a plan: the violation is stationary.
 
-What is missed in all, each row relative to its size, has a slope in the controls. It is worked out here from the
-problem's own functions, on a path that the solvers do not use. Rows that are just kept hold against it with a share of
-their own, from 0 to 1, which the interior point comes to where constraints may be missed at a price; controls at their
-limits hold by themselves. Where all of it cancels, the plan is the best near it that can be had.
+The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the
+problem's own functions, on a code path that the solvers do not use. Rows that are just kept balance it with multipliers
+from 0 to 1, which the restoration finds; controls at their limits balance it by themselves. Where everything cancels,
+no plan nearby violates the constraints less.
 """
 
 from dataclasses import dataclass
@@ -14,36 +14,42 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers.engine import Workspace
 
-STATIONARY = 5e-3  # slope that may be left, relative to what cancels
-AT_LIMIT = 1e-4  # of a control's range, which a barrier may have left, and which could lessen nothing that matters
-NAMED = 3  # constraints at most that a message names
+STATIONARY = 5e-3  # largest remaining gradient, relative to what cancels
+AT_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
+NAMED = 3  # most constraints that a message names beside the one that is violated most
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of a plan about which what is missed is stationary.
+    """A plan whose violation is stationary.
 
     Attributes:
-      states: (T+1, n). controls: (T, m). left: the slope that is left, relative to what cancels. missed: in all.
-      against: what stands against what is missed, in words.
+      states: (T+1, n). controls: (T, m). left: the remaining gradient, relative to what
+        cancels. missed: the total violation.
+      against: the other constraints that conflict, in words, the strongest first.
     """
 
     states: Array
     controls: Array
     left: float
     missed: float
-    against: str
+    against: tuple[str, ...]
+
+    def beside(self, worst: str) -> str:
+        """The conflicting constraints other than the one that a message begins with, in words."""
+        return ", ".join([name for name in self.against if not worst.startswith(name.split(" at ")[0])][:NAMED])
 
 
 def evidence(
     problem: Problem, work: Workspace, states: Array, controls: Array, *, shares: list[Array], sizes: list[Array],
     allowed: float, control_size: Array, state_size: Array,
 ) -> Evidence | None:  # fmt: skip
-    """The evidence that a plan is, or None.
+    """Return the evidence that a plan provides, or None.
 
     Args:
-      shares: of each constraint (T+1, rows), from -1 to 1. sizes: of each (rows,) by how much its rows change.
-      allowed: how much may be missed. control_size, state_size: by how much these change.
+      shares: multipliers of each constraint relative to the price, (T+1, rows), from -1 to 1.
+      sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
+      control_size, state_size: typical sizes of controls and states.
     """
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     slopes, alone, missed = np.zeros((steps + 1, n + m)), np.zeros((steps + 1, n + m)), 0.0
@@ -61,10 +67,13 @@ def evidence(
             if short[t, row] > allowed:
                 alone[t] -= slope
                 missed += float(short[t, row] / sizes[k][row])
-        shown = np.where(short > allowed, 0.0, np.abs(weights))
-        if shown.size and shown.max() > 1e-2:
-            t, row = np.unravel_index(shown.argmax(), shown.shape)
-            holding.append((float(shown.max()), f"{term.describe(int(row))} at {t * problem.dt:.2f} s"))
+        for row in range(term.rows):
+            beyond = float(short[:, row].max())
+            share = 1 + beyond / sizes[k][row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
+            if share > 1e-2:
+                t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
+                told = f", missed by {beyond:.2g}" if beyond > allowed else ""
+                holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{told}"))
     if not missed > 0:
         return None
     space = problem.control_coordinates
@@ -94,5 +103,4 @@ def evidence(
         holding += [
             (float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size
         ]
-    against = [name for _, name in sorted(holding, reverse=True)[:NAMED]]
-    return Evidence(states, controls, left, missed, ", ".join(against))
+    return Evidence(states, controls, left, missed, tuple(name for _, name in sorted(holding, reverse=True)))

@@ -2,8 +2,10 @@
 
 Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
 the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
-falls by Mehrotra's rule where the last step was long. A filter decides how much of a step is taken (Waechter and
-Biegler, 2006). Where a model has no minimum, the Hessian is mixed with that of the projected cost until it has.
+falls by Mehrotra's rule where the last step was long and the measures come down, and otherwise when its own problem is
+nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); what a long step leaves open
+is then closed by corrections with the same models. Where a model has no minimum, the Hessian is mixed with that of the
+projected cost until it has.
 
 A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
 between a lowest and a highest one, `d = s - p` has two slacks: s, whose product with y - lowest is the barrier's
@@ -28,38 +30,40 @@ from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
 from lqrsim.solvers.settings import INSIDE
 
-INTERIOR = "interior point"  # what its iterations are called
-MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
-WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
+INTERIOR = "interior point"  # name of its iterations in the log
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # fractions of the projected Hessian, tried in turn
+WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, relative to the cost, if not even that has a minimum
 REGULARISATION = 1e-8  # of equalities, relative
-# Of rows that press, in the first step at the end. Where a row couples controls, what is across it must not look like
-# rounding beside its weight, of which the kernel takes a share of 1e-9 for nothing.
+# Regularisation of active rows in the first step without a barrier. Where a row couples controls, curvature across it
+# must exceed 1e-9 of its weight, below which the kernel takes it for rounding.
 CROSSING = 1e-6
-LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
-BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
-NOTHING = 1e-4  # of what it typically costs to change all, a cost that is as good as none
-SHORTEST = 1e-7  # part of a step
-MARGIN = 1e-5  # by which a filter wants something to be better
-ARMIJO = 1e-4  # of what a step promises, what there has to be of it
-FORCED = 6  # steps that are taken though no part of them is better
-WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
-CROSSINGS = 8  # steps without a barrier, at the end
-FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
-AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
-CREEP, CREEPING = 0.1, 20  # the part of a step that is short; and how many of them in a row lead nowhere
-STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step below which equalities are softer, by how much, and at most
-ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that no plan can pay
-FARTHEST = 10.0  # times what the first plan misses, what others may; of gaps and rows at least 1/20 a step
-EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
+LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
+LATELY = 4  # iterations with that rule, than the worst of which the measures must be better for it to go on
+CLOSINGS, CLOSER = 3, 0.3  # corrections after a long step at most, and what each must leave of what was missed
+BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
+NOTHING = 1e-4  # relative to the typical cost of a change, a cost that counts as zero
+SHORTEST = 1e-7  # part of a step before the line search gives up
+MARGIN = 1e-5  # improvement that the filter requires
+ARMIJO = 1e-4  # part of the promised decrease that a step must achieve
+FORCED = 6  # most steps that are taken although the filter rejects them
+WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
+CROSSINGS = 8  # most steps without a barrier, at the end
+FINER, FINEST = 1e-2, 1e-13  # factor by which the tolerance falls if these fail, and its least value
+AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
+CREEP, CREEPING = 0.1, 20  # part of a step that is short, and number of short ones in a row that end the run
+STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step that softens equalities, the factor, and its limit
+ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
+FARTHEST = 10.0  # largest violation relative to the first plan's
+EDGE = 0.05  # distance of the first controls from their limits, relative to the range
 
 
 class Measures(NamedTuple):
-    """How far a plan is from an optimum.
+    """Residuals of a plan.
 
     Attributes:
-      cost: of it. stationarity: the largest slope of the Lagrangian in a control, times the control's range, relative
-        to the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
-        the states' ranges. complementarity: the largest product of a multiplier and what is left to spare, relative to
+      cost: of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative to
+        the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
+        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to
         the cost.
     """
 
@@ -71,7 +75,7 @@ class Measures(NamedTuple):
 
 
 def iteration_of(measures: Measures, before: float, seconds: float) -> Iteration:
-    """A line of the log, after one whose cost was `before`."""
+    """The log entry of measures; `before` is the cost of the previous entry."""
     return Iteration(
         measures.cost, (before - measures.cost) / max(abs(measures.cost), 1e-300), measures.gap,
         max(measures.stationarity, measures.complementarity), measures.gap, measures.violation, seconds, INTERIOR,
@@ -80,13 +84,14 @@ def iteration_of(measures: Measures, before: float, seconds: float) -> Iteration
 
 @dataclass(kw_only=True)
 class Found:
-    """What it came to.
+    """Result of a run.
 
     Attributes:
       plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
       multipliers: of each constraint (T+1, rows); of the limits (T, m), positive where a control presses against the
         upper one. solved: whether all measures are within tolerance. iterations: how many there were.
-      control_size, row_size: by how much controls (m,) and rows (R,) change. scale: the cost that is relative to.
+      control_size, row_size: typical sizes of controls (m,) and rows (R,). scale: the cost that measures are relative
+        to.
     """
 
     plan: Motion
@@ -102,7 +107,7 @@ class Found:
 
 
 class Sizes(NamedTuple):
-    """By how much things change: states (n,), controls (m,), the rows where these do (R,); and what that costs."""
+    """Typical sizes of states (n,), controls (m,) and constraint rows (R,), and of the cost of such changes."""
 
     states: Array
     controls: Array
@@ -111,7 +116,7 @@ class Sizes(NamedTuple):
 
 
 class Stages:
-    """A problem as the iterations see it: models of its stages, and all constraints and limits as rows.
+    """The stages of a problem: their models, with all constraints and control limits as rows.
 
     Attributes:
       live: (T+1, R) which rows act at which step. equality: (R,) which are to be zero. owners: (R,) the constraint that
@@ -149,7 +154,7 @@ class Stages:
         self.changes = Motion(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
     def _take(self, problem: Problem) -> None:
-        """Take a problem's numbers, and which of its rows can act."""
+        """Read a problem's numbers, and which of its rows can act."""
         self.problem, self.steps = problem, problem.steps
         fixed, steps = isinstance(problem.initial, FixedState), problem.steps
         self.free, self._soft = np.full(self.n, 0.0 if fixed else 1.0), 0 if fixed else 1
@@ -173,7 +178,7 @@ class Stages:
         self.live[steps, self.owners == -1] = False
 
     def renewed(self, problem: Problem) -> "Stages":
-        """Those of a problem of the same structure, in the memory of these if it has as many steps and rows."""
+        """The stages of another problem of the same structure, in this memory if sizes allow."""
         owners, limits, steps = self.owners, [one[:2] for one in self.limits], self.steps
         self._take(problem)
         same = steps == self.steps and np.array_equal(owners, self.owners)
@@ -183,14 +188,14 @@ class Stages:
         return self
 
     def _call(self, name: str, *arguments: Any, module: CompiledModule | None = None) -> Any:
-        """Call a compiled function; what is the same as the last time is not laid out again."""
+        """Call a compiled function, reusing the layout of its arguments."""
         call = self._calls.get(name)
         if call is None:
             call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
         return call(*arguments)
 
     def values(self, plan: Motion) -> Array:
-        """The rows' numbers (T+1, R); of no meaning where they do not act."""
+        """The rows' values (T+1, R); undefined where they do not act."""
         numbers = np.empty(self.live.shape)
         if self._values:
             constraints, costs = self._model.stage.constraints, self._costs
@@ -206,12 +211,12 @@ class Stages:
         return numbers
 
     def trial(self, plan: Motion) -> tuple[float, Array]:
-        """The cost of a plan, and where its steps lead (T, n)."""
+        """The cost of a plan, and the states that its steps arrive at, (T, n)."""
         arrived = np.empty((self.steps, self.n))
         return self._call("trial_cost", self.steps, self._soft, plan, self._model, arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> float:
-        """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
+        """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
         cost = self.second_order(plan, costates, multipliers, least)
         self.convexify(plan)
         return cost
@@ -219,19 +224,19 @@ class Stages:
     def second_order(
         self, plan: Motion, costates: Array, multipliers: Array, least: float, *, second: bool = True
     ) -> float:
-        """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
+        """`linearize` without projected Hessians; without `second`, also without those of dynamics and constraints."""
         return self._look(plan, costates, self.active._replace(size=0), in_c_order(multipliers), least, second=second)
 
     def convexify(self, plan: Motion) -> None:
-        """Make the projected Hessians about a plan."""
+        """Compute the projected Hessians about a plan."""
         self._call("convex_models", self.steps, self._soft, plan, self._model, self.models)
 
     def act_at(self, plan: Motion) -> None:
-        """Find out which rows act."""
-        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+        """Determine which rows act."""
+        self.live &= ~np.isposinf(self.values(plan))  # infinity means that a constraint does not act at that step
 
     def look_about(self, plan: Motion) -> None:
-        """Find out which rows act, and which entries each depends on: slopes at the plan or a little beside it tell."""
+        """Determine which rows act, and which variables each depends on, from slopes at the plan and near it."""
         self.act_at(plan)
         wiggle = np.sin(1.0 + np.arange(self.n + self.m))
         nowhere, none = np.zeros((self.steps + 1, self.n)), np.zeros(self.live.shape)
@@ -240,14 +245,14 @@ class Stages:
             self.linearize(beside, nowhere, none, np.inf)
 
     def sizes(self, plan: Motion) -> Sizes:
-        """By how much things change, as far as a plan and the problem tell."""
+        """Typical sizes, estimated from a plan and the problem."""
         self.look_about(plan)
         return self.sizes_of(plan, self.models.convex)
 
     def sizes_of(self, plan: Motion, hessian: Array) -> Sizes:
-        """The same of a plan about which the models are, with the Hessians of its cost.
+        """Typical sizes from the plan of the current models and the Hessians of its cost.
 
-        A control without limits has the size with which it moves states by theirs.
+        The size of a control without limits is the change that moves a state by its typical size.
         """
         problem = self.problem
         reach = np.ptp(plan.states, axis=0)
@@ -266,7 +271,7 @@ class Stages:
         return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
 
     def spread(self, rows: Array) -> Array:
-        """Numbers of the live rows (K,) where they belong, (T+1, R); others are zero."""
+        """Numbers of the live rows (K,) at their places in (T+1, R); others are zero."""
         spread = np.zeros(self.live.shape)
         spread[self.live] = rows
         return spread
@@ -281,7 +286,7 @@ class Stages:
         return np.matmul(weighed.transpose(0, 2, 1), self.slopes)
 
     def follow(self, plan: Motion, part: float, policy: tuple[Array, Array], limits: Limits) -> Motion:
-        """The motion that a part of a step leads to; see the kernel's."""
+        """Roll out a part of a step in closed loop; see the kernel."""
         out = Motion(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
         self._call("closed_loop_rollout", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
         return out
@@ -293,7 +298,7 @@ class Stages:
         return costates, slopes
 
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
-        """Write the step to the minimum of models, and the costates there; whether there is one."""
+        """Compute the step to the minimum of the models, and the costates there; return whether there is a minimum."""
         models = self.models._replace(hessian=in_c_order(hessian), gradient=in_c_order(gradient))
         return self._solve(models, self.active._replace(size=0), in_c_order(gaps))[0]
 
@@ -304,7 +309,7 @@ class Stages:
         return joined
 
     def look(self, plan: Motion, costates: Array, *, own: bool = False) -> float:
-        """Make the models about a plan, and write what rows have to spare; return its cost. See the kernel's."""
+        """Compute the models about a plan, and the margins of the rows; return its cost. See the kernel."""
         return self._look(plan, costates, self.active, self.active.force, 0.0, own=own)
 
     def _look(
@@ -318,12 +323,12 @@ class Stages:
         )  # fmt: skip
 
     def measure(self, plan: Motion, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
-        """How far the plan about which the models are is from an optimum; writes its gaps. See the kernel's."""
+        """Residuals of the plan of the current models; writes its gaps. See the kernel."""
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
         return self._call("optimality_measures", self.steps, *of, module=self._active)
 
     def pivot(self, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0) -> tuple[bool, int]:
-        """As `direction`, with rows that are held; also returns how many are wrong there. See the kernel's."""
+        """`direction` with held rows; also returns the number of wrong rows. See the kernel."""
         return self._solve(self.models, self.active, gaps, share, scale, weight, price)
 
     def _solve(
@@ -337,13 +342,13 @@ class Stages:
         return failed == -1, wrong
 
     def change(self, *, worst: bool) -> None:
-        """Change which rows are held; see the kernel's."""
+        """Change which rows are held; see the kernel."""
         self._call("update_active_set", self.steps, int(worst), self.active, module=self._active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
-        """The motion that a plan comes to with gains about it, its cost, and of each constraint the numbers.
+        """Roll out a plan with gains (T, m, n) about it; return the motion, its cost and the constraints' values.
 
-        Controls are put at the limits that are held; gains (T, m, n) are zero there.
+        Controls are put at the limits that are held, and have no gain there.
         """
         out = Motion(np.empty_like(plan.states), np.empty_like(plan.controls))
         limits = Limits(*(np.tile(side, (self.steps, 1)) for side in (self.low, self.high)))
@@ -355,7 +360,7 @@ class Stages:
 
 
 class Point(NamedTuple):
-    """Where the iterations stand: a plan, its cost, where its steps lead, the live rows' numbers (K,); slacks (P,)."""
+    """An iterate: a plan, its cost, the states its steps arrive at, the live rows' values (K,), and slacks (P,)."""
 
     plan: Motion
     cost: float
@@ -365,7 +370,7 @@ class Point(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A change of plan, slacks (P,), multipliers (K,), and the costates where it leads."""
+    """A step in plan, slacks (P,) and multipliers (K,), and the costates after it."""
 
     plan: Motion
     slack: Array
@@ -374,7 +379,7 @@ class Step(NamedTuple):
 
 
 class InteriorPoint:
-    """The iterations from one plan.
+    """Runs the interior point from one plan.
 
     Args:
       problem: with constraints, limits, or neither.
@@ -413,6 +418,7 @@ class InteriorPoint:
         self._rows_of(plan, barrier, room, price, multipliers)
         self.iterations = 0
         self._filter: list[tuple[float, float]] = []
+        self._errors: list[float] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
         self._soft = 1.0
         stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
@@ -425,7 +431,7 @@ class InteriorPoint:
         stages, live = self.stages, self.stages.live
         cost, arrived = stages.trial(plan)
         numbers = stages.values(plan)[live]
-        # A cost of next to nothing, as of standing still, says nothing about what there is to pay.
+        # A cost near zero, as of standing still, says nothing about the scale of the problem.
         self._scale = cost if NOTHING * self._typical < cost < np.inf else 1e-2 * self._typical
         shape = live.shape
         size = np.broadcast_to(self._row_size, shape)[live]
@@ -436,7 +442,7 @@ class InteriorPoint:
         self._highest, self._elastic = highest, bool(np.isfinite(highest).any())
         lowest = np.where(equality, -highest, 0.0)
         below, above = np.flatnonzero(np.isfinite(lowest)), np.flatnonzero(np.isfinite(highest))
-        # Slacks come in pairs with what is between a multiplier and its bound; `row` says whose.
+        # Each slack pairs with the distance of a multiplier from a bound; `row` is the row of each.
         self._row = np.concatenate([below, above])
         self._sign = np.concatenate([np.ones(len(below)), -np.ones(len(above))])
         self._bound = np.concatenate([lowest[below], highest[above]])
@@ -478,7 +484,7 @@ class InteriorPoint:
         near: bool = False,
         watch: Callable[[Measures], bool] = lambda measures: False,
     ) -> Found:
-        """Go on until the measures are within tolerance, or no step helps, or `watch` says so.
+        """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
@@ -497,7 +503,7 @@ class InteriorPoint:
             ended = watch(self.measures) or creeping == CREEPING
         finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
-            # Which rows press is told by a lower barrier: of a cost that is mostly constant, all else is little.
+            # A lower barrier shows which rows are active, also where the cost is mostly constant.
             finer *= FINER
             for _ in range(min(CROSSINGS, most - self.iterations)):
                 ended = not self._iterate(finer) or watch(self.measures)
@@ -511,7 +517,7 @@ class InteriorPoint:
         return self._found(solved)
 
     def _settle(self, tolerance: float, violation: float) -> bool:
-        """Go on from the plan as it was given, with its multipliers, without a barrier; whether that leads anywhere."""
+        """Take Newton steps without a barrier from the given plan and multipliers; return whether they converge."""
         stages, kept = self.stages, (self.point, self._force, self._costates, self.measures)
         plan = self._begun
         cost, arrived = stages.trial(plan)
@@ -546,10 +552,10 @@ class InteriorPoint:
         )  # fmt: skip
 
     def _cross(self, tolerance: float, violation: float) -> bool:
-        """Leave the barrier: rows that press are zero from now on, others do not matter; whether that is right.
+        """Cross over from the barrier to the active set: active rows become equalities; return whether they were right.
 
-        So controls come to stand at their limits, and multipliers lose what the barrier added. Constraints are kept
-        with as much to spare as rounding takes.
+        So controls end at their limits, and multipliers lose what the barrier added. Constraints keep a margin for
+        rounding.
         """
         stages, size, highest = self.stages, self._size, self._highest
         equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
@@ -563,7 +569,7 @@ class InteriorPoint:
         right = False
         for k in range(CROSSINGS):
             numbers = self.point.numbers - aim
-            # The first step may be long, and rounding spoils it with a weight as large as makes the others Newton's.
+            # The first step may be long, and a weight as large as that of the others would spoil it by rounding.
             sigma = np.where(presses, self._scale / ((REGULARISATION if k else CROSSING) * size**2), 0.0)
             self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
             stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 0.0)
@@ -607,7 +613,7 @@ class InteriorPoint:
         return others and found.violation <= violation
 
     def _scale_of(self, cost: float) -> float:
-        """What is relative to the cost is so to this: the cost, or where all of it cancels a millionth of its parts."""
+        """The scale of relative measures: the cost, or a millionth of its typical size where its terms cancel."""
         least = 1e-6 * self._typical
         return max(abs(cost), least) if np.isfinite(cost) else least
 
@@ -615,15 +621,15 @@ class InteriorPoint:
         return self.stages.adjoint(in_c_order(self.stages.models.gradient - self.stages.pull(self._force)))
 
     def _missed(self, point: Point) -> Array:
-        """By how much rows are not their slacks, (K,)."""
+        """Row values minus slacks, (K,)."""
         return point.numbers - np.bincount(self._row, self._sign * point.slack, len(point.numbers))
 
     def _duals(self, force: Array) -> Array:
-        """What is between multipliers and their bounds, (P,)."""
+        """Distances of multipliers from their bounds, (P,)."""
         return self._sign * (force[self._row] - self._bound)
 
     def _measure(self) -> None:
-        """Work out the measures where the models are made."""
+        """Compute the measures at the plan of the current models."""
         stages, point = self.stages, self.point
         self._gaps = stages.models.arrived - point.plan.states[1:]
         start, slopes = self._adjoint()
@@ -634,7 +640,7 @@ class InteriorPoint:
         numbers = point.numbers
         missed = float(np.where(equality, np.abs(numbers), -numbers).max(initial=0.0))
         self._products = point.slack * self._duals(self._force)
-        # What is left to spare times the multiplier; of what is elastic and missed, the product of the other slack.
+        # Margin times multiplier; for violated elastic rows, the product of the other slack.
         largest = float(self._products.max(initial=0.0))
         if self._hard.all():
             largest = float(np.where(equality, 0.0, np.abs(numbers) * self._force).max(initial=0.0))
@@ -644,15 +650,16 @@ class InteriorPoint:
         )  # fmt: skip
 
     def _iterate(self, tolerance: float) -> bool:
-        """One iteration; whether there was a step."""
+        """Do one iteration; return whether there was a step."""
         stages, point, scale = self.stages, self.point, self._scale
         least = 0.1 * tolerance * scale
-        if self._mixed or self._part < LONG:
+        free = self._falls()
+        if self._mixed or self._part < LONG or not free:
             self._lower_barrier(least)
         duals = self._duals(self._force)
         ratio = point.slack / duals
         while True:
-            # Far away, equalities as linearised may ask for what no plan can pay: softly they ask for a part of it.
+            # Far away, linearised equalities may be absurd; softened ones demand only a part.
             soft = self._soft * self._regularised
             sigma = 1 / (soft + np.bincount(self._row, ratio, len(point.numbers)))
             barrier = stages.curvature(sigma)
@@ -662,7 +669,7 @@ class InteriorPoint:
             corrections = np.zeros(len(point.slack))
             self._mixed = mix > 0
             hessian = self._hessian(mix, barrier)
-            if not self._mixed and self._part >= LONG and len(self._row):
+            if free and not self._mixed and self._part >= LONG and len(self._row):
                 corrections = self._predict(hessian, sigma, duals, least)
                 self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
             step = self._step(sigma, duals, corrections)
@@ -705,8 +712,20 @@ class InteriorPoint:
         self._measure()
         return True
 
+    def _falls(self) -> bool:
+        """Whether the measures have decreased lately, so that Mehrotra's rule may choose the barrier parameter.
+
+        That rule empties the filter each time; without this condition iterations may cycle.
+        """
+        found, missed = self.measures, float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+        error = max(found.stationarity, found.gap, missed, float(self._products.max(initial=0.0)) / self._scale)
+        good = error < max(self._errors[-LATELY:], default=np.inf)
+        if good:
+            self._errors.append(error)
+        return good
+
     def _lower_barrier(self, least: float) -> None:
-        """Lower its parameter while the measures are within reach of it."""
+        """Lower the barrier parameter while the measures are small relative to it."""
         missed = float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
         for _ in range(4):
             off = max(
@@ -724,7 +743,7 @@ class InteriorPoint:
         return mixed + barrier
 
     def _mix(self, barrier: Array, sigma: Array, duals: Array) -> float | None:
-        """The least share of the projected Hessian with which there is a step, which is in `stages`; None if none."""
+        """Write the step to `stages` with the least fraction of the projected Hessian that works; None if none does."""
         none = np.zeros(len(self.point.slack))
         nothing = np.zeros(len(self.point.numbers))
         for mix in MIXES:
@@ -740,7 +759,7 @@ class InteriorPoint:
         return None
 
     def _solve(self, hessian: Array, sigma: Array, duals: Array, corrections: Array, beyond: Array) -> bool:
-        """Find the step, of plan and costates; `beyond` is added to what the rows miss."""
+        """Compute the step in plan and costates; `beyond` is added to the rows' residuals."""
         pull = self._force - sigma * (self._target(duals, corrections) + beyond)
         gradient = self.stages.models.gradient - self.stages.pull(pull)
         return self.stages.direction(hessian, gradient, self._gaps + self._more)
@@ -748,12 +767,12 @@ class InteriorPoint:
     _more: Array | float = 0.0  # gaps that a correction adds
 
     def _target(self, duals: Array, corrections: Array) -> Array:
-        """What the rows are to change by, but for their response to multipliers, (K,)."""
+        """Residuals of the condensed row equations, (K,)."""
         wanted = self._sign * (self.parameter - corrections) / duals
         return self.point.numbers - np.bincount(self._row, wanted, len(self.point.numbers))
 
     def _step(self, sigma: Array, duals: Array, corrections: Array, beyond: Array | float = 0.0) -> Step:
-        """The step of slacks and multipliers that belongs to that of the plan in `stages`."""
+        """Complete the step in `stages` by slacks and multipliers."""
         stages, point = self.stages, self.point
         moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
         multipliers = -sigma * (moved + self._target(duals, corrections) + beyond)
@@ -763,7 +782,7 @@ class InteriorPoint:
         return Step(plan, slack, multipliers, stages.to_go.gradient.copy())
 
     def _predict(self, hessian: Array, sigma: Array, duals: Array, least: float) -> Array:
-        """Mehrotra's rule: the barrier's parameter from a step without one, and what its products add, (P,)."""
+        """Mehrotra's rule: set the barrier parameter by an affine step; return its second-order corrections, (P,)."""
         point, none = self.point, np.zeros(len(self.point.slack))
         self.parameter = 0.0
         self._solve(hessian, sigma, duals, none, np.zeros(len(point.numbers)))
@@ -777,43 +796,44 @@ class InteriorPoint:
         return step.slack * moved if primal > 0.5 else none
 
     def _longest(self, numbers: Array, changes: Array, share: float | None = None) -> float:
-        """The part of the changes, at most 1, that leaves positive numbers a share above zero."""
+        """The largest part of the changes, at most 1, by the fraction-to-the-boundary rule."""
         share = max(BOUNDARY, 1 - self.parameter / self._scale) if share is None else share
         falling = changes < 0
         return min(1.0, float((-share * numbers[falling] / changes[falling]).min())) if falling.any() else 1.0
 
     def _off(self, point: Point) -> float:
-        """By how much a point misses the dynamics and its rows, in all; relative to their sizes."""
+        """Total violation of dynamics and rows at a point, relative to their sizes."""
         gaps = np.abs(point.arrived - point.plan.states[1:]) / self._state_size
         return float(gaps.sum() + (np.abs(self._missed(point)) / self._size).sum())
 
     def _merit(self, point: Point) -> float:
-        """Cost, prices and barrier."""
+        """Cost plus prices plus barrier."""
         paid = -float((self._sign * self._bound) @ point.slack)
         return point.cost + paid - self.parameter * float(np.log(point.slack).sum())
 
     def _slope(self, step: Step) -> float:
-        """Of the merit along a step."""
+        """Derivative of the merit along a step."""
         joined = np.concatenate([step.plan.states, np.pad(step.plan.controls, ((0, 1), (0, 0)))], axis=1)
         slacks = -self._sign * self._bound - self.parameter / self.point.slack
         return float((self.stages.models.gradient * joined).sum() + slacks @ step.slack)
 
-    def _at(self, step: Step, part: float) -> Point | None:
-        """The point a part of a step further; None where it is not finite."""
+    def _at(self, step: Step, part: float, *, about: Point | None = None) -> Point | None:
+        """The point a part of a step further than this one, or another; None where it is not finite."""
+        about = self.point if about is None else about
         plan = Motion(
-            in_c_order(self.point.plan.states + part * step.plan.states),
-            in_c_order(self.point.plan.controls + part * step.plan.controls),
+            in_c_order(about.plan.states + part * step.plan.states),
+            in_c_order(about.plan.controls + part * step.plan.controls),
         )
         cost, arrived = self.stages.trial(plan)
         numbers = self.stages.values(plan)[self.stages.live]
         if not np.isfinite(cost) or not np.isfinite(numbers).all() or not np.isfinite(arrived).all():
             return None
-        slack = self.point.slack + part * step.slack
+        slack = about.slack + part * step.slack
         slack = np.where(self._hard, np.maximum(slack, numbers[self._row]), slack)
         return Point(plan, cost, arrived, numbers, slack)
 
     def _acceptable(self, tried: Point, part: float, slope: float) -> bool:
-        """Whether the filter takes it."""
+        """Whether the filter accepts a trial point."""
         off, merit = self._off(tried), self._merit(tried)
         before, at_first = self._off(self.point), self._merit(self.point)
         if not np.isfinite(merit) or off > self._farthest:
@@ -829,15 +849,17 @@ class InteriorPoint:
     def _search(
         self, step: Step, slope: float, hessian: Array | None, sigma: Array, duals: Array, corrections: Array
     ) -> tuple[Point, float, Step] | None:
-        """The longest part of a step that is acceptable, by halves; of the first one also its correction.
+        """Backtrack along a step until the filter accepts; the first trial also with a second-order correction.
 
-        A Hessian of None is for steps without a correction, which is a step of the second order: it closes what the
-        whole step leaves open, for neither rows nor dynamics are linear.
+        The correction reduces what the whole step leaves open, since rows and dynamics are not linear. Without a
+        Hessian there is none.
         """
         part, first = self._longest(self.point.slack, step.slack), True
         while part > SHORTEST:
             tried = self._at(step, part)
             if tried is not None and self._acceptable(tried, part, slope):
+                if hessian is not None and part >= LONG:
+                    tried = self._closed(tried, hessian, sigma, duals, part, slope)
                 return tried, part, step
             if first and tried is not None and hessian is not None and self._off(tried) >= self._off(self.point):
                 beyond = part * self._missed(self.point) + self._missed(tried) - self._missed(self.point)
@@ -848,11 +870,33 @@ class InteriorPoint:
                     other = self._step(sigma, duals, corrections, beyond)
                     corrected = self._at(other, self._longest(self.point.slack, other.slack))
                     if corrected is not None and self._acceptable(corrected, part, slope):
-                        # Multipliers and costates go where the step that was meant leads.
+                        # Multipliers and costates are those of the uncorrected step.
                         return corrected, part, step
             first = False
             part /= 2
         return None
+
+    def _closed(self, tried: Point, hessian: Array, sigma: Array, duals: Array, part: float, slope: float) -> Point:
+        """The point nearer to a motion that keeps its rows, by the least changes, as far as the filter takes them.
+
+        With the models of the step, so that each change costs a Riccati pass and a look at where the steps lead. So a
+        plan that is good enough keeps everything long before it is the best.
+        """
+        stages = self.stages
+        for _ in range(CLOSINGS):
+            off, missed = self._off(tried), self._missed(tried)
+            gaps = tried.arrived - tried.plan.states[1:]
+            if not stages.direction(hessian, stages.pull(sigma * missed), gaps):
+                break
+            moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+            multipliers = -sigma * (moved + missed)
+            slack = -self._sign * (self.point.slack / duals) * multipliers[self._row]
+            change = Step(stages.changes, slack, multipliers, self._costates)
+            closer = self._at(change, self._longest(tried.slack, slack), about=tried)
+            if closer is None or self._off(closer) > CLOSER * off or not self._acceptable(closer, part, slope):
+                break
+            tried = closer
+        return tried
 
     def _tidy(self, slack: Array) -> None:
         """Keep the products of slacks and multipliers within reach of the barrier's parameter, where rows are hard."""

@@ -21,11 +21,11 @@ from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import satisfy
 from lqrsim.solvers.budget import Budget, Stop
+from lqrsim.solvers.constrained import LITTLE
 from lqrsim.solvers.engine import RunResult, SolveRun, raised_by
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
 from lqrsim.solvers.settings import SmootherSettings, check_problem
-from lqrsim.solvers.strategy import LITTLE
 
 SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
 BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan

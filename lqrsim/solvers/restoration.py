@@ -1,13 +1,13 @@
-"""From a motion to one that misses constraints least: descent at a price.
+"""Restoration: from a motion to one that violates constraints least, by descent on an exact penalty.
 
-Each constraint that is missed costs its size times a price, smoothed by a logarithmic barrier whose parameter falls;
-limits of controls are kept by a barrier of their own. Steps are those of Newton's method in the Riccati recursion, and
-are followed in closed loop, so that every plan is a motion, and each costs less than the one before. It comes closer
-from afar than the interior point, which lets states part from the dynamics, and finishes slowly, which that does not.
+A violated constraint costs its size times a price, smoothed by a logarithmic barrier whose parameter falls; a barrier
+of their own keeps controls within their limits. Steps are those of Newton's method in the Riccati recursion, and are
+rolled out in closed loop, so that every plan is a motion, and each has a lower merit than the one before. Far from a
+solution this is more reliable than the interior point, whose states may leave the dynamics; near to one it is slower.
 
-Far from where it is kept, a constraint's price is straight: it has no curvature, and a step to the minimum of the model
-goes anywhere. So curvature is added, that of the parabola which touches the price and is nowhere below it, and changes
-of controls are weighed; less of both where steps are taken in full, more where they are not.
+Far from feasibility the penalty is linear in the constraint. It has no curvature, so the minimum of a quadratic model
+may be anywhere. The curvature of the parabola that touches the penalty from above is added, and changes of controls are
+weighted; less of both after full steps, more after short ones.
 """
 
 from collections.abc import Callable
@@ -20,23 +20,24 @@ from lqrsim.errors import Array
 from lqrsim.kernels.records import Limits, Motion
 from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
 
-FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # of the barrier's parameter, relative to the price; and what it falls by
-SETTLED = 0.1  # of the parameter, a promised decrease for each row below which it falls
-LAST = 1e-6  # the same of all rows at the end: shares are right to its root
+FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; its factor
+SETTLED = 0.1  # promised decrease per row, relative to the parameter, below which that falls
+LAST = 1e-6  # the same for all rows at the end: shares are accurate to its square root
 ARMIJO, SHORTEST = 1e-4, 1e-6
-INSIDE = 0.01  # of the way to a limit, what is left by a step
-EDGE = 0.01  # of the range, how far inside of the limits controls begin
+INSIDE = 0.01  # part of the distance to a limit that a step leaves
+EDGE = 0.01  # distance from the limits at the beginning, relative to the range
 WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to cost and price
-DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same where the damping is 1; how small it may grow from, and how large be
-LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step with which the damping falls or grows, and by what
-WIDE = 1e3  # times what the barrier's parameter says of a multiplier, what it may be
-CLOSE, PATIENCE = 1e-4, 2  # what may be missed, relative to the rows' sizes, so often in a row that this is its end
-LEVEL, FINER = 1e-4, 0.1  # of the merit, a promised decrease that is next to nothing; and by what that falls
+DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same for a damping of 1; bounds of the damping
+LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step above or below which the damping falls or grows, and the factor
+WIDE = 1e3  # factor by which a multiplier may differ from the one that the barrier implies
+# A violation, relative to the rows' sizes, and a change of cost that end the descent, so many times in a row.
+CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
+LEVEL, FINER = 1e-4, 0.1  # negligible promised decrease, relative to the merit; factor by which it falls
 
 
 @dataclass(frozen=True)
 class Restored:
-    """A motion. `settled`: whether what it misses is stationary. `near`: whether it misses next to nothing."""
+    """A motion; whether its violation is stationary (`settled`), and whether it is nearly feasible (`near`)."""
 
     plan: Motion
     settled: bool
@@ -47,13 +48,13 @@ def restore(
     stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
     watch: Callable[[float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
 ) -> Restored | None:  # fmt: skip
-    """Go down from a motion (states (T+1, n), controls (T, m)).
+    """Descend from a motion (states (T+1, n), controls (T, m)).
 
     Args:
-      price: of missing a constraint by its size, in units of the typical cost. most: iterations.
-      watch: called with cost, violation and promised decrease, relative to the merit, after each; True ends it.
-      stationary: asked, where there is next to nothing to gain, whether what a motion misses is stationary; given of
-        each constraint the share of its price that it pays (T+1, rows), from -1 to 1. True ends it.
+      price: of violating a constraint by its typical size, in units of the typical cost. most: iterations.
+      watch: called after each iteration with cost, violation and relative promised decrease; True ends the descent.
+      stationary: asked, once the promised decrease is negligible, whether the violation of a motion is stationary. It
+        gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.
     """
     live = stages.live
     size = np.broadcast_to(sizes.rows, live.shape)[live]
@@ -78,7 +79,7 @@ def restore(
 
     diagonal = np.arange(stages.n, stages.n + stages.m)
     lowest = np.where(equality, -highest, 0.0)
-    settled, damping, close, level, dual = False, 1.0, 0, LEVEL, None
+    settled, near, damping, close, level, dual, before = False, False, 1.0, 0, LEVEL, None, np.inf
     count = len(stages.problem.constraint_terms)
     force = np.zeros(len(size))
     costates = np.zeros((stages.steps + 1, stages.n))
@@ -122,7 +123,7 @@ def restore(
                     break
             part /= 2
         moved = np.matmul(stages.slopes, joined[:, :, None])[:, :, 0][live]
-        aim = force - curvature * moved  # what multipliers come to, with the whole step
+        aim = force - curvature * moved  # the multipliers after the whole step
         dual = dual + part * (aim - dual)
         if part > LONG:
             damping /= TIMES
@@ -130,7 +131,8 @@ def restore(
             damping = min(max(TIMES * damping, LIGHT), HEAVY)
         short = np.where(limit, 0.0, np.where(equality, np.abs(numbers), -numbers))
         missed, near = float(short.max(initial=0.0)), float((short / size).max(initial=0.0)) < CLOSE
-        close = close + 1 if near else 0
+        close = close + 1 if near and abs(before - cost) < SLOW * abs(cost) else 0
+        before = cost
         promised = -0.5 * slope / max(abs(now), 1e-300)
         if watch(cost, missed, promised) or close == PATIENCE:
             break
@@ -143,11 +145,11 @@ def restore(
         if taken is None or (parameter <= least and -slope < LAST * parameter):
             break
         plan = taken
-    return Restored(plan, settled, close > 0)
+    return Restored(plan, settled, near)
 
 
 def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -> tuple[Array, Array]:
-    """Both slacks of rows, whose difference is the number, where price and barrier together are least."""
+    """The two slacks of each row, whose difference is its value, that minimise price and barrier."""
     steep = np.where(equality, 2 * highest, highest)
     root = np.hypot(steep * numbers, 2 * parameter)
     rest = 4 * parameter**2 / (root + steep * np.abs(numbers))  # root - steep |numbers|, without cancelling
@@ -156,7 +158,7 @@ def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -
 
 
 def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, price: float) -> bool:
-    """Find a step downhill: with as much of the second order as has a minimum."""
+    """Find a descent direction, with as much of the exact Hessian as leaves the model a minimum."""
     models, none = stages.models, np.zeros((stages.steps, stages.n))
     for mix in MIXES:
         if stages.direction((1 - mix) * models.hessian + mix * models.convex + barrier, gradient, none):
@@ -171,7 +173,7 @@ def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, pr
 
 
 def _limits(stages: Stages, controls: Array) -> Limits:
-    """What controls may come to in one step."""
+    """Bounds of the controls in one step."""
     low = np.where(np.isfinite(stages.low), stages.low + INSIDE * (controls - stages.low), -np.inf)
     high = np.where(np.isfinite(stages.high), stages.high - INSIDE * (stages.high - controls), np.inf)
     return Limits(in_c_order(low), in_c_order(high))

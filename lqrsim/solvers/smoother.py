@@ -1,31 +1,18 @@
-"""Iterated LQR smoothing: Sec. V of the paper, with a safeguard for where it would fail."""
+"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. What they try is in `strategy.py`."""
 
-import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from lqrsim.errors import InputError
-from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Status
-from lqrsim.solvers.assembly import assemble
-from lqrsim.solvers.budget import Budget, Callback, Stop
-from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.free_duration import find_duration, settled
-from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_point import Measures, iteration_of
-from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
+from lqrsim.solvers.budget import Callback
+from lqrsim.solvers.initial_guess import StartLike
+from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings, check_callback, check_problem, check_runs, settings_from
-
-# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
-SHORTENED, SHORTER, TRIES = 3, 0.9, 150
+from lqrsim.solvers.strategy import solve
 
 
 def smooth(
@@ -58,7 +45,7 @@ def smooth(
     interior point.
 
     Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
-    tried for a few iterations each, and the most promising goes on; see `solvers/multistart.py`.
+    tried for a few iterations each, and the most promising goes on; see `solvers/strategy.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
@@ -116,7 +103,7 @@ def smooth(
     check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
-    return _solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
+    return solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
 
 
 def smooth_many(
@@ -150,104 +137,7 @@ def smooth_many(
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
     settings = settings_from(SmootherSettings, "smooth_many", options)
-    return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
-
-
-def _solve(
-    problem: Problem,
-    settings: SmootherSettings,
-    *,
-    attentive: bool = False,
-    threads: int = 1,
-    callback: Callback | None = None,
-) -> Solution:
-    """Solve; `attentive`: see `Budget`."""
-    if problem.duration is not None:
-        return _solve_for_duration(problem, settings, attentive=attentive, threads=threads, callback=callback)
-    given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
-    start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
-    check_functions(problem, start, first.offset[0].copy())
-    stop = Stop()
-    runs = [
-        SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
-        for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
-    ]
-    stop.begin(settings.time_limit)  # compiling, which comes before, does not count
-    search = Search([name for name, _ in given], runs, callback, threads)
-    with problem.dynamics.solving(threads if len(runs) == 1 else 1):
-        search.run()
-        default = settings.start is None and settings.starts is None and settings.safeguard
-        if default and not stop.due and search.is_unacceptable:
-            search.widen()
-        if problem.risk > 0 and settings.safeguard and not stop.due:
-            search.retry_without_risk()
-    chosen, found = search.best
-    detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
-    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)}
-    solution = assemble(
-        problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
-        options=settings.options(chosen.initial_guess) | tolerances, candidates=search.candidates(),
-    )  # fmt: skip
-    for run in runs:
-        run.give_back()
-    return stop.finish(solution)
-
-
-def _solve_for_duration(
-    problem: Problem, settings: SmootherSettings, *, attentive: bool, threads: int, callback: Callback | None
-) -> Solution:
-    """Solve for the stated duration, then for the best one near that, and then to the end with it.
-
-    Where time costs, shorter durations are tried, too, for they may lead another way round.
-    """
-    budget = Budget(settings.max_iterations, callback=callback)
-    budget.stop.begin(settings.time_limit)
-    log, clock = budget.log, time.perf_counter()
-
-    def watch(measures: Measures) -> bool:
-        nonlocal clock
-        now, before = time.perf_counter(), log[-1].cost if log else np.inf
-        budget.record(iteration_of(measures, before, now - clock))
-        clock = now
-        return budget.stop.due
-
-    assert problem.duration is not None
-    stated, first, best = problem.steps * problem.dt, None, None
-    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
-        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-        begin = _solve(settled(problem, stated), tries, attentive=attentive, threads=threads, callback=callback)
-        first = begin if first is None else first
-        if attempt and not begin.success:
-            break
-        ended = find_duration(
-            problem,
-            begin.trajectory,
-            tolerance=settings.final(problem),
-            violation=settings.missed(problem),
-            watch=watch,
-        )
-        if (
-            budget.stop.due
-            or ended is None
-            or (best is not None and not ended[1].measures.cost < best[1].measures.cost)
-        ):
-            break
-        best = ended
-        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
-    assert first is not None
-    if best is None:
-        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS
-        detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
-        return budget.stop.finish(replace(first, status=status, detail=detail, iterations=(*first.iterations, *log)))
-    ordinary, found = best
-    m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
-    guess = InitialGuess(
-        np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
-        f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
-    )  # fmt: skip
-    settings = replace(settings, start=guess, starts=None)
-    return budget.stop.finish(_solve(ordinary, settings, attentive=attentive, callback=callback))
+    return solve_all(all_driven_by(problems, noise, risk), settings, _check, solve, threads=threads, progress=progress)
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:

@@ -1,69 +1,102 @@
-"""What a solve from one start tries, top to bottom, until something converges.
+"""What `smooth` tries, top to bottom, until something converges.
 
-Without constraints: the method, Newton's where it has found the valley, the safeguard where it fails; see `SolveRun`.
-With constraints, whatever comes first is followed by the interior point, which has the end:
+`solve`
+  1. Which way round: a few iterations from each start, and the most promising goes on to its end (`Search.run`). With
+     constraints, the others follow as long as they may cost less.
+  2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
+     ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
+  3. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
 
-    the plan of another solution, with its multipliers;
-    a trajectory or a policy that the caller gave;
-    the plan of smoothing without the constraints, after a few iterations;
-    what the augmented Lagrangian comes to from there, with an ObstacleCost;
-    the same, after a descent in which constraints may be missed at a price;
-    the start itself;
-    the same, after such a descent.
+`finish`, for one start
+  without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
+     (`SolveRun.solve`). Where controls stay at their limits, or all of that fails, the interior point.
+  with constraints: a ladder of plans to begin with, each finished by the interior point (`constrained.py`).
+  without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
+     smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
 
-Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
-came to plans about which no change lessens what is missed.
-
-Problems with noise and constraints, those of an MJCF, and `finish=None` have the augmented Lagrangian alone.
+The budget of each start is `max_iterations`; the deadline is one for all (`budget.py`). Every answer is certified
+(`certify.py`).
 """
 
+import dataclasses
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array
+from lqrsim.errors import InputError
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import Motion
-from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
-from lqrsim.solvers import augmented_lagrangian, compiled
-from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import TOLERANCE, Target
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Candidate, Status, Trajectory
+from lqrsim.solvers import augmented_lagrangian
+from lqrsim.solvers.assembly import assemble, clearance_of
+from lqrsim.solvers.budget import Budget, Callback, Stop
+from lqrsim.solvers.constrained import OPENING, Known, Ladder
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.infeasibility import Evidence, evidence
-from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
-from lqrsim.solvers.restoration import Restored, restore
+from lqrsim.solvers.free_duration import find_duration, settled
+from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
+from lqrsim.solvers.interior_point import Measures, iteration_of
+from lqrsim.solvers.multistart import SWAYS, bends, choose, guides, path, pull, reweighted, sinusoidal_controls
+from lqrsim.solvers.risk import name_risk
+from lqrsim.solvers.settings import SmootherSettings
 
-FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS, SURE = 2, 4  # from which what is missed has to be stationary, to be called infeasible; and not to try others
-AUGMENTED = 100  # iterations of the augmented Lagrangian
-OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
-MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
-RESTORATION = "restoration"  # what its iterations are called
-MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
-PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
-SLOW, PATIENCE = 1e-2, 3  # change of cost that ends such a descent where nothing is missed, and how often in a row
-PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
-UPDATES = 5  # of multipliers, where Newton's steps at the end come to miss constraints
-ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
-AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
+# Controls are idle if they are this close to the nominal ones, relative to these and at least 1.
+IDLE = 1e-6
+# Factors on the weights of obstacles and goal that find another way round.
+HEAVIER = (10.0, 100.0)
+# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
+SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
-@dataclass
-class Known:
-    """What the runs of one search know of each other's results.
-
-    Attributes:
-      evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
-    """
-
-    evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
-    from_start: bool = False
+def solve(
+    problem: Problem,
+    settings: SmootherSettings,
+    *,
+    attentive: bool = False,
+    threads: int = 1,
+    callback: Callback | None = None,
+) -> Solution:
+    """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts."""
+    if problem.duration is not None:
+        return _solve_for_duration(problem, settings, attentive=attentive, threads=threads, callback=callback)
+    given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
+    start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+    first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
+    check_functions(problem, start, first.offset[0].copy())
+    stop = Stop()
+    runs = [
+        SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
+        for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
+    ]
+    stop.begin(settings.time_limit)  # compiling, which comes before, does not count
+    search = Search([name for name, _ in given], runs, callback, threads)
+    with problem.dynamics.solving(threads if len(runs) == 1 else 1):
+        search.run()
+        default = settings.start is None and settings.starts is None
+        # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
+        poor = search.says_infeasible or (default and search.is_unacceptable)
+        if settings.safeguard and not stop.due and poor:
+            search.widen()
+        if problem.risk > 0 and settings.safeguard and not stop.due:
+            search.retry_without_risk()
+    chosen, found = search.best
+    detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
+    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)}
+    solution = assemble(
+        problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
+        options=settings.options(chosen.initial_guess) | tolerances, candidates=search.candidates(),
+    )  # fmt: skip
+    for run in runs:
+        run.give_back()
+    return stop.finish(solution)
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
-    """Run to the end; certified. `known` is what other runs of the search found."""
+    """Run from one start to the end; certified. `known` is what other runs of the same problem found."""
     if run.initial_guess.found is not None:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
@@ -72,14 +105,14 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 
 
 def refine(run: SolveRun, known: Known) -> RunResult:
-    """Run to the end from where the first policy leads, and stay on that way round; certified."""
+    """Run to the end from the rollout of the first policy, on its side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
     return augmented_lagrangian.refine(run)
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
-    """The method; where controls stand at limits and it does not settle soon, or it fails, the interior point."""
+    """Smoothing and Newton's method; the interior point where controls stay at their limits, or where these fail."""
     problem, budget = run.problem, run.budget
     space = problem.control_coordinates
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
@@ -99,350 +132,230 @@ def _without_constraints(run: SolveRun) -> RunResult:
     return ladder.from_plan(plan) or found
 
 
-class Ladder:
-    """The ways to a plan that keeps constraints, one after the other."""
+class Search:
+    """Several runs, of which the most promising are finished.
 
-    def __init__(self, run: SolveRun, known: Known) -> None:
-        self._run, self._problem, self._budget = run, run.problem, run.budget
-        self._allowed = run.settings.missed(run.problem)
-        clock = time.perf_counter()
-        self._stages = Stages(run.problem)
-        run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
-        self._budget.log[:0] = run.initial_guess.log
-        self._best: RunResult | None = None
-        self._given: RunResult | None = None
-        self._valley: Motion | None = None
-        # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
-        self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
-        self._known = known
-        if run.settings.penalty is None:
-            self._without_multipliers()
+    Attributes:
+      best: the run with the best result so far, and that result.
+    """
 
-    def _without_multipliers(self) -> None:
-        """Have the augmented Lagrangian add nothing to the cost."""
-        for array in self._run.work.multipliers:
-            array[0], array[declarations.HEADER :] = 0.0, 0.0
+    def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
+        self._named = list(zip(names, runs, strict=True))
+        self._callback, self._threads, self._known = callback, threads, Known()
+        self._problem, self._settings = runs[0].problem, runs[0].settings
+        self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
+        self._finished: list[tuple[SolveRun, RunResult]] = []
 
-    def climb(self, *, stay: bool = False) -> RunResult:
-        """Try one after the other; with `stay`, only what begins where the first policy leads."""
-        guess = self._run.initial_guess
-        start = self.start()
-        given = guess.trajectory is not None or guess.gain.any() or stay
-        if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
-            self._given = start  # never left behind
-        rungs: list[Callable[[], RunResult | None]] = []
-        if guess.found is not None:
-            rungs.append(lambda: self._answered(guess.found))
-        if guess.multipliers and any(one.values.any() for one in guess.multipliers):
-            known = tuple(one.values for one in guess.multipliers)
-            rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
-        if stay and self._guided:
-            rungs.append(self._refined)
-        if given:
-            near = LITTLE if start.violation <= self._allowed else MUCH
-            rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
-        if not stay:
-            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        if stay or not self._known.from_start:  # all runs of a search have the same start
-            rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
-        for rung in rungs:
-            found = rung()
-            if found is not None and found.success:
-                if not self._worse(found):
-                    break
-                self._best = None  # what was given is better
-            if self._budget.over:
+    @property
+    def best(self) -> tuple[SolveRun, RunResult]:
+        return self._finished[0]
+
+    def run(self) -> None:
+        """Choose a run and finish it; with constraints, finish others too, as long as they may cost less."""
+        chosen, *others = choose([run for _, run in self._named], self._threads)
+        self._finish(chosen)
+        if not chosen.problem.constraints:
+            return
+        # Constraints can make the best way round the worst, or close it. The others' costs so far, without constraints,
+        # are about the least that they can cost with them.
+        for run in sorted(others, key=lambda run: run.cost):
+            best = self.best[1]
+            if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
-        return self._answer(start)
+            self._finish(run)
 
-    def from_plan(self, plan: Motion | RunResult) -> RunResult | None:
-        """From a plan, by the interior point; None where that leads nowhere, and smoothing can go on."""
-        checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
-        found = self._interior(_plan(plan), MUCH)
-        if found is not None and found.success:
-            return found
-        self._run.go_on(checkpoint, self._budget.log[begin:])
-        return None
+    @property
+    def is_unacceptable(self) -> bool:
+        """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
 
-    def _from_start(self, start: RunResult) -> RunResult | None:
-        self._known.from_start = True
-        return self._at_a_price(_plan(start))
-
-    def _from_valley(self) -> RunResult | None:
-        """From where smoothing leads without the constraints."""
-        run = self._run
-        run.smooth(GUIDED if self._guided else OPENING)
-        ending = run.checked_ending()
-        settled = ending.success or ending.outcome == declarations.IN_VALLEY
-        plan = run.work.arrays.rollout if settled else run.work.plan  # which is the one of least cost
-        if ending is not run.ending or not np.isfinite(run.work.memory["plan_cost"]):
-            return None
-        self._valley = _plan(plan)
-        if self._budget.stop.due:
-            return None
-        if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
-            return self._interior(self._valley, MUCH)
-        # Its bottom: the answer, if that keeps the constraints; or, with what keeps clear of obstacles, next to it.
-        checkpoint = run.checkpoint()
-        found = run.newton()
-        if found.success and found.violation == 0:
-            return self._note(found)
-        bottom = _plan(found) if found.success else self._valley
-        run.go_on(checkpoint)
-        return None if self._budget.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
-
-    def _refined(self) -> RunResult | None:
-        """From where steps lead that lower the augmented Lagrangian alone."""
-        with self._budget.limited(AUGMENTED):
-            found = augmented_lagrangian.refine(self._run)
-        return self._after_multipliers(found)
-
-    def _augmented(self) -> RunResult | None:
-        """From what the augmented Lagrangian comes to, which stays in the valley that smoothing has chosen."""
-        run = self._run
-        if self._valley is None or run.settings.elastic is not None or not self._guided:
-            return None
-        with self._budget.limited(AUGMENTED):
-            found = augmented_lagrangian.satisfy(run, run.result(run.ending))
-        return self._after_multipliers(found)
-
-    def _after_multipliers(self, found: RunResult) -> RunResult | None:
-        """The interior point from the plan that the method of multipliers came to."""
-        plan = _plan(found)
-        self._without_multipliers()
-        if self._budget.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
-            return None
-        return self._interior(plan, LITTLE)
-
-    def _at_a_price(self, plan: Motion | None) -> RunResult | None:
-        """With constraints that may be missed; and from where that leads, without."""
-        if plan is None or self._run.settings.elastic is not None:
-            return None
-        for price in PRICES:
-            priced = self._restore(plan, price)
-            if priced is None:
-                return None
-            plan = priced.plan
-            self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
-            if priced.settled:
-                return None
-            if priced.near or price == PRICES[-1]:
-                found = self._interior(plan, MUCH)
-                if found is not None and found.success:
-                    return found
-        return None
-
-    def _restore(self, plan: Motion, price: float) -> Restored | None:
-        """Descent at a price, with a line of the log each."""
-        budget, left = self._budget, self._budget.left - 1
-        before, clock, slow = np.inf, time.perf_counter(), 0
-
-        def watch(cost: float, violation: float, promised: float) -> bool:
-            nonlocal before, clock, slow
-            now = time.perf_counter()
-            improvement = (before - cost) / max(abs(cost), 1e-300)
-            budget.record(Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION))
-            slow = slow + 1 if violation <= self._allowed and abs(improvement) < SLOW else 0
-            before, clock = cost, now
-            return budget.stop.due or slow == PATIENCE
-
-        sizes = self._stages.sizes(plan)
-        if left < 1 or budget.stop.due:
-            return None
-        try:
-            with np.errstate(all="ignore"):
-                return restore(
-                    self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch,
-                    stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
-                )  # fmt: skip
-        except BaseException as error:  # Ctrl-C: raised again when there is a solution
-            budget.stop.error = error
-            return None
-
-    def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
-        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
-        there = self._result(plan.states, plan.controls, self._without_gains(plan))
-        if not there.violation > FAR * self._allowed:
-            return False
-        rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
-        found = evidence(
-            self._problem, self._run.work, there.states, there.controls, shares=shares, sizes=rows,
-            allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
-        )  # fmt: skip
-        if found is not None:
-            self._known.evidence.append((found, there))
-        return found is not None
-
-    def _interior(
-        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
-    ) -> RunResult | None:
-        """The interior point from a plan, and what becomes of it."""
-        return self._answered(self._iterate(plan, barrier, multipliers=multipliers))
-
-    def _answered(self, found: Found | None) -> RunResult | None:
-        """What becomes of what the interior point came to."""
-        if found is None or not np.isfinite(found.plan.states).all():
-            return None
-        if found.solved and (result := self._kept(found)) is not None and result.success:
-            return self._note(result)
-        return self._note(self._rolled_out(found.plan, found.gain))
-
-    def _iterate(
-        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
-    ) -> Found | None:
-        """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
-        budget, left = self._budget, self._budget.left - 1
-        if left < 1 or budget.stop.due:
-            return None
-        before, clock = np.inf, time.perf_counter()
-
-        def watch(measures: Measures) -> bool:
-            nonlocal before, clock
-            now = time.perf_counter()
-            budget.record(iteration_of(measures, before, now - clock))
-            before, clock = measures.cost, now
-            return budget.stop.due
-
-        try:
-            with np.errstate(all="ignore"):
-                point = InteriorPoint(
-                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=self._run.settings.price,
-                    multipliers=multipliers, stages=self._stages,
-                )  # fmt: skip
-                return point.run(
-                    tolerance=self._run.final, violation=self._allowed, most=min(MOST, left),
-                    near=barrier is LITTLE, watch=watch,
-                )  # fmt: skip
-        except BaseException as error:  # Ctrl-C: raised again when there is a solution
-            budget.stop.error = error
-            return None
-
-    def start(self) -> RunResult:
-        """Where the policy leads that it all begins with."""
-        work = self._run.work
-        guess = self._run.initial_guess
-        states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
-        return self._result(states, controls, (guess.gain, guess.offset))
-
-    def _without_gains(self, plan: Motion) -> tuple[Array, Array]:
-        return np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls
-
-    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
-        """Where a plan leads with gains about it; or without, if that misses less."""
-        candidates = []
-        for gains in (gain, np.zeros_like(gain)):
-            offset = plan.controls - np.einsum("tij,tj->ti", gains, plan.states[:-1])
-            states, controls = compiled.rollout(self._problem, gains, offset, plan.states[0].copy())
-            candidates.append(self._result(states, controls, (gains.copy(), offset)))
-        return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
-
-    def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> RunResult:
-        """A plan that has not converged."""
-        cost, _ = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))
-        work = self._run.work
-        violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
-        return RunResult(
-            status=Status.MAX_ITERATIONS, detail="", states=states, controls=controls, law=law,
-            cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
-        )  # fmt: skip
-
-    def _kept(self, found: Found) -> RunResult | None:
-        """The end: controls at their limits are put there, and Newton's method makes policy and value functions.
-
-        Its cost has the augmented Lagrangian at the multipliers that were found, about which the plan is a minimum.
+        Far is farther than the robot's radius, or, without a position, than the tolerance of a goal; through is deeper
+        than half the radius, or half that of the largest collision sphere.
         """
-        work, stages = self._run.work, self._stages
-        low, high = stages.low, stages.high
-        controls, gain = found.plan.controls.copy(), found.gain.copy()
-        for side, sign in ((low, -1.0), (high, 1.0)):
-            room = np.abs(side - controls) / found.control_size
-            force = sign * found.pressing * found.control_size / found.scale
-            there = (room < AT_LIMIT) & (force > room)
-            controls = np.where(there, side, controls)
-            gain[there] = 0.0
-        offset = controls - np.einsum("tij,tj->ti", gain, found.plan.states[:-1])
-        states, controls = compiled.rollout(self._problem, gain, offset, found.plan.states[0].copy())
-        if not np.isfinite(states).all():
-            return None
-        values = work.constraint_values(states, controls)
-        for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
-            array, size = work.multipliers[k], found.row_size[stages.owners == k]
-            array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
-            # Such that the augmented Lagrangian's forces, about this plan, are those that were found.
-            force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
-            presses = found.multipliers[k] > array[0] * (numbers - array[3])  # others have what a barrier leaves
-            acts = np.isfinite(numbers) & (term.equality | presses)
-            array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
-        work.plan.states[...], work.plan.controls[...] = states, controls
-        work.memory["plan_cost"] = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))[0]
-        lagrangian = AugmentedLagrangian(self._run)
-        lagrangian.evaluate(*work.plan)
-        with self._budget.joined_with_last(INTERIOR):
-            result = self._newton(lagrangian)
-            for _ in range(UPDATES):
-                if lagrangian.kept or not result.success:
-                    break
-                lagrangian.update(growth=1.0)
-                result = self._newton(lagrangian)
-        detail = ""
-        if self._run.settings.elastic is not None and result.violation > 0:
-            detail = f"elastic: {lagrangian.worst()}"
-        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
-        if result.success and lagrangian.kept:
-            return result
-        self._without_multipliers()
-        return replace(result, status=Status.MAX_ITERATIONS)
+        problem = self._problem
+        space = problem.dynamics.state_coordinates
+        if pull(problem) == 0 or problem.goal is None:
+            return self._idle() or self._stuck
+        (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+        if not found.success:
+            return run.budget.left > 0
+        if space.position:
+            place = list(space.position)
+            arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
+        else:
+            target = Target(space, problem.weighed_goal, found.states)
+            arrived = target.distance(found.states[-1]) <= TOLERANCE
+        if not arrived:
+            return True
+        clearance = clearance_of(problem, found.states)
+        return clearance is not None and not clearance.min() >= -0.5 * radius
 
-    def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
-        """The multipliers, without what is left of the barrier on rows that have more to spare than they press."""
-        values = self._run.work.constraint_values(result.states, result.controls)
-        multipliers = []
-        for k, one in enumerate(lagrangian.multipliers()):
-            size = found.row_size[self._stages.owners == k]
-            idle = (one.values * size / found.scale < values[k] / size) & ~self._problem.constraint_terms[k].equality
-            multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
-        return tuple(multipliers)
+    def _idle(self) -> bool:
+        """Whether the best plan does nothing, as where no control at rest helps alone, but several may together."""
+        found, nominal = self.best[1], self._problem.nominal_control
+        off = np.abs(found.controls - nominal).max()
+        return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
-    def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:
-        """Newton's method from the plan in the memory, with these multipliers."""
-        result = self._run.newton(added=lagrangian.added())
-        lagrangian.evaluate(result.states, result.controls)
-        return result
+    @property
+    def says_infeasible(self) -> bool:
+        """Whether the best result is INFEASIBLE, which other starts may disprove."""
+        return self._stuck and self.best[1].status is Status.INFEASIBLE
 
-    def _note(self, found: RunResult) -> RunResult:
-        """Keep it, if it is the best so far, in memory of its own."""
-        if self._best is None or found.rank < self._best.rank:
-            law = found.law[0].copy(), found.law[1].copy()
-            self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
-        return found
+    @property
+    def _stuck(self) -> bool:
+        """Whether there is a plan whose violation is stationary, and none that keeps the constraints."""
+        return bool(self._known.evidence) and not self.best[1].success
 
-    def _worse(self, found: RunResult) -> bool:
-        """Whether a plan costs more than one that was given and keeps the constraints."""
-        return self._given is not None and found.cost > self._given.cost + ROUNDING * abs(self._given.cost)
+    def widen(self) -> None:
+        """Try other starts: another way round, or, where there is nothing to go round, other controls and paths."""
+        if self._stuck and pull(self._problem) == 0:
+            self._try_elsewhere()
+        elif pull(self._problem) == 0:
+            self._try_sinusoidal_controls()
+        else:
+            for times in HEAVIER:
+                self._try_reweighted(times)
 
-    def _answer(self, start: RunResult) -> RunResult:
-        """The best of all, certified."""
-        run, stop = self._run, self._budget.stop
-        best = start if self._best is None else self._best
-        priced = run.settings.elastic is not None and best.success
-        if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
-            best = self._given
-        if not best.success and self._problem.constraints:
-            lagrangian = AugmentedLagrangian(run)
-            lagrangian.evaluate(best.states, best.controls)
-            status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
-            detail = lagrangian.worst()
-            if len(self._known.evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._known.evidence, key=lambda pair: pair[0].missed)
-                lagrangian.evaluate(best.states, best.controls)
-                detail = lagrangian.worst()
-                status = Status.INFEASIBLE
-                detail += f"; against it stand {least.against}" if least.against else ""
-            status = Status.TIME_LIMIT if stop.due else status
-            sure = status is Status.INFEASIBLE and len(self._known.evidence) >= SURE
-            best = replace(best, status=status, detail=detail, final=sure)
-        return run.certified(best)
+    def _try_sinusoidal_controls(self) -> None:
+        problem = self._problem
+        runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
+        named = dict(zip(map(id, runs), SWAYS, strict=True))
+        chosen = choose(runs, self._threads)[0]
+        self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
+        found, best = self._to_its_end(chosen, finish, Known()), self.best[1]
+        # Even a plan that has not converged is better than doing nothing.
+        better = found.violation <= best.violation and found.cost < best.cost
+        self._finished.insert(0 if better else len(self._finished), (chosen, found))
+
+    def _try_elsewhere(self) -> None:
+        """Try other starts until one leads to a plan, before the constraints are called infeasible."""
+        problem = self._problem
+        starts: dict[str, StartLike] = {
+            f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
+        }
+        place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
+        if place and begin is not None and goal is not None and (goal != begin)[place].any():
+            for name, bend in bends((goal - begin)[place], 3)[1:]:
+                states = path(begin, goal, np.zeros(len(begin)), problem.steps)
+                states[:, place] = path(begin[place], goal[place], bend, problem.steps)
+                controls = np.tile(problem.nominal_control, (problem.steps, 1))
+                starts[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+        for name, one in starts.items():
+            if self._budget.stop.due or self.best[1].success:
+                return
+            run = self._another(resolve(one, problem))
+            self._named.append((name, run))
+            self._known.from_start = False
+            self._finish(run)
+
+    def _try_reweighted(self, times: float) -> None:
+        """Solve for heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
+        if self._budget.stop.due:
+            return
+        heavier = reweighted(self._problem, times)
+        runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
+        try:
+            boldest = choose(runs, self._threads)[0].solve()
+        except InputError:  # the heavier cost is not finite at the start
+            return
+        if self._budget.stop.due:
+            return
+        summary = f"a plan for {times:g} times the weight of obstacles and goal"
+        run = self._another(InitialGuess(boldest.law[0].copy(), boldest.law[1].copy(), None, None, summary))
+        self._named.append((summary, run))
+        found, best = self._to_its_end(run, refine, self._known), self.best[1]
+        # The same optimum, different within the tolerances, is no improvement.
+        other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
+        self._finished.insert(0 if other else len(self._finished), (run, found))
+
+    def retry_without_risk(self) -> None:
+        """If the risk was too high on the way: solve without risk, and go on from that plan."""
+        if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
+            return
+        riskless = dataclasses.replace(self._problem, risk=0.0)
+        runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
+        found = finish(choose(runs, self._threads)[0], Known())
+        if not found.success or self._budget.stop.due:
+            return
+        summary = "a plan without a risk"
+        initial_guess = InitialGuess(
+            found.law[0].copy(), found.law[1].copy(), found.values["cost_to_go"], None, summary,
+            multipliers=found.multipliers,
+        )  # fmt: skip
+        run = self._another(initial_guess)
+        self._named.append((summary, run))
+        self._finish(run)
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All runs as candidates; none if there was one run."""
+        results = {id(run): found for run, found in self._finished}
+        found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
+        return tuple(found) if len(found) > 1 else ()
+
+    def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
+        problem = self._problem if problem is None else problem
+        return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
+
+    def _finish(self, run: SolveRun) -> None:
+        self._finished.append((run, self._to_its_end(run, finish, self._known)))
+        self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+
+    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
+        """Finish a run; the callback hears of all its iterations, also those before."""
+        run.budget.report_to(self._callback)
+        return how(run, known)
 
 
-def _plan(of: RunResult | Trajectory | Motion) -> Motion:
-    return Motion(of.states.copy(), of.controls.copy())
+def _solve_for_duration(
+    problem: Problem, settings: SmootherSettings, *, attentive: bool, threads: int, callback: Callback | None
+) -> Solution:
+    """Solve for the stated duration, then find the best one near it, and finish the plan with that.
+
+    With a weight on time, shorter durations are tried, too, since they may lead another way round.
+    """
+    budget = Budget(settings.max_iterations, callback=callback)
+    budget.stop.begin(settings.time_limit)
+    log, clock = budget.log, time.perf_counter()
+
+    def watch(measures: Measures) -> bool:
+        nonlocal clock
+        now, before = time.perf_counter(), log[-1].cost if log else np.inf
+        budget.record(iteration_of(measures, before, now - clock))
+        clock = now
+        return budget.stop.due
+
+    assert problem.duration is not None
+    stated, first, best = problem.steps * problem.dt, None, None
+    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
+        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+        begin = solve(settled(problem, stated), tries, attentive=attentive, threads=threads, callback=callback)
+        first = begin if first is None else first
+        if attempt and not begin.success:
+            break
+        ended = find_duration(
+            problem,
+            begin.trajectory,
+            tolerance=settings.final(problem),
+            violation=settings.missed(problem),
+            watch=watch,
+        )
+        if (
+            budget.stop.due
+            or ended is None
+            or (best is not None and not ended[1].measures.cost < best[1].measures.cost)
+        ):
+            break
+        best = ended
+        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
+    assert first is not None
+    if best is None:
+        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS
+        detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
+        return budget.stop.finish(replace(first, status=status, detail=detail, iterations=(*first.iterations, *log)))
+    ordinary, found = best
+    m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
+    guess = InitialGuess(
+        np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
+        f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
+    )  # fmt: skip
+    settings = replace(settings, start=guess, starts=None)
+    return budget.stop.finish(solve(ordinary, settings, attentive=attentive, callback=callback))

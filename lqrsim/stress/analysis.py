@@ -1,6 +1,7 @@
-"""The answers of a stress test: how often each policy succeeds, which is better, how it fails, and where it breaks.
+"""Analysis of a stress test: success rates, comparisons of policies, kinds of failures, and breaking points.
 
-All of it is of a table, `Mapping[Cell, Outcomes]`. A trial succeeds if its outcome is "reached"; all else is a failure.
+Most functions take a table, `Mapping[Cell, Outcomes]`. A trial succeeds if its outcome is "reached"; all else is a
+failure.
 """
 
 from collections import Counter
@@ -10,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
 from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm, mean, paired_difference, rate, wilson
 
 Table = Mapping[Cell, Outcomes]
 
-MEASURES = {  # with units; those of tracking errors and of the goal's distance are of robots with a position
+MEASURES = {  # with units; tracking errors and the distance from the goal are in metres for robots with a position
     "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
     "saturated": "", "cost": "",
 }  # fmt: skip
@@ -25,17 +26,28 @@ LEVELS = (0.05, 0.5, 0.95)
 
 
 def succeeded(outcomes: Outcomes) -> npt.NDArray[np.bool_]:
-    """Which trials reached their goal, (K,)."""
-    return outcomes.outcome == "reached"
+    """Whether each trial reached its goal, (K,). Raises InputError unless these are Outcomes."""
+    return _checked(outcomes).outcome == "reached"
+
+
+def _checked(outcomes: Outcomes) -> Outcomes:
+    return check_kind("outcomes", outcomes, Outcomes, "Outcomes, such as results.outcomes(cell)")
+
+
+def _checked_table(table: Table) -> Table:
+    known = isinstance(table, Mapping) and all(isinstance(cell, Cell) for cell in table)
+    if not known or not all(isinstance(one, Outcomes) for one in table.values()):
+        raise InputError(f"table: got {excerpt(table)}, want a mapping from Cell to Outcomes")
+    return table
 
 
 @dataclass(frozen=True)
 class Success:
-    """How often a cell's trials succeeded.
+    """The success rate of a cell.
 
     Attributes:
-      exact: the rate with the interval of Clopper and Pearson, for claims. band: with Wilson's, for plots.
-      alike: all trials are the same, as without a disturbance; the rate is then known, and has no interval.
+      exact: the rate with the interval of Clopper and Pearson, for claims. band: with Wilson's interval, for plots.
+      alike: whether all trials are the same run, as without disturbances; the rate is then exact.
     """
 
     cell: Cell
@@ -47,7 +59,8 @@ class Success:
 
 
 def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -> Success:
-    """How often the trials of a cell succeeded, and how sure that is. Raises InputError for no trials."""
+    """The success rate of a cell with its intervals. Raises InputError if there are no trials."""
+    check_kind("cell", cell, Cell, "a Cell")
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
     exact, band = rate(reached, trials, confidence=confidence), wilson(reached, trials, confidence=confidence)
     same = alike(outcomes)
@@ -57,15 +70,17 @@ def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -
 
 
 def alike(outcomes: Outcomes) -> bool:
-    """Whether all trials, of several, are the same run."""
+    """Whether there are several trials, and all are the same run."""
+    if len(_checked(outcomes)) < 2:
+        return False
     numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
     same = all(np.array_equal(one, np.full_like(one, one[0]), equal_nan=True) for one in numbers)
-    return len(outcomes) > 1 and same and len(set(outcomes.outcome.tolist())) == 1
+    return same and len(set(outcomes.outcome.tolist())) == 1
 
 
 def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CONFIDENCE) -> list[Success]:
-    """Success of a policy over the strength of a sweep, the weakest first. Raises InputError if there is none."""
-    check_name("policy", policy, dict.fromkeys(cell.policy for cell in table))
+    """Success rates of a policy by increasing strength. Raises InputError if the table has no such policy or sweep."""
+    check_name("policy", policy, dict.fromkeys(cell.policy for cell in _checked_table(table)))
     check_name("sweep", sweep, dict.fromkeys(cell.sweep for cell in table))
     cells = [cell for cell in table if (cell.policy, cell.sweep) == (policy, sweep)]
     return [success(cell, table[cell], confidence=confidence) for cell in sorted(cells, key=lambda cell: cell.strength)]
@@ -73,11 +88,13 @@ def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CO
 
 @dataclass(frozen=True)
 class BreakingPoint:
-    """Where a policy breaks.
+    """The strength at which a policy breaks.
 
     Attributes:
-      strength: the least that was tried at which the interval of its success lies below `below`; None: at none.
-      success: there.
+      below: the limit of the success rate.
+      strength: the smallest tried strength at which the interval of the success rate lies below the limit; None if
+        there is none.
+      success: the success rate at this strength.
     """
 
     policy: str
@@ -88,16 +105,10 @@ class BreakingPoint:
 
 
 def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE) -> list[BreakingPoint]:
-    """What breaks first: for each policy and sweep, the least strength with less success than `below`, surely so.
-
-    What breaks at the least strength comes first, what does not break last.
-
-    Raises:
-      InputError: `below` is no rate.
-    """
+    """The breaking point of each policy and sweep, the weakest first. Raises InputError unless `below` is a rate."""
     check_number("below", below, above=0.0, at_most=1.0)
     breaking_points = []
-    for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in table):
+    for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table)):
         points = degradation(table, policy, sweep, confidence=confidence)
         first = next((point for point in points if point.exact.high < below), None)
         strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
@@ -107,13 +118,13 @@ def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two policies on the same trials.
+    """A comparison of two policies on the same trials.
 
     Attributes:
-      pairs: in how many trials only one of them succeeded, and the exact test of that.
-      success: of the first less that of the second. rms: the same of the mean tracking error, among the
+      pairs: number of trials in which only one of them succeeded, with the exact test.
+      success: success rate of the first minus that of the second. rms: the same for the mean tracking error, over the
         `both` trials in which both succeeded; None if there are fewer than two.
-      adjusted: the p-value, for as many comparisons as were made.
+      adjusted: p-value, adjusted for the number of comparisons.
     """
 
     first: Cell
@@ -126,15 +137,15 @@ class Comparison:
 
 
 def comparisons(table: Table) -> list[Comparison]:
-    """The first policy of the table against each other one, in every sweep and at every strength at which it meets it.
+    """Compare the first policy of the table with each other one, for every sweep and strength that both have.
 
-    Differences are on the same trials: of success with Tango's score interval, of errors with Student's. Where the
-    trials of both are all alike, they are one trial and there is nothing to test.
+    Differences are paired by trial: those of success with Tango's score interval, those of errors with Student's. If
+    all trials of both policies are the same run, there is nothing to test.
 
     Raises:
-      InputError: two policies ran other trials.
+      InputError: two policies have different trials.
     """
-    policies = list(dict.fromkeys(cell.policy for cell in table))
+    policies = list(dict.fromkeys(cell.policy for cell in _checked_table(table)))
     compared: list[Comparison] = []
     for other in policies[1:]:
         for cell in table:
@@ -152,7 +163,7 @@ def comparisons(table: Table) -> list[Comparison]:
 
 def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes) -> Comparison:
     if not np.array_equal(one.trial, other.trial):
-        raise InputError(f"{second}: got other trials than those of {first}, want the same, in the same order")
+        raise InputError(f"{second}: got other trials than {first} has, want the same trials in the same order")
     pairs = compare(succeeded(one), succeeded(other))
     difference = paired_difference(pairs.only_first, pairs.only_second, len(one))
     both = succeeded(one) & succeeded(other)
@@ -161,7 +172,7 @@ def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes) -> Comp
 
 
 def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:
-    """How trials failed: outcome and obstacle (empty if it was none) -> how many, the most frequent first."""
+    """Count the kinds of failures: (outcome, obstacle or "") -> number of trials, the most frequent first."""
     failed = ~succeeded(outcomes)
     kinds = zip(outcomes.outcome[failed].tolist(), outcomes.obstacle[failed].tolist(), strict=True)
     return dict(sorted(Counter(kinds).items(), key=lambda kind: (-kind[1], kind[0])))
@@ -170,23 +181,29 @@ def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:
 def quantiles(outcomes: Outcomes, measure: str, levels: Sequence[float] = LEVELS) -> Array:
     """Quantiles of a measure (see MEASURES) over the trials that have it; NaN if none has.
 
-    Infinite values count: where there are no obstacles, all clearance is.
+    Infinite values count: without obstacles, clearance is infinite.
+
+    Raises:
+      InputError: there is no such measure, or a level is not in [0, 1].
     """
-    values = getattr(outcomes, check_name("measure", measure, MEASURES))
+    shares = check_array("levels", levels, (None,))
+    if not ((shares >= 0) & (shares <= 1)).all():
+        raise InputError(f"levels: got {excerpt(levels)}, want numbers from 0 to 1")
+    values = getattr(_checked(outcomes), check_name("measure", measure, MEASURES))
     values = values[~np.isnan(values)]
-    # Not interpolated, which would make a NaN of two infinite values.
-    return np.quantile(values, levels, method="inverted_cdf") if len(values) else np.full(len(levels), np.nan)
+    # Not interpolated: between two infinite values that gives NaN.
+    return np.quantile(values, shares, method="inverted_cdf") if len(values) else np.full(len(shares), np.nan)
 
 
 RANKING = (
-    "Worst are trials that did not run through, then those that collided or were lost, the earliest first, then those"
-    " with the least clearance, then those with the largest tracking error."
+    "The worst trials are those with errors, then those that collided or diverged, the earliest first, then those with"
+    " the least clearance, then those with the largest tracking error."
 )
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial of a cell; its row of the outcomes."""
+    """A trial of a cell, with some of its outcomes."""
 
     cell: Cell
     trial: int
@@ -198,10 +215,10 @@ class Trial:
 
 
 def worst(table: Table, count: int = 10) -> list[Trial]:
-    """The worst trials of all cells, ranked as RANKING says."""
+    """The worst trials of all cells, ranked as RANKING says. Raises InputError unless `count` is a positive number."""
     check_count("count", count)
     ranked: list[tuple[tuple[float, ...], Trial]] = []
-    for cell, outcomes in table.items():
+    for cell, outcomes in _checked_table(table).items():
         over = np.isin(outcomes.outcome, ("collided", "diverged"))
         keys = (
             np.where(outcomes.outcome == "error", 0.0, np.where(over, 1.0, 2.0)),

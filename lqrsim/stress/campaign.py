@@ -1,18 +1,19 @@
-"""Many trials of policies under disturbances of growing strength, into a folder; it can be interrupted anywhere.
+"""Running a campaign: trials of policies under disturbances of growing strength, stored in a folder.
 
     campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.disturbances.ForceNoise(0.2),)})
     results = run_campaign(campaign, "runs/stress/quadrotor")
 
-On equal processors a trial's rows depend on the campaign alone: not on how many workers there are, on what they do at
-once, or on how often the campaign was interrupted.
+A campaign can be interrupted at any time. On equal processors the rows of a trial depend on the campaign alone, not on
+the number of workers, the batch size or interruptions.
 """
 
 import contextlib
+import itertools
 import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,24 +31,23 @@ from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
 from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.manifest import GIVEN, NAME, digest_of_solution, read_manifest, write_manifest
-from lqrsim.stress.results import Results
-from lqrsim.stress.specification import POLICIES as POLICIES
-from lqrsim.stress.specification import TOLD, Shard
-from lqrsim.stress.specification import USUAL as USUAL
-from lqrsim.stress.specification import Campaign as Campaign
-from lqrsim.stress.specification import Cell as Cell
-from lqrsim.stress.trial_tables import Damaged, write
-from lqrsim.stress.trials import (
-    Job,
-    Trials,
-    check_has_use,
-    controller_of,
+from lqrsim.stress.policies import (
+    DESIGNED,
+    POLICIES,
+    POLICY_KINDS,
+    check_used,
+    design_uncertainty,
     impossible_policies,
     left_out,
+    make_controller,
     solve,
-    stated_uncertainty,
-    without_diagnostics,
 )
+from lqrsim.stress.results import Results
+from lqrsim.stress.specification import Campaign as Campaign
+from lqrsim.stress.specification import Cell as Cell
+from lqrsim.stress.specification import Shard
+from lqrsim.stress.trial_tables import Damaged, write
+from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, versions
 
 _log = logging.getLogger("lqrsim")
@@ -66,36 +66,51 @@ def run_campaign(
     scheduler: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Results:
-    """Run what is asked and not there yet; the same call goes on where it was stopped, and what is done stays.
+    """Run the trials of a campaign that are not in its folder yet. Call it again to resume after an interruption.
 
     Args:
       campaign: what to run.
-      folder: takes everything.
-      workers: processes on this machine; by default one a processor. 0: do it in this process.
-      batch: how many trials a worker simulates together; changes nothing but time and memory.
-      solution: runs in place of what its solver would find for the scenario: of a Solution of `smooth`, or the path of
-        one, all policies but "ilqr"; of one of `ilqr`, that one. It is kept in the folder.
-      scheduler: address of a dask cluster that does the work in place of processes on this machine.
-      progress: called with the number of trials that there are and of all: first, and after each shard.
+      folder: where everything is stored.
+      workers: processes on this machine; by default one per processor. 0 runs everything in this process.
+      batch: trials that a worker simulates together; affects only time and memory.
+      solution: a Solution, or the path of one, to run instead of solving the scenario. A solution of `ilqr` replaces
+        that of the policy "ilqr", any other solution those of all other policies. It is stored in the folder.
+      scheduler: address of a dask cluster that does the work instead of processes on this machine.
+      progress: called with the number of finished trials and of all trials: at the start, and after each shard.
 
     Returns:
       The Results.
 
     Raises:
-      InputError: something that is asked cannot be run; the solution is not of the scenario's robot, horizon and goal;
-        the folder is another campaign's, no campaign's, being
-        written, or on a full disk; the cluster cannot be reached; or a script calls this with workers, and not under
-        `if __name__ == "__main__":`, so that each of them would call it again.
+      InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder
+        belongs to another campaign, holds other files, is being written by another process or cannot be written; the
+        cluster cannot be reached; or a script calls this with workers and without `if __name__ == "__main__":`, so that
+        each worker would call it again.
     """
     executors.end_if_started_by_import()
     check_kind("campaign", campaign, Campaign, "a Campaign")
+    options = {"workers": workers, "batch": batch, "scheduler": scheduler, "progress": progress}
+    return run_resolved(campaign, resolve(campaign.scenario), folder, solution=solution, **options)
+
+
+def run_resolved(
+    campaign: Campaign,
+    scenario: Scenario,
+    folder: str | os.PathLike[str],
+    *,
+    workers: int | None,
+    batch: int,
+    solution: Solution | str | os.PathLike[str] | None,
+    scheduler: str | None,
+    progress: Callable[[int, int], object] | None,
+) -> Results:
+    """The same, with the scenario that the campaign names: a user's function may return another one each time."""
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)
-    scenario = resolve(campaign.scenario)
+    check_function("progress", progress, "a function of the number of finished trials and of all", arguments=2)
     given = None if solution is None else solving.given(scenario, solution)
     _check_runnable(campaign, scenario, given)
     _check_folder(folder)
@@ -104,14 +119,12 @@ def run_campaign(
         stack.enter_context(sole_writer(folder))
         _write_or_check_manifest(campaign, scenario, folder, given)
         results = Results(folder, scenario=campaign.scenario)
-        # Of the scenario that was checked: a user's function may make another when it is called again.
-        solutions = {policy: results.solution(policy) for policy in campaign.policies}
-        results.trials = Trials(campaign, scenario, solutions)
+        results.resolved = scenario
         unfinished = _unfinished(results)
         if unfinished:
             _check_versions(results)
-            results.trials.warm_up()  # so that what is compiled is there for the workers
-        job = _job(results, campaign, batch)
+            results.trials.warm_up()  # here first: the workers then find everything compiled
+        job = Job.of(results.trials, results.manifest["digest"], batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         if progress is not None:
@@ -133,28 +146,23 @@ def run_campaign(
     return results
 
 
-def _job(results: Results, campaign: Campaign, batch: int) -> Job:
-    solutions = {policy: without_diagnostics(solution) for policy, solution in results.trials.solutions.items()}
-    return Job(campaign.as_json(), results.manifest["digest"], solutions, batch)
-
-
 def _check_versions(results: Results) -> None:
     if others := changed(results.manifest["versions"]):
         raise InputError(
-            f"versions: got {others}, with which bits can differ, want those {results.folder} was begun with, or"
-            " another folder"
+            f"versions: got {others}, which may change the last bits, want those that {results.folder} was begun with,"
+            " or another folder"
         )
 
 
 def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:
-    """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
+    """Raise InputError for what would fail in every trial, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
     impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
         if policy in impossible:
-            those = ", ".join(one for one in POLICIES if one not in impossible)
-            raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {those}")
-    check_has_use(given, campaign.policies)
+            possible = ", ".join(one for one in POLICIES if one not in impossible)
+            raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
+    check_used(given, campaign.policies)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -166,16 +174,16 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
                 disturbance.start(plant, standing, [np.random.default_rng(campaign.seed)])
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
-            except Exception:  # may depend on the trial, or on the plan; then it is those trials' error
+            except Exception:  # it may depend on the trial or on the plan, and is then an error of those trials
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
-    if {*TOLD} & {*campaign.policies}:
-        stated_uncertainty(scenario, campaign.stated)
+    if {*DESIGNED} & {*campaign.policies}:
+        design_uncertainty(scenario, campaign.design_disturbances)
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise InputError for a folder that is not empty, and no campaign's."""
+    """Raise InputError if the folder holds anything but a campaign."""
     if os.path.isdir(folder) and not os.path.exists(folder / NAME):
         others = sorted(
             name for name in os.listdir(folder) if name not in _CAMPAIGN_FILES and not name.startswith(".unfinished-")
@@ -185,7 +193,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path, given: Solution | None) -> None:
-    """Solve and write the policies, and then the manifest; or see that it is the same campaign that was begun."""
+    """Solve for the policies, store them, and write the manifest; or check the one that is there."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
         "model": sha256(scenario.scene.xml),
@@ -197,9 +205,10 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
     if os.path.exists(folder / NAME):
         _check_same_campaign(specification, read_manifest(folder), folder)
         return
-    policies, solutions = {}, solve(campaign.policies, scenario, campaign.stated, given)
-    for policy in {*TOLD} & {*campaign.policies}:  # what cannot be made is not begun
-        controller_of(policy, scenario, solutions[policy], stated=campaign.stated)
+    design, policies = campaign.design_disturbances, {}
+    solutions = solve(campaign.policies, scenario, design, given)
+    for policy in {*DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
+        make_controller(POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
@@ -221,7 +230,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             )
     for field, what in (("model", "MJCF"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
-            raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
+            raise InputError(f"scenario: got another {what} than {folder} was begun with, want another folder")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / GIVEN
@@ -232,10 +241,10 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
 
 
 def _code(campaign: Campaign) -> dict[str, str | None]:
-    """Hash of the file of each disturbance that is not lqrsim's own; None where it is in none."""
-    kinds = {type(one) for sweep in (*campaign.sweeps.values(), campaign.stated or ()) for one in sweep}
+    """The hash of the file that defines each disturbance of a user's; None for one that is not defined in a file."""
+    used = (*campaign.sweeps.values(), campaign.design_disturbances or ())
     hashes: dict[str, str | None] = {}
-    for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
+    for kind in sorted({type(one) for one in itertools.chain(*used)}, key=lambda kind: kind.__qualname__):
         if kind.__module__.partition(".")[0] != "lqrsim":
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
             hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
@@ -243,16 +252,16 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
 
 
 def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
-    """Its fields, with each sweep as one of them."""
+    """The fields of a campaign, each sweep as one field."""
     sweeps = {f"sweeps: {name}": sweep for name, sweep in campaign["sweeps"].items()}
     return sweeps | {name: value for name, value in campaign.items() if name != "sweeps"}
 
 
 def _unfinished(results: Results) -> list[Shard]:
-    """What is to be done; what is damaged is moved aside, and remains of writing are removed."""
+    """The shards that are still to be run. Removes half-written files, and moves damaged ones aside."""
     for remains in results.folder.glob("**/.unfinished-*"):
         remains.unlink(missing_ok=True)
-    on_disk = results.there()
+    on_disk = results.shards_on_disk()
     return [shard for shard in results.shards() if shard not in on_disk or not _is_intact(results, shard)]
 
 
@@ -261,20 +270,16 @@ def _is_intact(results: Results, shard: Shard) -> bool:
         results.read(shard)
     except Damaged as error:
         path = results.path(shard)
-        aside = next(name for name in _numbered_names(results.folder / "damaged" / path.name) if not name.exists())
+        aside = results.folder / "damaged" / path.name
+        for number in itertools.count(1):
+            if not aside.exists():
+                break
+            aside = aside.with_name(f"{path.name}.{number}")
         try:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
         except OSError as problem:
             raise InputError(f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror})") from None
-        _log.warning("%s was damaged (%s); moved to %s, and done again", path.name, error, aside)
+        _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
         return False
     return True
-
-
-def _numbered_names(path: Path) -> Iterator[Path]:
-    yield path
-    number = 1
-    while True:
-        yield path.with_name(f"{path.name}.{number}")
-        number += 1

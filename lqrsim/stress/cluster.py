@@ -1,9 +1,9 @@
-"""A running dask cluster that does a campaign's work. Tables come back as bytes, so that no folder need be shared.
+"""Running a campaign on a dask cluster. Tables come back as bytes, so no folder needs to be shared.
 
-Dask itself starts workers, hands out the work, and does that of a dead worker again, up to its `allowed-failures`. What
-is added is what it does not have: a time limit of a task that counts from when a worker begins it, and the end of one
-that hangs, for `cancel()` leaves a task that runs running; one task at a time in a worker; and a window of two tasks a
-worker, so that the scheduler does not hold a whole campaign.
+Dask starts workers, distributes tasks, and repeats those of dead workers, up to its `allowed-failures`. Added here are:
+a time limit that counts from the moment when a worker begins a task; restarting a worker that hangs, since `cancel()`
+does not stop a running task; one task at a time per worker; and at most two queued tasks per worker, so that the
+scheduler never holds a whole campaign.
 """
 
 import asyncio
@@ -16,20 +16,20 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from typing import Any
 
-from lqrsim.errors import InputError, told
+from lqrsim.errors import InputError, format_error
 from lqrsim.stress.executors import FinishedShards
 from lqrsim.stress.specification import Shard
-from lqrsim.stress.trials import Job, failed_work, work
+from lqrsim.stress.trials import Job
 from lqrsim.versions import versions
 
-_POLL = 0.5  # s between two looks at what takes too long
+_POLL = 0.5  # s between two checks of the time limit
 RESUME = "run the same command again to resume"
 _lock = threading.Lock()
 
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """A dask client. Raises InputError where there is no cluster with workers that can do the work to the bit."""
+    """Connect a dask client. Raises InputError if there is no cluster, or its workers have other versions."""
     try:
         import distributed
     except ImportError:
@@ -43,7 +43,7 @@ def connected(address: str) -> Iterator[Any]:
     with _silenced(), contextlib.closing(client):
         try:
             versions_there: Any = client.run(versions)
-        except Exception as error:  # whatever a worker has
+        except Exception as error:  # a worker may raise anything
             raise InputError(f"scheduler: got {address}, whose workers do not run lqrsim ({error})") from None
         if not versions_there:
             raise InputError(f"scheduler: got {address}, which has no workers, want at least one")
@@ -52,27 +52,23 @@ def connected(address: str) -> Iterator[Any]:
                 other = ", ".join(
                     f"{name} {theirs.get(name)}" for name, own in versions().items() if theirs.get(name) != own
                 )
-                raise InputError(f"scheduler: got worker {worker} with {other}, want the versions that are here")
+                raise InputError(f"scheduler: got worker {worker} with {other}, want the versions of this machine")
         yield client
 
 
 def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float) -> FinishedShards:
-    """The files of shards as they come. Dask does the work of dead workers again, and gives it up if they die on it.
-
-    Raises:
-      InputError: the scheduler is gone.
-    """
+    """Run the shards on the cluster; yield each with its file. Raises InputError if the scheduler is lost."""
     from distributed import wait
 
     waiting = iter(shards)
     submitted: dict[Any, Shard] = {}
-    started: dict[Shard, tuple[str, float]] = {}  # where and when; a worker counts from when it begins
+    started: dict[Shard, tuple[str, float]] = {}  # where and when a worker began it
     client.subscribe_topic(
         job.run, lambda event: started.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
     )
     try:
         while True:
-            room = 2 * max(1, sum(client.nthreads().values())) - len(submitted)  # one to do, and one to do next
+            room = 2 * max(1, sum(client.nthreads().values())) - len(submitted)  # one running and one waiting each
             for shard in itertools.islice(waiting, max(0, room)):
                 submitted[client.submit(_task, job, shard, key=f"{job.run}-{shard.file}")] = shard
             if not submitted:
@@ -86,20 +82,20 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
                 elif time.monotonic() - started.get(shard, ("", time.monotonic()))[1] > time_limit:
                     del submitted[future]
                     _restart_worker(client, future, started[shard][0])
-                    yield shard, failed_work(job, shard, f"took longer than {time_limit:g} s, and was stopped")
-    except (CancelledError, asyncio.CancelledError):  # of what it was given
-        raise InputError(f"scheduler: got it lost or restarted, want it to keep what it is given: {RESUME}") from None
-    except OSError as error:  # also dask's own, of connections
-        raise InputError(f"scheduler: got none any more ({error}), want it to answer: {RESUME}") from None
+                    yield shard, job.failed(shard, f"took longer than {time_limit:g} s, and was stopped")
+    except (CancelledError, asyncio.CancelledError):
+        raise InputError(f"scheduler: got one that lost its tasks or was restarted, {RESUME}") from None
+    except OSError as error:  # dask's connection errors are OSErrors, too
+        raise InputError(f"scheduler: got no answer any more ({error}), {RESUME}") from None
     finally:
-        with contextlib.suppress(Exception):  # it may be gone
+        with contextlib.suppress(Exception):  # the scheduler may have ended
             client.unsubscribe_topic(job.run)
             client.cancel(list(submitted))
 
 
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
-    """Within this block dask does not write tracebacks to the screen; what matters of them is raised."""
+    """In this block dask prints no tracebacks; errors that matter are raised."""
 
     def silent(record: logging.LogRecord) -> bool:
         return False
@@ -120,22 +116,21 @@ def _contents(job: Job, shard: Shard, future: Any) -> bytes:
         return future.result()
     if future.status in ("cancelled", "lost"):
         raise CancelledError
-    error = future.exception()
-    return failed_work(job, shard, told(error))
+    return job.failed(shard, format_error(future.exception()))
 
 
 def _restart_worker(client: Any, future: Any, worker: str) -> None:
-    """End the worker, for nothing else ends a thread; its nanny starts another."""
+    """Restart a worker by its nanny: a thread that hangs cannot be stopped otherwise."""
     future.cancel()
-    with contextlib.suppress(Exception):  # it may be gone, or have no nanny
+    with contextlib.suppress(Exception):  # it may have ended, or have no nanny
         client.restart_workers([worker], timeout=30, raise_for_error=False)
 
 
 def _task(job: Job, shard: Shard) -> bytes:
-    """In a worker; one at a time, for a process has one set of workspaces."""
+    """Run a shard in a worker; one at a time, because a process has one set of workspaces."""
     from distributed import get_worker
 
     with _lock:
         worker = get_worker()
         worker.log_event(job.run, [worker.address, [shard.cell, shard.first, shard.count]])
-        return work(job, shard)
+        return job.work(shard)

@@ -1,10 +1,16 @@
-"""Processes of this machine that do a campaign's work, watched over: they may die, or hang, and the work goes on.
+"""Worker processes on this machine for a campaign. They may die or hang; the campaign goes on.
 
-What there is does not do that. A `ProcessPoolExecutor` of which one process is killed gives up every task that is not
-done, and does not tell which one was at fault; a task that hangs cannot be cancelled, and before Python 3.14 no process
-of it can be ended without reaching into private fields. A `LocalCluster` of dask does the work of dead workers again,
-but its tasks have no time limit either and go on after `cancel()`; it does not say by which signal a worker ended,
-takes seconds to start and is an extra to install. For clusters of machines see cluster.py.
+Weighed against libraries:
+
+- `ProcessPoolExecutor`: when one process is killed, all unfinished tasks are lost, without a hint which one was at
+  fault. A task that hangs cannot be stopped before Python 3.14.
+- pebble 5.2 has time limits and names the task of a killed worker. But its workers share one pipe and its lock: a
+  worker that is killed while it sends a result keeps the lock, and after two minutes all other tasks are lost, too.
+  A worker that dies before it has read its arguments leaves the pool waiting for ever if they are larger than a pipe.
+- A `LocalCluster` of dask repeats the work of dead workers, but it has no time limits either, does not say by which
+  signal a worker ended, takes seconds to start, and is an extra to install. cluster.py uses dask for many machines.
+
+Here each worker has a pipe of its own.
 """
 
 import contextlib
@@ -22,31 +28,31 @@ from multiprocessing.connection import Connection, wait
 from lqrsim import process
 from lqrsim.errors import InputError
 from lqrsim.stress.specification import Shard
-from lqrsim.stress.trials import Job, Trials, failed_work, prepare, work
+from lqrsim.stress.trials import Job, Trials
 
 FinishedShards = Generator[tuple[Shard, bytes]]
 
-ATTEMPTS = 3  # of a shard, and to start a process
-_START_TIMEOUT = 300.0  # s; a process that is not ready by then never will be
+ATTEMPTS = 3  # to run a shard, and to start a process
+_START_TIMEOUT = 300.0  # s
 _ONE_THREAD = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")
 _context = multiprocessing.get_context("spawn")  # forking a process that has threads is not safe
 _NAME = "lqrsim worker"
-_RUNS_THE_SCRIPT = 79  # exit code of a worker that would start the campaign once more
+_RUNS_THE_SCRIPT = 79  # exit code of a worker whose import of the caller's script starts the campaign again
 _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
 _serving = False  # whether this process is a worker that has imported the caller's script
 
 
 def run_here(job: Job, shards: Iterable[Shard], trials: Trials) -> FinishedShards:
-    """This process does the work; what ends it ends the campaign, until it is resumed."""
+    """Run the shards in this process; yield each with its file. If the process dies, the campaign must be resumed."""
     for shard in shards:
-        yield shard, work(job, shard, trials)
+        yield shard, job.work(shard, trials)
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
-    """Processes do the work; the files of shards as they come.
+    """Run the shards in worker processes; yield each with its file as it is finished.
 
-    A process that dies is replaced, and its shard done again; a shard on which it dies thrice, or that takes longer
-    than the time limit, is one of failed trials.
+    If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
+    times, or if it exceeds the time limit.
 
     Raises:
       InputError: processes cannot be started.
@@ -79,7 +85,7 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                 if failed_starts == ATTEMPTS:
                     raise InputError(f"workers: got processes that do not start ({answer}), want {_GUARD}")
                 if worker.late or attempts[shard] == ATTEMPTS:
-                    yield shard, failed_work(job, shard, answer)
+                    yield shard, job.failed(shard, answer)
                 else:
                     queue.appendleft(shard)
     finally:
@@ -88,21 +94,21 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
 
 
 def end_if_started_by_import() -> None:
-    """End this process if it is a worker that imports the caller's script, which starts the campaign unguarded.
+    """End this process if it is a worker, and its import of the caller's script has started the campaign again.
 
-    Python refuses only that such a process starts others, with a page of text from each, and after all that the script
-    does before. The driver reads the exit code.
+    Python would only refuse to start processes there, with a page of text from each worker, and after all that the
+    script does before. The driver recognises the exit code.
     """
     if multiprocessing.current_process().name == _NAME and not _serving:
         sys.exit(_RUNS_THE_SCRIPT)
 
 
 class _Worker:
-    """A process, and the shard that it has.
+    """A worker process and the shard that it runs.
 
-    It says `STARTED` when it has imported the caller's script, is then given the job and the shard, and says `READY`
-    when it can begin. The job is not among the process's arguments: Python writes those to a pipe whose other end it
-    keeps open meanwhile, and if the process dies before it reads them it waits for ever, deaf to Ctrl-C.
+    It sends `STARTED` once it has imported the caller's script, then receives the job and the shard, and sends `READY`
+    when it can begin. The job is not an argument of the process: Python writes arguments to a pipe whose other end it
+    keeps open, and if the process dies before it reads them, the writer waits for ever, deaf to Ctrl-C.
     """
 
     STARTED, READY = "started", "ready"
@@ -111,22 +117,22 @@ class _Worker:
         self.job = job
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
-        with process.uninterrupted(), _surroundings(), _without_ctrl_c():
+        with process.uninterrupted(), _worker_environment(), _without_ctrl_c():
             self.process.start()
-        theirs.close()  # so that its death is an end of file here
+        theirs.close()  # so that the end of the process closes the pipe
         self.ready = self.late = False
         self.deadline = time.monotonic() + _START_TIMEOUT
 
     def take(self, shard: Shard, time_limit: float) -> None:
-        """Give it work."""
+        """Assign a shard."""
         self.shard = shard
         if self.ready:
             self.deadline = time.monotonic() + time_limit
-            with contextlib.suppress(OSError):  # it has died, which its answer will tell
+            with contextlib.suppress(OSError):  # if it has died, `answer` says so
                 self.connection.send(shard)
 
     def answer(self, time_limit: float) -> bytes | str | None:
-        """The shard's file; or why there will be none; or None where it is still being done."""
+        """The shard's file; or the reason why there will be none; or None while the shard is being run."""
         try:
             while self.connection.poll():
                 message = self.connection.recv()
@@ -134,8 +140,8 @@ class _Worker:
                     self.connection.send(self.job)
                     self.connection.send(self.shard)
                 elif message == self.READY:
-                    self.ready = True  # its clock starts now
-                    self.deadline = time.monotonic() + time_limit
+                    self.ready = True
+                    self.deadline = time.monotonic() + time_limit  # counts from now on
                 else:
                     return message
         except (EOFError, OSError):
@@ -147,28 +153,28 @@ class _Worker:
         return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
 
     def end(self) -> None:
-        """Stop the process, whatever it does."""
+        """Stop the process, whatever it is doing."""
         self.connection.close()
         self.process.kill()
         self.process.join()
 
 
 def _serve(connection: Connection) -> None:
-    """What a worker does."""
+    """The main function of a worker."""
     global _serving
     _serving = True
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all of a terminal's processes; the driver decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the driver handles it
     try:
         connection.send(_Worker.STARTED)
-        job = connection.recv()
-    except (EOFError, OSError):  # the driver is gone
+        job: Job = connection.recv()
+    except (EOFError, OSError):  # the driver has ended
         return
-    prepare(job)
+    job.prepare()
     with contextlib.suppress(EOFError, OSError):
         connection.send(_Worker.READY)
         while True:
-            connection.send(work(job, connection.recv()))
+            connection.send(job.work(connection.recv()))
 
 
 def _end_with_parent() -> None:
@@ -185,15 +191,15 @@ def _exit(code: int | None) -> str:
 
 
 @contextlib.contextmanager
-def _surroundings() -> Iterator[None]:
-    """What is started in this block computes with one thread: there are as many processes as processors.
+def _worker_environment() -> Iterator[None]:
+    """Processes started in this block use one thread each, and the GLFW library that this process has loaded.
 
-    And it takes the GLFW that this process has. To find one, GLFW's package starts a process of its own as MuJoCo is
-    imported, which would outlive a worker that is stopped then, and complain that nobody reads what it has found.
+    Without the latter, importing MuJoCo starts a process that looks for GLFW. It would outlive a worker that is stopped
+    meanwhile, and complain that nobody reads what it has found.
     """
     ours = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
-    if glfw is not None and sys.platform != "win32":  # there it starts none
+    if glfw is not None and sys.platform != "win32":  # it starts none there
         ours["PYGLFW_LIBRARY"] = glfw._name
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
@@ -209,11 +215,11 @@ def _surroundings() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """What is started in this block is not interrupted while it starts either."""
+    """Processes started in this block are not interrupted by Ctrl-C while they start."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    # It is started with the first process, and takes SIGINT out of the mask in which that is then started.
+    # The tracker starts with the first process, and would unblock SIGINT for it.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

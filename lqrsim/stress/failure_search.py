@@ -1,4 +1,4 @@
-"""How a policy fails where random trials seldom show it: how likely that is, and how little it takes.
+"""Failures that random trials seldom show: their probability, and the smallest disturbance that causes one.
 
 problem = ReliabilityProblem("quadrotor", strength=2.0)
 print(problem.rare_failures())  # by multilevel splitting, as `lqrsim rare`
@@ -34,40 +34,39 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
 from lqrsim.stress.manifest import digest_of_solution
-from lqrsim.stress.multilevel_splitting import MOST, SplittingResult, split
-from lqrsim.stress.specification import POLICIES, check_told, disturbance_as_json
+from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, failure_probability
+from lqrsim.stress.policies import POLICIES, check_designed, make_policy
+from lqrsim.stress.specification import disturbances_as_json
 from lqrsim.stress.statistics import Estimate
-from lqrsim.stress.sweeps import sweep
-from lqrsim.stress.trial_score import TrialScore, collision, miss
-from lqrsim.stress.trials import controller_of, solve
+from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
 from lqrsim.versions import versions
 
-FAILURES = {"collision": collision, "miss": miss}
+FAILURES = {"collision": collision_score, "miss": miss_score}
 Report = Callable[[str], object]
-Progress = Callable[[int, int], object]
 
 
 @dataclass(frozen=True)
 class ReliabilityProblem:
-    """A policy of a scenario under disturbances, and what counts as its failure. It is solved when it is first needed.
+    """A policy of a scenario under disturbances, and what counts as its failure. It is solved when first needed.
 
     Attributes:
-      scenario: what is run, as `lqrsim solve` takes it.
-      sweep: disturbances, as `lqrsim stress` names them; by default those of the scenario's demo.
-      strength: what they are multiplied by.
+      scenario: as in `lqrsim solve`.
+      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default those of the scenario's demo.
+      strength: factor by which they are scaled.
       policy: as in `Campaign`.
-      stated: disturbances that "track" or "offset_free" is made for, by name like `sweep`; by default as in `Campaign`.
-      failure: "collision", with an obstacle, or lost; "miss", any trial that does not reach its goal.
-      goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
+      design_disturbances: the name of the set for which "track" or "offset_free" is designed; by default as in
+        `Campaign`.
+      failure: "collision": the robot collides, or its simulation diverges; "miss": it does not reach its goal.
+      goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
       goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
-      solution: a Solution, or the path of one, that runs in place of what its solver would find, as in `run_campaign`.
+      solution: a Solution, or the path of one, to run instead of solving the scenario, as in `run_campaign`.
 
     Raises:
-      InputError: something is not as described.
+      InputError: a field is not as described.
     """
 
     scenario: str
@@ -78,7 +77,7 @@ class ReliabilityProblem:
     failure: str = "collision"
     goal_radius: float | None = None
     goal_tolerance: float | None = None
-    stated: str | None = None
+    design_disturbances: str | None = None
     solution: Solution | str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
@@ -86,9 +85,9 @@ class ReliabilityProblem:
         check_text("sweep", self.sweep, "a name, such as 'light'")
         object.__setattr__(self, "strength", check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)
-        if self.stated is not None:
-            check_told("stated", (self.policy,))
-            check_text("stated", self.stated, "a name, such as 'light'")
+        if self.design_disturbances is not None:
+            check_designed((self.policy,))
+            check_text("design_disturbances", self.design_disturbances, "a name, such as 'light'")
         check_name("failure", self.failure, FAILURES)
         kinds = (Solution, str, os.PathLike, type(None))
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
@@ -98,20 +97,18 @@ class ReliabilityProblem:
 
     @cached_property
     def score(self) -> TrialScore:
-        """The trials as a function of the numbers that they draw. Raises InputError where no such failure can be."""
-        scenario, disturbances = self.resolved, self.disturbances
-        plant = scenario.plant()
+        """The score of trials as a function of their random numbers. Raises InputError if no such failure can occur."""
+        scenario, plant = self.resolved, self.resolved.plant()
         if self.failure == "collision" and not len(plant.world):
             raise InputError(
-                f"failure: got 'collision' for {self.scenario}, where nothing measures how near it is, want 'miss'"
+                f"failure: got 'collision' for {self.scenario}, which has no obstacles with a distance, want 'miss'"
             )
-        stated = None if self.stated is None else sweep(self.stated, scenario)
-        solution = solve((self.policy,), scenario, stated, self.given)[self.policy]
+        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, self.given)
         score = TrialScore(
             plant,
             solution,
-            disturbances,
-            controller=controller_of(self.policy, scenario, solution, stated=stated),
+            self.disturbances,
+            controller=controller,
             **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             failure=FAILURES[self.failure],
         )
@@ -126,16 +123,16 @@ class ReliabilityProblem:
 
     @cached_property
     def given(self) -> Solution | None:
-        """The solution that runs in place of a solve, if there is one. Raises InputError where it does not fit."""
+        """The solution that was given instead of solving, or None. Raises InputError if it does not fit."""
         return None if self.solution is None else solving.given(self.resolved, self.solution)
 
     @cached_property
     def disturbances(self) -> list[Disturbance]:
-        """Those of the sweep at that strength. Raises InputError for an unknown one."""
-        return [one.scaled(self.strength) for one in sweep(self.sweep, self.resolved)]
+        """The disturbances of the set, scaled by the strength. Raises InputError if there is no such set."""
+        return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
 
     def summary(self) -> str:
-        """What is run, what fails, and where the plan ends, in some lines. Raises InputError as `score` does."""
+        """Lines that say what is run, what counts as failure, and where the plan ends. Raises InputError as `score`."""
         score = self.score
         words = "; ".join(one.describe(score.plant) for one in self.disturbances)
         lines = [
@@ -154,17 +151,17 @@ class ReliabilityProblem:
         report: Report | None = None,
         progress: Progress | None = None,
     ) -> "RareFailures":
-        """How likely a failure is that is seldom seen, by multilevel splitting: see `split`.
+        """Estimate the probability of a rare failure by multilevel splitting: see `failure_probability`.
 
         Args:
-          particles: trials that are kept at each level.
-          repetitions: independent ones, of which the interval is made.
+          particles: number of trials at each level.
+          repetitions: number of independent estimates, from which the interval follows.
           seed: of all random numbers.
-          report: called with the summary, and with a line for each level as the pilot run finds it.
-          progress: called with the repetitions that are done, and all of them.
+          report: called with the summary, and with a line for each level that the pilot run finds.
+          progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
 
         Returns:
-          The probability with its interval, and the failures that were seen.
+          The probability with its interval, and the failures that were found.
 
         Raises:
           InputError: an option is out of range, or as `score` does.
@@ -175,9 +172,8 @@ class ReliabilityProblem:
             "particles": check_count("particles", particles, at_least=20),
             "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
         }
-        self._check_callbacks(report, progress)
-        score = self._reported(report)
-        splitting = split(score, score.size, level=self._level(report), progress=progress, **options)
+        score = self._begin(report, progress)
+        splitting = failure_probability(score, score.size, level=self._level(report), progress=progress, **options)
         return RareFailures(self, splitting, options)
 
     def smallest_failure(
@@ -188,28 +184,32 @@ class ReliabilityProblem:
         report: Report | None = None,
         progress: Progress | None = None,
     ) -> "SmallestFailure":
-        """The smallest disturbance that breaks the policy: the failure nearest to none at all, see `smallest_failure`.
+        """Find the smallest disturbance that makes the policy fail: see `lqrsim.stress.smallest_failure`.
 
         Args:
-          rounds: in which it comes nearer, at most.
+          rounds: largest number of rounds.
           seed: of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
-          progress: called with the rounds that are done, and all of them.
+          progress: called with the number of finished rounds, that of all, and the distance so far as text.
 
         Returns:
-          The failure, its distance and its parts.
+          The failure, its distance, and the contribution of each disturbance.
 
         Raises:
-          InputError: an option is out of range, the policy fails with nothing random, or as `score` does.
+          InputError: an option is out of range, the policy fails without any disturbance, or as `score` does.
           NoFailure: none was found.
         """
-        seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_least=0, at_most=MOST)
-        self._check_callbacks(report, progress)
-        score = self._reported(report)
+        seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)
+        score = self._begin(report, progress)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
-            raise InputError(f"scenario: got {self.scenario}, where {self.policy} fails with nothing random, want else")
-        first = split(score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed)
+            raise InputError(
+                f"scenario: got {self.scenario}, where {self.policy} fails with all random numbers at zero, want a"
+                " policy that fails only with others"
+            )
+        first = failure_probability(
+            score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed
+        )
         point = smallest_failure(
             score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
         )
@@ -226,13 +226,16 @@ class ReliabilityProblem:
             options={"seed": seed, "rounds": rounds},
         )
 
-    def _reported(self, report: Report | None) -> TrialScore:
+    def _begin(self, report: Report | None, progress: Progress | None) -> TrialScore:
+        """Check the callbacks, report the summary, and return the score."""
+        check_function("report", report, "a function of a line of text", arguments=1)
+        check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
         if report is not None:
             report(self.summary())
         return self.score
 
     def _level(self, report: Report | None) -> Callable[[float], object] | None:
-        """Reports a level of the score, with its unit."""
+        """A callback that reports a level of the score with its unit."""
         if report is None:
             return None
         unit = "m" if len(self.score.plant.world) else self.score.solution.target.unit
@@ -242,18 +245,13 @@ class ReliabilityProblem:
 
         return report_level
 
-    @staticmethod
-    def _check_callbacks(report: Report | None, progress: Progress | None) -> None:
-        check_function("report", report, "a function of a line of text", arguments=1)
-        check_function("progress", progress, "a function of how much is done, of how much", arguments=2)
-
 
 @dataclass(frozen=True)
 class RareFailures:
-    """How likely a policy fails, and failures as they are typical.
+    """The probability that a policy fails, and typical failures.
 
     Attributes:
-      problem: whose failures. options: `seed`, `particles` and `repetitions`.
+      problem: the ReliabilityProblem. options: `seed`, `particles` and `repetitions`.
       splitting: the levels, the estimate of each repetition, and all failures that were found.
     """
 
@@ -263,42 +261,42 @@ class RareFailures:
 
     @property
     def probability(self) -> Estimate:
-        """Of failure, with its interval."""
+        """The probability of failure with its interval."""
         return self.splitting.probability
 
     @property
     def plain_trials(self) -> float | None:
-        """How many plain trials have the same standard error, in the mean; None where all repetitions agree."""
+        """Number of plain trials with the same standard error; None if all repetitions agree."""
         plain = self.splitting.plain_trials
         return plain if np.isfinite(plain) else None
 
     def summary(self) -> str:
-        """The probability with its interval, and what it took, in two lines."""
+        """Two lines: the probability with its interval, and the number of simulated trials."""
         one, plain = self.probability, self.plain_trials
         interval = f"{100 * one.confidence:g} % interval, {self.options['repetitions']} repetitions"
-        alike = "unknown, for all repetitions agree" if plain is None else f"about {_rounded(plain)}"
+        needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
         return (
             f"probability of failure: {one:.2g} ({interval})\n"
-            f"simulated: {self.splitting.simulations:,} trials; plain ones for the same certainty: {alike}"
+            f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}"
         )
 
     __str__ = summary
 
     def typical(self, count: int = 8) -> Array:
-        """The numbers of so many failures at most, (k, d): the worst first, then others, distributed as failures are.
+        """The random numbers of at most `count` failures, (k, d): the worst, then others in their own distribution.
 
         Raises:
-          InputError: it is no number of failures.
+          InputError: `count` is not a positive whole number.
         """
         check_count("count", count)
         scores = self.splitting.scores
         worst = int(scores.argmax())
-        others = np.delete(np.arange(len(scores)), worst)  # of all repetitions, in their order
+        others = np.delete(np.arange(len(scores)), worst)  # in the order of the repetitions
         chosen = np.linspace(0, len(others), count - 1, endpoint=False).astype(int)
         return self.splitting.failures[[worst, *others[np.unique(chosen)[: len(others)]]]]
 
     def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:
-        """Write rare.json, and so many typical failures as rollout.npz; returns these. Raises InputError."""
+        """Write rare.json, and `shown` typical failures as rollout.npz. Returns these; raises InputError."""
         folder, result, one = check_path("folder", folder, "the path of a folder"), self.splitting, self.probability
         numbers = self.typical(check_count("shown", shown))
         found = {
@@ -312,14 +310,14 @@ class RareFailures:
 
 @dataclass(frozen=True)
 class SmallestFailure:
-    """The failure nearest to no disturbance, and what it is made of.
+    """The failure nearest to the undisturbed trial, and the contribution of each disturbance.
 
     Attributes:
-      problem: whose failure. options: `seed` and `rounds`.
-      point: its numbers, how far that is in standard deviations, and how sure it is.
-      simulations: trials that were run, those of the splitting before the search included.
-      disturbances: in words. shares: of each in the square of the distance.
-      largest: what they do at their largest, in physical units.
+      problem: the ReliabilityProblem. options: `seed` and `rounds`.
+      point: its random numbers, their distance in standard deviations, and whether the search converged.
+      simulations: number of trials, those of the splitting before the search included.
+      disturbances: descriptions. shares: the share of each in the squared distance.
+      largest: the largest disturbances of the trial in physical units.
     """
 
     problem: ReliabilityProblem
@@ -331,24 +329,22 @@ class SmallestFailure:
     options: Mapping[str, int]
 
     def summary(self) -> str:
-        """The distance, FORM's estimate, each disturbance's share, and what each is at its largest, a line each."""
+        """Lines with the distance, FORM's estimate, the share of each disturbance, and the largest disturbances."""
         point = self.point
         lines = [
             f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"
             f" {self.simulations:,} trials"
         ]
         if not point.converged:
-            left = "an unknown share" if np.isnan(point.remaining) else f"some {100 * point.remaining:.1f} %"
-            lines.append(
-                f"the rounds ended first: by the noise of what it knows, {left} may be left to gain; more --rounds"
-            )
+            left = "an unknown share" if np.isnan(point.remaining) else f"about {100 * point.remaining:.1f} %"
+            lines.append(f"not converged: {left} of the distance may be left to gain; use more --rounds")
         likely = point.first_order_probability
         lines.append(
-            f"if all failures lay beyond it, one trial in {_rounded(1 / max(likely, 1e-300))} would fail"
-            f" (reliability {1 - likely:.6g}); `lqrsim rare` measures how many do"
+            f"first-order estimate: one trial in {_rounded(1 / max(likely, 1e-300))} fails"
+            f" (reliability {1 - likely:.6g}); `lqrsim rare` measures the probability"
         )
         parts = zip(self.shares, self.problem.score.sizes, self.disturbances, strict=True)
-        lines += [f"{100 * share:6.1f} % of its square: {words} ({count:,} of the numbers)"
+        lines += [f"{100 * share:6.1f} % of the squared distance: {words} ({count:,} numbers)"
                   for share, count, words in parts if count]  # fmt: skip
         lines += [
             f"largest {one.what}: {one.size:.3g} {one.unit}".rstrip() + f" at {one.time:.2f} s" for one in self.largest
@@ -358,7 +354,7 @@ class SmallestFailure:
     __str__ = summary
 
     def save(self, folder: str | os.PathLike[str]) -> Rollout:
-        """Write break.json, and that trial as rollout.npz; returns the trial. Raises InputError."""
+        """Write break.json, and the trial as rollout.npz. Returns the trial; raises InputError."""
         folder, point = check_path("folder", folder, "the path of a folder"), self.point
         found = {
             "distance": point.distance, "first_order_probability": point.first_order_probability,
@@ -378,8 +374,8 @@ def _write(
     found: Mapping[str, Any],
     numbers: Array,
 ) -> Rollout:
-    """Write trials with these numbers as rollout.npz, and what was asked and found as NAME.json; returns the trials."""
-    # As they look: stopped by what they run into, up to which they are the same to the bit.
+    """Write trials with these numbers as rollout.npz, and options and results as NAME.json. Returns the trials."""
+    # With contacts, for pictures; bit-identical until the collision.
     rollout = replace(problem.score, contacts=True).rollout(numbers)
     asked = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
     asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
@@ -387,7 +383,7 @@ def _write(
         "format": f"lqrsim {name}",
         "version": 1,
         "asked": asked,
-        "disturbances": [disturbance_as_json(one) for one in problem.disturbances],
+        "disturbances": disturbances_as_json(problem.disturbances),
         "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,
         "policy": digest_of_solution(problem.score.solution),
@@ -402,5 +398,6 @@ def _write(
 
 
 def _rounded(number: float) -> str:
-    """Two digits of it, as a whole number where that is short."""
+    """The number with two significant digits, without an exponent below 1e9."""
+
     return f"{float(f'{number:.2g}'):,.0f}" if number < 1e9 else f"{number:.2g}"

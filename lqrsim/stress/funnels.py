@@ -1,6 +1,6 @@
-"""`funnel`: from where a policy works. `levels.py` says how a level is found, and what its confidence rests on."""
+"""Funnels: the region around a plan from which a policy reaches the goal. `levels.py` says how a level is found."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,22 +26,21 @@ from lqrsim.errors import (
 from lqrsim.problem.noise import Noise
 from lqrsim.results.funnel import Funnel, flat
 from lqrsim.results.goal import Target, endings
-from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.simulation.begun_later import simulate_from
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.start_at import simulate_from
 from lqrsim.solvers.parallel import check_threads
-from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, Test, find_level, smallest_test
+from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, LevelTest, find_level, smallest_test
+from lqrsim.stress.multilevel_splitting import Progress
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
 
 KNOTS = 5  # by default
-FAR = 2.0**20  # times the level that the search begins with, beyond which it does not look
-DRAWN = 2**31  # the stream of a trial that its point is drawn from; disturbances have the first ones
+FAR = 2.0**20  # largest level, relative to the first one that is tried
+DRAWN = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
 FAILURES = 3
 
 
@@ -62,45 +61,45 @@ def funnel(
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
     threads: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Funnel:
-    """The largest ellipsoids about a plan from which runs reach the goal as often as is asked.
+    """Find the largest ellipsoids about a plan from which runs reach the goal with a given success rate.
 
-    Limits, obstacles and whatever else ends a trial count, for the trials are simulated. The rate is the share of
-    states drawn uniformly in the ellipsoid, and of the disturbances; see `Funnel`. The confidence is that all levels
-    are right at once: each knot has its part of what is missing to 1. A level that would claim too much is 0, with the
-    reason.
+    The trials are simulated, so that limits, obstacles and everything else that ends a trial counts. The rate is over
+    states drawn uniformly in the ellipsoid, and over the disturbances; see `Funnel`. With the given confidence all
+    levels are right at once: the error probability is divided among the knots. A level of 0, with its reason, means
+    that no level was certified.
 
-    A run that begins at a later knot is taken to have been as planned until then: see `simulate_from`.
+    A run that begins at a later knot is taken to have followed the plan until then: see `simulate_from`.
 
     Args:
       plant: as in `simulate`.
       solution: as in `simulate`.
-      disturbances: as in `simulate`. What an `InitialStateError` draws does not count.
+      disturbances: as in `simulate`, without those that change the start of a run, such as `InitialStateError`.
       controller: as in `simulate`; by default the solution's policy.
-      rate: wished success rate, above 0 and below 1.
+      rate: wanted success rate, above 0 and below 1.
       confidence: that all levels are right, at least 0.5 and below 1.
-      knots: numbers of those at which runs begin; by default 5, from the first on.
-      states: names of those that may be off the plan, the others being on it; by default all.
-      shape: the ellipsoids' family: by default that of the solution's cost-to-go; or a `Tube`, whose covariance it is;
-        or a covariance (n, n), or one a knot, (T+1, n, n). What is certified does not depend on it, but how much does.
-      largest: level beyond which none is tried; by default where an angle could be off by half a turn.
-      failures: how many trials of a test may fail. With more, there are more trials, and levels come out larger.
-      seed: of all draws.
+      knots: numbers of the knots at which runs begin; by default 5, from the first on.
+      states: names of the states that may be off the plan; by default all.
+      shape: family of the ellipsoids: by default that of the solution's cost-to-go; or a `Tube`, for its covariance; or
+        a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
+      largest: largest level that is tried; by default that at which an angle is off by half a turn.
+      failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
+      seed: of all random numbers.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       threads: as in `simulate`.
-      progress: called with the number of knots that are done, and of all.
+      progress: called with the number of finished knots, that of all, and what is being tried as text.
 
     Returns:
       A Funnel.
 
     Raises:
-      InputError: as `simulate`; an option is out of range; there is no cost-to-go and no shape; or an ellipsoid is
-        flat.
+      InputError: as `simulate`; a disturbance changes the start of a run; an option is out of range; there is no
+        cost-to-go and no shape; or an ellipsoid is flat.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
-    check_function("progress", progress, "a function of how many knots are done, of how many", arguments=2)
+    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     if largest is not None:
         largest = check_number("largest", largest, above=0.0)
     options = {"failures": failures, "largest": largest}
@@ -122,58 +121,60 @@ def _blank(
     trials: "_Trials", asked: dict[str, Any], knots: Sequence[int] | None, states: Sequence[str] | None,
     shape: Tube | npt.ArrayLike | None,
 ) -> Funnel:  # fmt: skip
-    """A funnel without levels. Raises InputError for what cannot be one."""
+    """A funnel without levels. Raises InputError for invalid options."""
     solution = trials.solution
     plan, law = solution.trajectory, solution.policy
     asked["confidence"] = check_number("confidence", asked["confidence"], at_least=0.5, below=1.0)
-    begun, names = _knots(knots, plan.steps), _states(states, solution)
+    starts, names = _knots(knots, plan.steps), _states(states, solution)
     shapes = _shapes(solution, shape, [law.state_coordinates.names.index(name) for name in names])
-    for knot in begun:
+    for knot in starts:
         if flat(shapes[knot]):
             raise InputError(
                 f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
             )
-    none = np.zeros(len(begun), dtype=np.int64)
+    none = np.zeros(len(starts), dtype=np.int64)
     return Funnel(
         plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
-        shape=shapes, family=_family(shape), knots=np.array(begun), levels=none * 1.0, trials=none, successes=none,
-        reasons=("",) * len(begun), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
+        shape=shapes, family=_family(shape), knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
+        reasons=("",) * len(starts), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
         disturbances=tuple(one.describe(trials.plant) for one in trials.disturbances), versions=versions(), **asked,
     )  # fmt: skip
 
 
 def _search(
-    whole: Funnel, trials: "_Trials", test: Test, largest: float | None,
-    progress: Callable[[int, int], object] | None,
+    whole: Funnel, trials: "_Trials", test: LevelTest, largest: float | None, progress: Progress | None
 ) -> list[FoundLevel]:  # fmt: skip
-    """The level at each knot of a funnel that has none yet."""
+    """Find the level at each knot of a funnel that has none yet."""
     found: list[FoundLevel] = []
     size, chosen = len(whole.knots), whole.chosen
     for done, knot in enumerate(whole.knots.tolist()):
-        if progress is not None:
-            progress(done, size)
+        last = f", level {found[-1].level:.3g} at the one before" if found else ""
         shape = whole.shape[knot]
         guess = _reach(trials.plant, whole.state_coordinates.position, chosen, shape)
         end = min(_half_turn(trials.solution, chosen, shape), guess * FAR if largest is None else largest)
 
-        def runs(level: float, numbers: npt.NDArray[np.intp], knot: int = knot) -> npt.NDArray[np.bool_]:
+        def runs(
+            level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
+        ) -> npt.NDArray[np.bool_]:
+            if progress is not None:
+                progress(done, size, f"trying level {level:.3g} at knot {knot}{last}")
             points = points_of(numbers, whole.seed, len(chosen))
             return trials.reached(whole.states_at(knot, points, level), knot, whole.seed, numbers)
 
         found.append(find_level(runs, test, guess=guess, largest=end, rate=whole.rate))
     if progress is not None:
-        progress(size, size)
+        progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}")
     return found
 
 
 class FunnelCheck(NamedTuple):
-    """How new trials went.
+    """New trials at a knot of a funnel.
 
     Attributes:
-      knot: at which they began.
-      level: of the funnel there.
-      reached: the share that succeeded, with its exact interval.
-      successes: which of them did, (K,).
+      knot: at which the trials began.
+      level: of the funnel at the knot.
+      reached: the success rate with its exact interval.
+      successes: whether each trial reached the goal, (K,).
     """
 
     knot: int
@@ -196,23 +197,23 @@ def check_funnel(
     goal_tolerance: float | None = None,
     threads: int | None = None,
 ) -> tuple[FunnelCheck, ...]:
-    """New trials from states drawn uniformly in a funnel, or just outside, at each knot that has a level.
+    """Run new trials from states drawn uniformly inside a funnel, or in a shell outside, at each knot with a level.
 
     Args:
-      funnel: that is checked.
+      funnel: the funnel to check.
       plant: as for `funnel`.
       solution: as for `funnel`.
       disturbances: as for `funnel`.
       controller: as for `funnel`.
-      trials: at each knot.
-      between: shares of the level: (0, 1) is inside, (1, 1.5) a shell outside.
-      seed: of all draws; another than the funnel's, or the trials are not new.
+      trials: number of trials at each knot.
+      between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
+      seed: of all random numbers; it must differ from the funnel's, or the trials would not be new.
       goal_radius: as for `funnel`.
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.
 
     Returns:
-      A FunnelCheck of each such knot.
+      A FunnelCheck for each of these knots.
 
     Raises:
       InputError: as `funnel`; the seed is the funnel's; or the solution has another plan.
@@ -220,13 +221,13 @@ def check_funnel(
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
-        raise InputError("solution: got one with another plan than the funnel's, want that of the funnel")
+        raise InputError("solution: got one with another plan than the funnel's, want the funnel's own solution")
     check_count("trials", trials, at_most=MOST_TRIALS)
     shares = check_array("between", between, (2,))
     if not 0 <= shares[0] < shares[1]:
         raise InputError(f"between: got {excerpt(between)}, want two shares of the level, in order, from 0 on")
     if check_seed("seed", seed) == funnel.seed:
-        raise InputError(f"seed: got {seed}, the funnel's own, want another: the trials would not be new")
+        raise InputError(f"seed: got {seed}, the funnel's own, want another one, for new trials")
     found, size = [], len(funnel.states)
     for knot, level in zip(funnel.knots.tolist(), funnel.levels.tolist(), strict=True):
         if level == 0:
@@ -234,15 +235,15 @@ def check_funnel(
         parts = []
         for first in range(0, trials, BATCH):
             numbers = np.arange(first, min(first + BATCH, trials))
-            begun = funnel.states_at(knot, points_of(numbers, seed, size, (shares[0], shares[1])), level)
-            parts.append(runner.reached(begun, knot, seed, numbers))
+            starts = funnel.states_at(knot, points_of(numbers, seed, size, (shares[0], shares[1])), level)
+            parts.append(runner.reached(starts, knot, seed, numbers))
         reached = np.concatenate(parts)
         found.append(FunnelCheck(knot, level, rate_of(int(reached.sum()), trials), reached))
     return tuple(found)
 
 
 def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tuple[float, float] = (0.0, 1.0)) -> Array:
-    """A point (K, size) for each trial, uniform by volume between two balls about 0, of its own stream."""
+    """A point for each trial from its own random stream, uniform by volume between two balls about 0, (K, size)."""
     points = np.empty((len(numbers), size))
     low, high = (share**size for share in between)
     for row, trial in enumerate(numbers.tolist()):
@@ -263,31 +264,28 @@ class _Trials:
         self.solution = check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
         self.law, _ = as_controller(controller, solution, plant.robot.dynamics)
         self.disturbances = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
-        # A rest of the plan has another range, which goals without a position are measured by.
+        # The tolerance of a goal without a position is relative to the range of the whole plan, not of its rest.
         self.target = Target(solution.policy.state_coordinates, solution.goal, solution.trajectory.states)
         self.radius = self.target.radius(plant.robot.radius, *near)
         self.options: Mapping[str, Any] = {"goal_radius": near[0], "goal_tolerance": near[1], "frames": False,
                                            "contacts": False, "threads": check_threads(threads)}  # fmt: skip
 
     def reached(self, states: Array, knot: int, seed: int, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-        """Which trials of these numbers (K,), that begin in the states (K, n), reach the goal, (K,)."""
+        """Whether the trials with these numbers (K,), begun in the states (K, n), reach the goal, (K,)."""
         streams = seeded(seed)
         run = simulate_from(
             self.plant, self.solution, states, knot=knot, disturbances=self.disturbances, controller=self.law,
             generators=lambda trial, stream: streams(int(numbers[trial]), stream), **self.options,
         )  # fmt: skip
-        return self.outcome(run) == "reached"
-
-    def outcome(self, run: Rollout) -> npt.NDArray[np.str_]:
-        """How the trials ended."""
-        return endings(
+        outcome, *_ = endings(
             collided_at=run.collided_at, diverged_at=run.diverged_at, failed_at=run.failed_at,
             distance=self.target.distance(run.states[:, -1]), radius=self.radius, horizon=run.plan.horizon,
-        )[0]  # fmt: skip
+        )  # fmt: skip
+        return outcome == "reached"
 
 
 def _knots(knots: Sequence[int] | None, steps: int) -> list[int]:
-    """Those that are asked for, in order. Raises InputError for others than the plan has."""
+    """The chosen knots in order. Raises InputError for knots that the plan does not have."""
     if knots is None:
         return sorted({int(knot) for knot in np.linspace(0, steps, min(KNOTS, steps) + 1)[:-1]})
     given = check_items("knots", knots, (int, np.integer), "numbers of knots", at_most=10_000)
@@ -298,7 +296,7 @@ def _knots(knots: Sequence[int] | None, steps: int) -> list[int]:
 
 
 def _states(states: Sequence[str] | None, solution: Solution) -> tuple[str, ...]:
-    """Names of those that may be off the plan. Raises InputError for others than there are."""
+    """Names of the chosen states. Raises InputError for states that do not exist."""
     known = solution.policy.state_coordinates.names
     if states is None:
         return known
@@ -313,12 +311,12 @@ def _family(shape: object) -> str:
 
 
 def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list[int]) -> Array:
-    """Covariances (T+1, d, d) of the chosen states; zero where there is none."""
+    """Covariances (T+1, d, d) of the chosen states; zero at knots without one."""
     plan = solution.trajectory
     knots, n = plan.states.shape
     if shape is None:
         if solution.cost_to_go is None:
-            raise InputError(f"shape: got none, and a solution without a cost-to-go ({solution.status.name}), want one")
+            raise InputError(f"shape: got none for a solution without a cost-to-go ({solution.status.name}), want one")
         curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
         return np.array([_inverse(one) for one in curve])
     if isinstance(shape, Tube):
@@ -335,7 +333,7 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
 
 
 def _inverse(curve: Array) -> Array:
-    """Of a Hessian (d, d); zero where it has none, or it is no ellipsoid's."""
+    """Inverse of a Hessian (d, d); zero if it is not that of an ellipsoid."""
     if flat(curve):
         return np.zeros_like(curve)
     size = np.sqrt(np.diagonal(curve))
@@ -344,14 +342,15 @@ def _inverse(curve: Array) -> Array:
 
 
 def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Array) -> float:
-    """The level at which the position may be off by the robot's radius; 1 without a position or a radius."""
+    """The level at which the position is off by the robot's radius; 1 without a position or a radius."""
     rows = [chosen.index(i) for i in position if i in chosen]
     widest = float(np.sqrt(max((shape[i, i] for i in rows), default=0.0)))
     return plant.robot.radius / widest if widest > 0 and plant.robot.radius > 0 else 1.0
 
 
 def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
-    """The level at which an angle may be off by half a turn, where states would be in the ellipsoid twice."""
+    """The level at which an angle is off by half a turn; beyond it the ellipsoid has some states twice."""
+
     space = solution.policy.state_coordinates
     groups = [[i] for i in space.angles] + [[i, i + 1, i + 2] for i in space.rotation_vectors]
     end = np.inf

@@ -1,12 +1,12 @@
-"""The largest of nested levels at which trials succeed with a stated rate, and how sure that is.
+"""The largest of nested levels at which trials succeed with a given rate, certified with a given confidence.
 
-A pilot looks for it, by steps and bisection, with the same random numbers at each level. What it says is not
-believed. Fresh trials then test levels that are fixed shares of the pilot's, from the smallest up, each at the whole
-confidence, until one does not pass: the last that did is the answer. That order is fixed before the fresh trials are
-run, and a level is only tested if all below it passed. So a wrong claim needs the first level at which the rate is too
-low to pass its test, which is as improbable as that test allows: no confidence has to be shared among the levels, and
-none is lost to choosing (the fixed-sequence procedure; Maurer, Hothorn & Lehmacher, 1995). The tests may share their
-trials. They are exact: a test passes if the one-sided bound of Clopper and Pearson is at least the rate.
+A pilot search finds a candidate by steps and bisection, with the same random numbers at each level. Fresh trials then
+test fixed shares of that level, from the smallest up, each with the whole confidence, until one fails; the last level
+that passed is the result. The order is fixed before the fresh trials run, and a level is tested only if all smaller
+ones passed. So a wrong result requires that the first level whose rate is too low passes its test, which is as
+improbable as that test allows: the confidence need not be divided among the levels (the fixed-sequence procedure;
+Maurer, Hothorn & Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided
+bound of Clopper and Pearson is at least the rate.
 """
 
 from collections.abc import Callable
@@ -19,22 +19,22 @@ from lqrsim.errors import InputError, check_count, check_number
 from lqrsim.stress.statistics import rate as rate_of
 
 SHARES = (0.7, 0.9, 1.0)  # of the pilot's level, in the order in which they are tested
-NEAR = 1.04  # how near the pilot comes: the ratio of a level at which too many fail to the one that it returns
-HALVINGS = 40  # after which there is no level
-FEW = 64  # trials that find out about where the level is
-BATCH = 512  # trials that are run together
+NEAR = 1.04  # the pilot's accuracy: ratio of a level with too many failures to its result
+HALVINGS = 40  # steps down after which the pilot gives up
+FEW = 64  # trials of the pilot's coarse search
+BATCH = 512  # trials that are simulated together
 MOST_TRIALS = 1_000_000
 
 Runs = Callable[[float, npt.NDArray[np.intp]], npt.NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
-class Test:
-    """What a level has to pass.
+class LevelTest:
+    """The test that a level has to pass.
 
     Attributes:
-      trials: that are run. failures: of them that are allowed. aim: that the pilot allows of as many: fewer, for what
-        just passes there would fail every other time.
+      trials: number of trials. failures: number of them that may fail. aim: number that may fail in the pilot; smaller,
+        because a level that just passes in the pilot would fail every second test.
     """
 
     trials: int
@@ -42,48 +42,48 @@ class Test:
     aim: int
 
 
-def smallest_test(rate: float, confidence: float, failures: int) -> Test:
-    """The fewest trials of which so many may fail, so that the rate is shown with that confidence.
+def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
+    """The test with the fewest trials that proves the rate with the given confidence if `failures` trials fail.
 
     Raises:
-      InputError: one is out of range, or it takes more trials than anybody wants to run.
+      InputError: an argument is out of range, or the test needs more than MOST_TRIALS trials.
     """
     rate = check_number("rate", rate, above=0.0, below=1.0)
     confidence = check_number("confidence", confidence, above=0.0, below=1.0)
     check_count("failures", failures, at_least=0, at_most=10_000)
 
-    def shown(trials: int) -> bool:
+    def proves(trials: int) -> bool:
         return lowest_rate(trials - failures, trials, confidence) >= rate
 
     high = failures + 1
-    while not shown(high):
+    while not proves(high):
         high *= 2
         if high > MOST_TRIALS:
             raise InputError(
-                f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which take more than"
-                f" {MOST_TRIALS:,} trials, want less of one of them"
+                f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
+                f" {MOST_TRIALS:,} trials, want one of them smaller"
             )
-    low = failures  # of which none succeeds
+    low = failures  # trials, all of which fail
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if shown(middle) else (middle, high)
-    return Test(high, failures, (2 * failures) // 3)
+        low, high = (low, middle) if proves(middle) else (middle, high)
+    return LevelTest(high, failures, (2 * failures) // 3)
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:
-    """The exact lower bound of a success rate: one-sided, so it is that of a two-sided interval of less confidence."""
-    if confidence < 0.5:  # which no two-sided interval has
+    """The exact one-sided lower bound of a success rate: that of a two-sided interval with less confidence."""
+    if confidence < 0.5:  # there is no such two-sided interval
         raise InputError(f"confidence: got {confidence:g}, want a number >= 0.5")
     return rate_of(successes, trials, confidence=max(2 * confidence - 1, 1e-12)).low
 
 
 @dataclass(frozen=True)
 class FoundLevel:
-    """What was found.
+    """A certified level.
 
     Attributes:
-      level: 0 where none passed. trials, successes: of its test. reason: why it is 0, or what kept larger ones from
-        being tried; else empty. pilot: the pilot's level. simulated: trials that were run in all.
+      level: 0 if none passed. trials, successes: of its test. reason: why the level is 0, or why no larger one was
+        tried; else empty. pilot: the pilot's level. simulated: number of all trials.
     """
 
     level: float
@@ -94,13 +94,13 @@ class FoundLevel:
     simulated: int
 
 
-def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: float) -> FoundLevel:
-    """The largest level that passes the test, as far as the pilot finds it.
+def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rate: float) -> FoundLevel:
+    """Find the largest level that passes the test, within the accuracy of the pilot.
 
     Args:
-      runs: (level, numbers of the trials (K,)) -> which of them succeed. Trials of different numbers are independent;
-        those of the same number have the same random numbers at all levels.
-      guess: where the pilot begins. largest: beyond which it does not look. rate: that is tested, for the reason.
+      runs: (level, numbers of the trials (K,)) -> whether each succeeds. Trials with different numbers are independent;
+        a trial has the same random numbers at all levels.
+      guess: where the pilot begins. largest: level that is tried. rate: tested rate, for the text of the reason.
     """
     pilot = _Pilot(runs, test)
     aimed = pilot.level(min(guess, largest), largest)
@@ -108,11 +108,11 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
         failed = pilot.failures(0.0, test.trials)
         if failed > test.aim:
             reason = (
-                f"begun on the plan itself, {failed} of {test.trials} trials fail, and no more than {test.aim} may for"
-                f" {rate:g} to be shown"
+                f"begun on the plan itself, {failed} of {test.trials} trials fail; to prove a rate of {rate:g}, at most"
+                f" {test.aim} may"
             )
         else:
-            reason = "too many trials fail at every level that was tried, however small"
+            reason = "too many trials fail at all levels that were tried, down to the smallest"
         return FoundLevel(0.0, 0, 0, reason, 0.0, pilot.simulated)
     found, stopped, simulated = (0.0, 0, 0), "", pilot.simulated
     for level in dict.fromkeys(min(share * aimed, largest) for share in SHARES):
@@ -126,10 +126,10 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
     return FoundLevel(*found, reason, aimed, simulated)
 
 
-def fresh(runs: Runs, level: float, test: Test) -> tuple[int, int]:
-    """How many of the test's own trials fail, and of how many; no more are run once it is more than allowed.
+def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
+    """Run the test's own trials, which the pilot has not used. Returns how many fail, and how many were run.
 
-    No pilot has seen these trials.
+    It stops once more have failed than are allowed.
     """
     failed, done = 0, 0
     while done < test.trials and failed <= test.failures:
@@ -140,18 +140,18 @@ def fresh(runs: Runs, level: float, test: Test) -> tuple[int, int]:
 
 
 class _Pilot:
-    """Looks for a level. It takes a trial that succeeds to succeed at all lower levels, too, and so runs few again.
+    """Searches for a level. It assumes that a trial that succeeds also succeeds at all lower levels, and so runs less.
 
-    Where that is not so it looks in the wrong place; the fresh trials do not rest on it.
+    If that is wrong, the level is less accurate; the fresh trials do not rely on it.
     """
 
-    def __init__(self, runs: Runs, test: Test) -> None:
+    def __init__(self, runs: Runs, test: LevelTest) -> None:
         self.runs, self.test, self.simulated = runs, test, 0
-        self._good = np.full(test.trials, -np.inf)  # the largest level at which each has succeeded
-        self._bad = np.full(test.trials, np.inf)  # the smallest one at which it has failed
+        self._good = np.full(test.trials, -np.inf)  # the largest level at which each trial has succeeded
+        self._bad = np.full(test.trials, np.inf)  # the smallest level at which each trial has failed
 
     def failures(self, level: float, trials: int) -> int:
-        """How many of the first trials fail."""
+        """Number of failures at a level among the first `trials` trials."""
         unknown = np.flatnonzero((self._good[:trials] < level) & (self._bad[:trials] > level))
         for first in range(0, len(unknown), BATCH):
             numbers = unknown[first : first + BATCH]
@@ -161,10 +161,9 @@ class _Pilot:
         return int(np.sum(self._bad[:trials] <= level))
 
     def level(self, guess: float, largest: float) -> float:
-        """The largest level of which it seems that it would pass; 0 where there is none.
+        """The largest level that seems to pass; 0 if there is none.
 
-        A few trials find about where some fail, all trials how many do there. From there down only those have to be run
-        that failed.
+        A few trials find the rough level, then all trials run there. Further down only those that failed run again.
         """
         test = self.test
         few = min(FEW, test.trials)
@@ -176,7 +175,8 @@ class _Pilot:
 
     @staticmethod
     def _last(good: Callable[[float], bool], guess: float, largest: float, *, factor: float) -> float:
-        """The largest level that is good, by steps of the factor and bisection; 0 where none is found."""
+        """The largest good level, by steps of the factor and bisection; 0 if none is found."""
+
         low = high = guess
         if good(guess):
             while low < largest:

@@ -1,9 +1,8 @@
-"""One writer of a folder at a time. The system takes the lock from a process that dies, however it dies.
+"""A lock for the one process that writes a folder. The system releases it when the process dies, however it dies.
 
-The package filelock was weighed, 4.2: it passes the same tests with the same system calls. What it would save are the
-two functions at the end of this file; the folder, the messages and the number of the process remain, and a dependency
-comes in. Where a file system has no such locks, its `FileLock` by default falls back to a file whose existence is the
-lock, which a process that is killed leaves behind: here that is refused.
+The package filelock 4.2 passes the same tests with the same system calls, but it would replace only the two functions
+at the end of this file. On a file system without locks its `FileLock` falls back to a file whose existence is the lock,
+which a killed process leaves behind; here such file systems are refused.
 """
 
 import contextlib
@@ -15,15 +14,15 @@ from pathlib import Path
 
 from lqrsim.errors import InputError
 
-_HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # of a lock that another process has; EDEADLK on Windows
+_HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
 
 
 @contextlib.contextmanager
 def sole_writer(folder: Path) -> Iterator[None]:
-    """Makes the folder if need be, and is its only writer as long as the block lasts.
+    """Make the folder if it does not exist, and lock it during the block.
 
     Raises:
-      InputError: another process is, or the folder cannot be written, or locked.
+      InputError: another process has locked it, or the folder cannot be written or locked.
     """
     path = folder / "campaign.lock"
     try:
@@ -41,7 +40,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
                 ) from None
             reason = error.strerror or error
             raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
-        with contextlib.suppress(OSError):  # of use to people only
+        with contextlib.suppress(OSError):  # for people who look who has the lock
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
         yield
@@ -53,7 +52,8 @@ if sys.platform == "win32":
     import msvcrt
 
     def _lock(handle: int) -> None:
-        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads, for locked ones cannot be read
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads: locked bytes cannot be read
+
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
 else:
     import fcntl

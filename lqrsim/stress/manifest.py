@@ -1,7 +1,7 @@
-"""What a campaign's folder says of itself, `manifest.json`: sealed when it is written, checked whenever it is read.
+"""The manifest of a campaign's folder, `manifest.json`: specification, versions and hashes, checked when it is read.
 
-It has two hashes. `sha256` is of all of it: whatever is edited is refused. `digest` is of what rows depend on, and each
-shard has it too: a manifest that is sealed anew, with other numbers, has shards that are not its own.
+It has two hashes. `sha256` covers the whole file, so that an edited one is refused. `digest` covers what the rows
+depend on; each shard has it, too, so that a manifest with new settings and a renewed hash does not fit the shards.
 """
 
 import json
@@ -17,11 +17,12 @@ from lqrsim.results import schema
 from lqrsim.results.archive import Other, blamed
 from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Solution
-from lqrsim.stress.specification import POLICIES, Campaign, Cell
+from lqrsim.stress.policies import POLICIES
+from lqrsim.stress.specification import Campaign, Cell
 from lqrsim.stress.trial_tables import write
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 5, "manifest.json"
-GIVEN = "solution.npz"  # beside it: what was given in place of a solve, whose hash is `solution`
+FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
+GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST = 1 << 26  # bytes
 
 _HASH = schema.line
@@ -37,7 +38,7 @@ _CAMPAIGN = schema.record(
             ("replan_every", "goal_radius", "goal_tolerance"), schema.optional(schema.number(above=0.0))
         ),
         "shard": schema.count, "time_limit": schema.number(above=0.0),
-        "stated": schema.optional(schema.listed(_DISTURBANCE)),
+        "design_disturbances": schema.optional(schema.listed(_DISTURBANCE)),
     }
 )  # fmt: skip
 _MANIFEST = schema.record(
@@ -54,16 +55,16 @@ _MANIFEST = schema.record(
 
 
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
-    """Seal and write it: `contents` is all but its format, its cells and its hashes. Raises InputError."""
+    """Write the manifest: `contents`, with format, cells and hashes added. Raises InputError."""
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(schema.parse(json.dumps(manifest)))  # in this order: that of the sweeps is that of the cells
+    _check(schema.parse(json.dumps(manifest)))  # without sorting: the order of the sweeps is that of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What a campaign's folder says of itself. Raises InputError unless it is, in content, what was written."""
+    """Read the manifest of a folder. Raises InputError if it is missing, damaged, edited, or of another version."""
     path = folder / NAME
     if not os.path.isfile(path):
         raise InputError(f"folder: got {excerpt(str(folder))}, want one that `lqrsim stress` wrote, with a {NAME}")
@@ -81,28 +82,28 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _check(manifest: dict[str, Any]) -> None:
-    """Raise InputError unless it is whole, and its hashes are those of what it says."""
+    """Raise InputError unless all fields are there, and the hashes fit."""
     _MANIFEST("manifest", manifest)
     if manifest["sha256"] != _seal(manifest):
-        raise InputError("sha256: got another than that of the content, want a file that has not been changed")
+        raise InputError("sha256: got one that does not fit the content, want a file that has not been changed")
     campaign = manifest["campaign"]
     if schema.canonical(manifest["cells"]) != schema.canonical(_cells(campaign)):
-        raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
+        raise InputError("cells: got some that are not the campaign's, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     if manifest["digest"] != digest_of_rows(manifest):
-        raise InputError("digest: got another than that of the campaign, want a file that has not been changed")
+        raise InputError("digest: got one that does not fit the campaign, want a file that has not been changed")
 
 
 def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
-    """Each policy, sweep and strength, in the order of their numbers. Raises InputError if it is no campaign."""
-    # Its disturbances may be a user's, and are made only where that user's file was named.
-    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "stated": None})
+    """Policy, sweep and strength of each cell, in order. Raises InputError if a field of the campaign is invalid."""
+    # Without the disturbances: they may be a user's, whose file is not loaded here.
+    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
     return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
 
 def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
-    """Its cells."""
+    """The cells of a manifest."""
     return [Cell(*cell) for cell in manifest["cells"]]
 
 
@@ -111,22 +112,21 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
-    """Hash of all that rows depend on, and of nothing that differs where the same is begun again."""
-    lasting = {
-        name: manifest[name] for name in ("cells", "model", "problem", "start", "solution", "code", "versions")
-    } | {
+    """Hash of all that the rows depend on; the same when the same campaign is begun again."""
+    fields = ("cells", "model", "problem", "start", "solution", "code", "versions")
+    hashed = {name: manifest[name] for name in fields} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
-    return sha256(schema.canonical(lasting))
+    return sha256(schema.canonical(hashed))
 
 
 def digest_of_solution(solution: Solution) -> str:
-    """Hash of what running it depends on: not of how long it took to find."""
+    """Hash of what a run of the solution depends on; not of the log of its solve."""
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
-    if solution.cost_to_go is not None:  # which solving again begins with, and with the multipliers
+    if solution.cost_to_go is not None:  # re-planning begins with it, and with the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
     arrays += [one.values for one in solution.multipliers]
     return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))

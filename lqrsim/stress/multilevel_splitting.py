@@ -1,20 +1,20 @@
-"""How likely a rare failure is, by splitting: through levels of a score, each not so rare given the one before.
+"""The probability of a rare failure by multilevel splitting: the product of the probabilities of more frequent levels.
 
 A trial is a function of a vector z of standard normal numbers (trial_score.py), and fails if its score is positive. A
-pilot run finds levels that about `keep` of the vectors exceed given the level before, and how far to move at each of
-them. The repetitions that count use these levels and moves: N vectors; those above the level are kept and copied in
-place of the others; each is moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi, that are refused
-if the score falls below the level, and so leave the distribution above it as it is. The estimate is the product of the
-shares above each level. With levels and moves fixed beforehand its mean is the probability exactly, for any number of
-particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2); levels taken from the particles themselves,
-as subset simulation takes them, would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics and
-Computing 22, 2012).
+pilot run finds levels of the score, each exceeded by about `keep` of the vectors above the level before, and a step
+size for each level. Each repetition uses these levels and step sizes: it begins with N vectors; those above the level
+replace the others; then all are moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi. A step is
+rejected if the score falls below the level, so that the steps preserve the distribution above the level. The estimate
+is the product of the shares above each level. With levels and step sizes fixed beforehand it is unbiased, for any
+number of particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2). Levels taken from the particles
+themselves, as in subset simulation, would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics
+and Computing 22, 2012).
 
-The interval is of the relative error. A product's standard deviation grows with its mean, so repetitions that happen to
-come out low look more alike than they are, and Student's interval about them then misses the probability. How their
-standard deviation relates to their mean depends on neither: an interval holds each probability p from which the mean is
-no more than t standard errors away, with p's own standard error. It is not symmetric, and where the repetitions differ
-so much that they bound nothing from above, it says so: it ends at 1.
+The interval uses the relative error. The standard deviation of a product grows with its mean, so repetitions that
+happen to be low also vary too little, and Student's interval about them misses the probability. The ratio of standard
+deviation and mean does not depend on the mean. So the interval holds each probability p from which the mean is at most
+t standard errors away, with the standard error that belongs to p. It is not symmetric. If the repetitions vary so much
+that they give no upper bound, it ends at 1.
 """
 
 from collections.abc import Callable
@@ -27,25 +27,26 @@ from lqrsim.errors import Array, InputError, check_count, check_function, check_
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 Score = Callable[[Array], Array]
+Progress = Callable[[int, int, str], object]  # how much is done, of how much, and what has been found so far
 MOST = 10_000  # repetitions, moves, levels and rounds
-ACCEPTANCE = 0.4  # the share of moves for which the pilot run aims
+ACCEPTANCE = 0.4  # share of accepted moves at which the pilot run aims
 
 
 class NoFailure(InputError):
-    """No failure was found: they are too rare, or there are none."""
+    """No failure was found: failures are too rare, or there are none."""
 
 
 @dataclass(frozen=True)
 class SplittingResult:
-    """How likely failure is.
+    """An estimate of the probability of failure.
 
     Attributes:
-      probability: the mean of the repetitions, with its interval: see the top of this file. Where there is one level
-        alone, repetitions are plain trials, and it is the exact one of Clopper and Pearson.
-      standard_error: of that mean. repetitions: (R,), independent and each without bias.
-      levels: of the score, the last one 0. step_sizes: b of the moves at each but the last.
-      simulations: scores that were computed in all, those of the pilot run included.
-      failures: (k, d) vectors that fail, of the repetitions, distributed as failures are. scores: (k,) theirs.
+      probability: the mean of the repetitions, with its interval: see the top of this file. If there is only one level,
+        the repetitions are plain trials, and the interval is the exact one of Clopper and Pearson.
+      standard_error: of that mean. repetitions: (R,), independent unbiased estimates.
+      levels: of the score, the last one 0. step_sizes: b of the moves at each level but the last.
+      simulations: number of computed scores, those of the pilot run included.
+      failures: (k, d) vectors that fail, from all repetitions, in their own distribution. scores: (k,) of these.
     """
 
     probability: Estimate
@@ -59,13 +60,13 @@ class SplittingResult:
 
     @property
     def plain_trials(self) -> float:
-        """How many plain trials have the same standard error, in the mean; NaN where all repetitions agree."""
+        """Number of plain trials with the same standard error; NaN if all repetitions agree."""
         if self.standard_error == 0:
             return float("nan")
         return self.probability.value * (1 - self.probability.value) / self.standard_error**2
 
 
-def split(
+def failure_probability(
     score: Score,
     size: int,
     *,
@@ -77,22 +78,22 @@ def split(
     confidence: float = CONFIDENCE,
     most_levels: int = 40,
     level: Callable[[float], object] | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> SplittingResult:
-    """The probability that the score of a standard normal vector is positive.
+    """Estimate the probability that the score of a standard normal vector is positive, by multilevel splitting.
 
     Args:
-      score: of vectors (K, size), (K,); positive is failure.
-      size: how many numbers a vector has.
-      particles: N of each repetition.
-      keep: share that exceeds the next level.
-      moves: of each particle at a level.
-      repetitions: independent ones; the interval is made of how much they differ.
+      score: a function of vectors (K, size) that returns (K,); positive is failure.
+      size: length of a vector.
+      particles: number of vectors N in each repetition.
+      keep: share of the vectors that exceeds the next level.
+      moves: number of moves of each particle at a level.
+      repetitions: number of independent estimates; the interval follows from their spread.
       seed: of all random numbers.
       confidence: of the interval.
-      most_levels: with as many the pilot run gives up.
-      level: called with each level as the pilot run finds it.
-      progress: called with the repetitions that are done, and all of them.
+      most_levels: number of levels after which the pilot run gives up.
+      level: called with each level that the pilot run finds.
+      progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
 
     Returns:
       The probability with its interval, and the failures.
@@ -102,17 +103,17 @@ def split(
       NoFailure: none was found.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
-    check_count("size", size)
-    check_count("particles", particles, at_least=10)
+    size = check_count("size", size)
+    particles = check_count("particles", particles, at_least=10)
     check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved ones, and copies of them
     keep = check_number("keep", keep, at_least=2 / particles, at_most=0.5)
-    check_count("moves", moves, at_most=MOST)
-    check_count("repetitions", repetitions, at_least=2, at_most=MOST)
+    moves = check_count("moves", moves, at_most=MOST)
+    repetitions = check_count("repetitions", repetitions, at_least=2, at_most=MOST)
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
-    check_count("most_levels", most_levels, at_most=MOST)
+    most_levels = check_count("most_levels", most_levels, at_most=MOST)
     confidence = check_number("confidence", confidence, above=0.0, below=1.0)
     check_function("level", level, "a function of a level", arguments=1)
-    check_function("progress", progress, "a function of how many repetitions are done, of how many", arguments=2)
+    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     counted = CountedScore(score)
     first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
     levels, step_sizes = _pilot_run(
@@ -122,15 +123,15 @@ def split(
     failures, scores = [], []
     for number, key in enumerate(rest):
         if progress is not None:
-            progress(number, repetitions)
+            progress(number, repetitions, f"{shares[:number].prod(axis=1).mean():.2g}" if number else "")
         shares[number], failed, failed_scores = _repetition(
             counted, size, particles, moves, levels, step_sizes, np.random.default_rng(key)
         )
         failures.append(failed)
         scores.append(failed_scores)
-    if progress is not None:
-        progress(repetitions, repetitions)
     estimates = shares.prod(axis=1)
+    if progress is not None:
+        progress(repetitions, repetitions, f"{estimates.mean():.2g}")
     if not estimates.any():
         raise NoFailure(f"particles: got {particles}, of which none failed, want more")
     return SplittingResult(
@@ -146,13 +147,13 @@ def split(
 
 
 def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
-    """The mean of the repetitions' products of shares (R, levels), none of them NaN, with its interval."""
+    """The mean of the estimates with its interval, from the shares (R, levels) above each level."""
     count, levels = shares.shape
     if levels == 1:
         return rate(round(float(shares.sum()) * particles), count * particles, confidence=confidence)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
-    # Repetitions may agree by chance. Particles that were independent at each level would differ by so much.
+    # Repetitions may agree by chance. Their spread is at least that of independent particles at each level.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical) / particles)
@@ -163,14 +164,14 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
 
 
 class CountedScore:
-    """A score that is checked, and that counts its evaluations. Raises InputError for what is no number for each."""
+    """Counts the evaluations of a score and checks what it returns. Raises InputError unless it is a number each."""
 
     def __init__(self, score: Score) -> None:
         self.score, self.evaluations = score, 0
 
     def __call__(self, vectors: Array) -> Array:
         self.evaluations += len(vectors)
-        # With vectors of its own, for a user's function may write to them.
+        # A copy, because a user's function may write to its vectors.
         scores = shaped("score: returned", self.score(vectors.copy()), (len(vectors),))
         if np.isnan(scores).any():
             raise InputError(f"score: got NaN returned, want a number for each of {len(vectors)} vectors")
@@ -187,7 +188,7 @@ def _pilot_run(
     rng: np.random.Generator,
     on_level: Callable[[float], object] | None,
 ) -> tuple[Array, Array]:
-    """Levels, the last one 0, and how far to move at each but the last."""
+    """Find the levels, the last one 0, and the step size at each level but the last."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     levels: list[float] = []
@@ -213,7 +214,7 @@ def _pilot_run(
 def _repetition(
     score: Score, size: int, particles: int, moves: int, levels: Array, step_sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """One repetition: the share above each level, 0 from where none was; and the failures with their scores."""
+    """One repetition: the share above each level, 0 once there is none; and the failures with their scores."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     shares = np.zeros(len(levels))
@@ -230,7 +231,7 @@ def _repetition(
 
 
 def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """As many as there were, of those above the level: each as often as any other, but for chance where that is odd."""
+    """Replace all vectors by copies of those above the level, equally often; a random choice takes up the remainder."""
     above = np.flatnonzero(scores > level)
     times, left = divmod(len(scores), len(above))
     chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
@@ -240,7 +241,8 @@ def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Genera
 def _crank_nicolson_step(
     score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
-    """One move of each that stays above the level; and the share of those that were accepted."""
+    """Move each vector if it stays above the level. Returns vectors, scores and the share of accepted moves."""
+
     proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
     proposed_scores = score(proposed)
     accepted = proposed_scores > level

@@ -1,4 +1,4 @@
-"""How trials ended: a table with one row a trial, made of a rollout, small enough to be kept for millions of them."""
+"""The outcomes of trials: a table with one row per trial, small enough for millions of trials."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -14,21 +14,21 @@ from lqrsim.solvers import compiled
 
 @dataclass(frozen=True, kw_only=True)
 class Outcomes:
-    """One entry a trial; what is measured is of the time until it ended, as `Rollout.outcome` and `ended` say.
+    """The outcomes of K trials, an array (K,) for each measure. Measures cover the time until the trial ended.
 
     Attributes:
-      trial: its number.
+      trial: number of the trial.
       outcome: one of OUTCOMES.
-      obstacle: what it collided with; empty unless that ended it.
-      ended: when it collided, was lost or failed, in seconds; the horizon where none of that happened.
+      obstacle: the obstacle it collided with; empty if none ended it.
+      ended: time in seconds of its collision, divergence or error; the horizon without one.
       worst: largest tracking error, in `Rollout.tracking_unit`: metres for robots with a position.
-      rms: root mean square of the tracking error, likewise.
-      final: at the end of the plan; NaN for what ended before.
-      goal: distance from the goal at the end, in `Target.unit`; NaN for what ended before.
-      clearance: the least, in metres; not above 0 where it collided.
-      effort: the integral of the squares of the applied controls over time, in their unit squared times s.
+      rms: root mean square of the tracking error, in the same unit.
+      final: tracking error at the end of the plan; NaN if the trial ended before.
+      goal: distance from the goal at the end, in `Target.unit`; NaN if the trial ended before.
+      clearance: the least, in metres; at most 0 after a collision.
+      effort: integral of the squared applied controls over time, in their unit squared times s.
       saturated: share of the control periods with a command at a limit.
-      cost: of the problem, over stages and end, with the controls that were applied; NaN for what ended before.
+      cost: of the problem, for the true states and the applied controls; NaN if the trial ended before.
     """
 
     trial: npt.NDArray[np.int64]
@@ -66,7 +66,7 @@ class Outcomes:
         return len(self.trial)
 
     def columns(self) -> dict[str, npt.NDArray[np.generic]]:
-        """The table by its columns, in their order."""
+        """Name -> column, in order."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
@@ -77,11 +77,11 @@ def outcomes(
     goal_radius: float | None = None,
     goal_tolerance: float | None = None,
 ) -> Outcomes:
-    """The outcomes of a rollout's trials.
+    """Compute the outcomes of a rollout's trials.
 
     Args:
-      rollout: what `simulate` returned.
-      problem: whose cost to work out; NaN without one.
+      rollout: returned by `simulate`.
+      problem: for the cost; NaN without one.
       goal_radius: in metres, replaces the rollout's; see `simulate`.
       goal_tolerance: a scaled error, replaces the rollout's; see `simulate`.
 
@@ -89,7 +89,7 @@ def outcomes(
       The Outcomes, one row per trial.
 
     Raises:
-      InputError: one of these is out of range, or not what this rollout's goal is judged by.
+      InputError: the problem does not fit the rollout, or a goal option is out of range or does not fit its goal.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     check_kind("problem", problem, (Problem, type(None)), "a Problem or None")
@@ -106,7 +106,8 @@ def outcomes(
     outcome = np.array(rollout.outcome, dtype=np.str_)
     whole = np.isin(outcome, ("reached", "timed out"))
     error = np.where(counts, rollout.tracking_error, 0.0)
-    spent = np.clip(ended[:, None] - rollout.times[:-1], 0.0, plan.dt)  # of each control period
+    spent = np.clip(ended[:, None] - rollout.times[:-1], 0.0, plan.dt)  # seconds of each control period
+
     driven = (spent > 0) & np.isfinite(rollout.applied).all(axis=2)
     effort = np.where(driven, spent * np.sum(np.square(rollout.applied), axis=2), 0.0).sum(axis=1)
     cost = np.full(rollout.trials, np.nan)

@@ -1,4 +1,4 @@
-"""What a campaign came to: a folder that is opened and checked, its tables, and any of its trials once more."""
+"""The results of a campaign: its folder, opened and checked, the tables in it, and replays of its trials."""
 
 import os
 import shlex
@@ -15,11 +15,12 @@ from lqrsim.results import notebook, save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.stress.analysis import alike
 from lqrsim.stress.manifest import GIVEN, cells_of, digest_of_solution, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
-from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
+from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trial_tables import Damaged, Table, read
 from lqrsim.stress.trials import Trials
@@ -31,15 +32,15 @@ class Results:
     """The folder of a campaign, finished or not.
 
     Args:
-      folder: that `run` wrote.
-      scenario: the campaign's, where it is a function of yours: a file is data, and never chooses code to run.
+      folder: written by `run_campaign`.
+      scenario: the campaign's reference, needed if it is a function of yours: files never choose code to run.
 
     Attributes:
-      manifest: what the folder says of itself.
-      cells: of the campaign.
+      manifest: the contents of manifest.json.
+      cells: the cells of the campaign.
 
     Raises:
-      InputError: it is not a campaign's, damaged, or of another version.
+      InputError: the folder is not a campaign's, is damaged, or has another version of the format.
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
@@ -54,36 +55,40 @@ class Results:
                 raise InputError(f"scenario: got {excerpt(scenario)}, want {reference}, which {self.folder} was run on")
 
     @cached_property
+    def resolved(self) -> Scenario:
+        """The campaign's scenario. Raises InputError if it is a function of yours, and no scenario was given."""
+        return resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
+
+    @cached_property
     def campaign(self) -> Campaign:
-        """What was asked. Raises InputError where it has disturbances of yours, and no scenario was given."""
-        _ = self.trials.scenario
-        return self.trials.campaign
+        """The specification. Raises InputError if it has disturbances of yours, and no scenario was given."""
+        _ = self.resolved  # may define disturbances
+        return Campaign.from_json(self.manifest["campaign"])
 
     @cached_property
     def trials(self) -> Trials:
-        """What runs its trials. Raises InputError as `campaign` does, or where a policy is damaged."""
-        scenario = resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
-        campaign = Campaign.from_json(self.manifest["campaign"])
-        return Trials(campaign, scenario, {policy: self.solution(policy) for policy in campaign.policies})
+        """Runs the campaign's trials. Raises InputError as `campaign` does, or if a policy is damaged."""
+        solutions = {policy: self.solution(policy) for policy in self.campaign.policies}
+        return Trials(self.campaign, self.resolved, solutions)
 
     @property
     def given(self) -> Path | None:
-        """The file of the solution that was given in place of a solve; None if there was none."""
+        """The file of the solution that was given instead of solving; None if there was none."""
         return None if self.manifest["solution"] is None else self.folder / GIVEN
 
     @property
     def complete(self) -> bool:
-        """Whether every trial has its row."""
+        """Whether all trials have been run."""
         return not self.missing
 
     @property
     def missing(self) -> list[tuple[Cell, int, int]]:
-        """What is still to be run: cell, first trial, how many."""
-        on_disk = self.there()
+        """The trials that have not been run: cell, first trial, count."""
+        on_disk = self.shards_on_disk()
         return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in on_disk]
 
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
-        """All trials of a cell, in order.
+        """The outcomes of a cell's trials, in order.
 
         Args:
           cell: one of `cells`.
@@ -93,17 +98,17 @@ class Results:
           The Outcomes.
 
         Raises:
-          InputError: something is damaged, or not finished without `partial`.
+          InputError: a file is damaged, no trial has been run, or, without `partial`, one is missing.
         """
         tables = [table for _, table in self.tables(cell, partial=partial)]
         if not tables:
-            raise InputError(f"cell: got {cell}, of which there is nothing yet, want one that was begun")
+            raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
         return Outcomes(**columns)
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
-        """Counts of the outcomes of a cell's trials. It reads the cell in parts.
+        """Count the outcomes of a cell's trials, reading one file after the other.
 
         Args:
           cell: one of `cells`.
@@ -121,7 +126,7 @@ class Results:
         return counts
 
     def summary(self) -> str:
-        """A line for each cell: how its trials ended, how sure the rate is; then where the plans end, and errors."""
+        """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
         width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
         wide = max(10, *(len(policy) for policy in self.manifest["policies"]))
         others = [name for name in OUTCOMES if name != "reached"]
@@ -161,7 +166,7 @@ class Results:
         return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", remarks, rows)
 
     def came_to_nothing(self) -> list[str]:
-        """A line for each of the most frequent reasons why trials are an "error", or have a filter that diverged."""
+        """A line for each of the most frequent reasons of trials that ended with an error or a diverged filter."""
         reasons: Counter[str] = Counter()
         for cell in self.cells:
             ends = self.tally(cell, partial=True)
@@ -170,7 +175,7 @@ class Results:
         return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def plans(self) -> list[str]:
-        """Where the plan of each policy ends, and whether it misses the goal."""
+        """Lines that say where the plan of each policy ends, and whether it misses the goal."""
         campaign, lines = self.manifest["campaign"], []
         for policy in self.manifest["policies"]:
             solution = self.solution(policy)
@@ -181,7 +186,7 @@ class Results:
         return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
-        """Why trials of a cell are an "error", or have a filter that diverged.
+        """The reasons of a cell's trials that ended with an error or a diverged filter.
 
         Args:
           cell: one of `cells`.
@@ -197,7 +202,7 @@ class Results:
         }
 
     def solution(self, policy: str) -> Solution:
-        """The solution from which a policy was made.
+        """The solution that a policy runs.
 
         Args:
           policy: its name.
@@ -211,23 +216,24 @@ class Results:
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
-            raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
+            raise InputError(f"policy: got {path}, which is damaged, want another folder for the campaign")
         return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
-        """The shards of a cell, or all of them.
+        """The shards of a cell, or of all cells.
 
         Args:
           cell: one of `cells`; None for all.
 
         Returns:
-          Their descriptions.
+          An iterator of Shards.
         """
-        campaign = self.manifest["campaign"]
+        trials, size = self.manifest["campaign"]["trials"], self.manifest["campaign"]["shard"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
-            yield from shards_of(number, campaign["trials"], campaign["shard"])
+            for first in range(0, trials, size):
+                yield Shard(number, first, min(size, trials - first))
 
-    def there(self) -> set[Shard]:
+    def shards_on_disk(self) -> set[Shard]:
         """The shards that have a file."""
         folder = self.folder / "shards"
         names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
@@ -252,13 +258,13 @@ class Results:
         return self.cells.index(cell)
 
     def path(self, shard: Shard) -> Path:
-        """The file of a shard.
+        """The path of a shard's file.
 
         Args:
           shard: one of `shards`.
 
         Returns:
-          Its path.
+          The path.
         """
         check_kind("shard", shard, Shard, "a Shard of the campaign")
         check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
@@ -276,17 +282,17 @@ class Results:
         return read(self.path(shard), shard, self.manifest["digest"])
 
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
-        """The shards of a cell one by one.
+        """The tables of a cell, shard by shard.
 
         Args:
           cell: one of `cells`.
           partial: whether to skip shards that are missing.
 
         Returns:
-          Pairs of a shard and its columns.
+          An iterator of pairs: a shard and its columns.
 
         Raises:
-          InputError: something is damaged, or missing without `partial`.
+          InputError: a file is damaged, or, without `partial`, missing.
         """
         check_flag("partial", partial)
         for shard in self.shards(cell):
@@ -294,7 +300,7 @@ class Results:
                 yield shard, self.table(shard)
 
     def table(self, shard: Shard) -> Table:
-        """The rows of a shard.
+        """The rows of a shard; `read` with an InputError.
 
         Args:
           shard: one of `shards`.
@@ -303,20 +309,20 @@ class Results:
           Column -> values, one per trial.
 
         Raises:
-          InputError: it is missing or damaged.
+          InputError: the file is missing or damaged.
         """
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
-            raise InputError(f"cell: got {self.cells[shard.cell]} without trials {trials}, finish it: {self.command}")
+            raise InputError(f"cell: got {self.cells[shard.cell]} without trials {trials}, run: {self.command}")
         try:
             return self.read(shard)
         except Damaged as error:
-            raise InputError(f"shard: got {path}, which is damaged ({error}), repair it: {self.command}") from None
+            raise InputError(f"shard: got {path}, which is damaged ({error}), run: {self.command}") from None
 
     @property
     def command(self) -> str:
-        """The command that goes on with the campaign, and repairs what is damaged; it runs in any working directory."""
+        """The command line that resumes the campaign and repairs damaged files. It runs in any working directory."""
         reference = self.manifest["campaign"]["scenario"]
         return shlex.join(["lqrsim", "stress", reference, "--resume", "--out", str(self.folder.absolute())])
 
@@ -331,7 +337,7 @@ class Results:
           The command line.
 
         Raises:
-          InputError: another command, or options that are no text.
+          InputError: another command, or an option that is not text.
         """
         check_name("command", command, ("report", "replay"))
         for option in options:
@@ -349,9 +355,9 @@ def replay(
     frames: bool = True,
     contacts: bool = True,
 ) -> Rollout:
-    """The very trial of a campaign again, the same to the bit until it ends; to the plan's end without contacts.
+    """Run a trial of a campaign again: bit-identical until it ends, and without contacts until the plan ends.
 
-    That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
+    It needs the kind of processor and the versions in `results.manifest["versions"]`.
 
     Args:
       results: the campaign.
@@ -364,7 +370,8 @@ def replay(
       A Rollout of one trial.
 
     Raises:
-      InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.
+      InputError: there is no such cell or trial, or the scenario is a function of yours, and `Results` was not given
+        it.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
@@ -375,19 +382,20 @@ def replay(
 
 
 def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:
-    """The row of a trial in the campaign's table. Raises InputError if it is missing or damaged."""
+    """The row of a trial in the campaign's tables. Raises InputError if its file is missing or damaged."""
     shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
     return {name: column[trial - shard.first] for name, column in results.table(shard).items()}
 
 
 def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> list[str]:
-    """What a trial that was run again has otherwise than its row in the table, in words; empty if nothing.
+    """A line for each value of a replayed trial that differs from its row in the table.
 
-    All that a row has is of the time until the trial ended, so that obstacles may have stopped the robot or not.
+    A row describes the time until the trial ended, so it does not matter whether obstacles stopped the robot then.
 
     Raises:
-      InputError: the row is missing or damaged.
+      InputError: the row's file is missing or damaged.
     """
+
     was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"

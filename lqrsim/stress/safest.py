@@ -1,4 +1,4 @@
-"""The way that runs succeed by most often, among those that the search for the cheapest plan has looked at."""
+"""The safest plan: among the candidates of a solve, the one whose runs reach the goal most often."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,16 +19,16 @@ from lqrsim.stress.levels import MOST_TRIALS
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.statistics import rate as rate_of
 
-SAME = 0.02  # of a state's range along the plan: plans that are nowhere farther apart are one
+SAME = 0.02  # of a state's range along the plan; plans that differ nowhere by more count as the same
 
 
-class Way(NamedTuple):
+class ComparedPlan(NamedTuple):
     """A plan that was compared.
 
     Attributes:
-      start: what the search began with.
-      solution: what it became.
-      successes: which of the common trials reached the goal, (K,).
+      start: the start of its search.
+      solution: the result of the search.
+      successes: whether each of the common trials reached the goal, (K,).
     """
 
     start: str
@@ -38,30 +38,30 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SafestPlan:
-    """The way that most of the common trials succeeded by.
+    """The plan with which most of the common trials reached the goal.
 
     Attributes:
-      solution: of it.
-      ways: all that were compared, the best first.
-      reached: the share of fresh trials that reach the goal by it, with its exact interval. Those by which it was
-        chosen would say too much.
+      solution: with that plan.
+      compared: all plans that were compared, the best first.
+      reached: its success rate in fresh trials, with the exact interval. The trials that selected it would be biased.
     """
 
     solution: Solution
-    ways: tuple[Way, ...]
+    compared: tuple[ComparedPlan, ...]
     reached: Estimate
 
     def __post_init__(self) -> None:
         check_kind("SafestPlan: solution", self.solution, Solution, "a Solution")
-        object.__setattr__(self, "ways", check_items("SafestPlan: ways", self.ways, Way, "a tuple of Ways"))
+        compared = check_items("SafestPlan: compared", self.compared, ComparedPlan, "a tuple of ComparedPlan")
+        object.__setattr__(self, "compared", compared)
         check_kind("SafestPlan: reached", self.reached, Estimate, "an Estimate")
 
     def summary(self) -> str:
-        """A line for each way: cost and successes."""
-        lines = [f"{100 * self.reached.value:.1f} % of fresh trials reach the goal by the first of these ways:"]
-        for way in self.ways:
-            found = f"{int(way.successes.sum())} of {len(way.successes)} trials"
-            lines.append(f"  {way.start}: cost {way.solution.cost:.6g}, {found}")
+        """The success rate, and a line for each plan with its cost and successes."""
+        lines = [f"{100 * self.reached.value:.1f} % of fresh trials reach the goal with the first of these plans:"]
+        for plan in self.compared:
+            found = f"{int(plan.successes.sum())} of {len(plan.successes)} trials"
+            lines.append(f"  {plan.start}: cost {plan.solution.cost:.6g}, {found}")
         return "\n".join(lines)
 
     def __str__(self) -> str:
@@ -80,16 +80,16 @@ def smooth_safest(
     goal_tolerance: float | None = None,
     threads: int | None = None,
 ) -> SafestPlan:
-    """Choose among the ways that `smooth` looks at by how often runs succeed, not by cost.
+    """Choose among the candidates of `smooth` by success rate instead of cost.
 
-    Each candidate of the search is solved for to its end. Of plans that are the same only the first is kept. All are
-    run in the same trials, and the one that most of them succeed by is the answer; of several, the cheapest.
+    Each candidate is solved to convergence; duplicates are dropped. All plans run in the same trials. The result is the
+    plan with the most successes; the cheapest one if there are several.
 
     Args:
       problem: as for `smooth`.
       plant: as in `simulate`.
       disturbances: as in `simulate`.
-      trials: of each way, and as many fresh ones of the chosen way.
+      trials: number of trials of each plan, and of fresh trials of the chosen plan.
       starts: as for `smooth`.
       seed: of the disturbances.
       goal_radius: as in `simulate`.
@@ -100,7 +100,7 @@ def smooth_safest(
       A SafestPlan.
 
     Raises:
-      InputError: as `smooth` and `simulate`, or no way leads to a plan.
+      InputError: as `smooth` and `simulate`, or no candidate converges.
     """
     count, seed = check_count("trials", trials, at_most=MOST_TRIALS), check_seed("seed", seed)
     first = smooth(problem, starts=starts, threads=threads)
@@ -115,7 +115,7 @@ def smooth_safest(
     if not found and first.success:
         found.append(("the search's own", first))
     if not found:
-        raise InputError(f"problem: got one for which no way leads to a plan ({first.status.name}), want one that does")
+        raise InputError(f"problem: got one without any converged plan ({first.status.name}), want one that has some")
 
     def reached(solution: Solution, begin: int) -> npt.NDArray[np.bool_]:
         run = simulate(
@@ -124,15 +124,16 @@ def smooth_safest(
         )  # fmt: skip
         return np.array([one == "reached" for one in run.outcome])
 
-    ways = [Way(start, one, reached(one, 0)) for start, one in found]
-    ways.sort(key=lambda way: (-int(way.successes.sum()), way.solution.cost))
-    best = ways[0].solution
+    compared = [ComparedPlan(start, one, reached(one, 0)) for start, one in found]
+    compared.sort(key=lambda plan: (-int(plan.successes.sum()), plan.solution.cost))
+    best = compared[0].solution
     fresh = int(reached(best, count).sum())
-    return SafestPlan(solution=best, ways=tuple(ways), reached=rate_of(fresh, count))
+    return SafestPlan(solution=best, compared=tuple(compared), reached=rate_of(fresh, count))
 
 
 def _same(one: Solution, other: Solution) -> bool:
-    """Whether two plans are one, to within what solves leave open."""
+    """Whether two plans are the same within SAME."""
+
     apart = one.policy.state_coordinates.difference(one.trajectory.states, other.trajectory.states)
     scale = np.maximum(np.ptp(other.trajectory.states, axis=0), 1e-9)
     return bool((np.abs(apart) <= SAME * scale).all())

@@ -1,12 +1,12 @@
-"""What a campaign is asked to do: plain data, to JSON and back."""
+"""The specification of a campaign: plain data that converts to JSON and back."""
 
 import dataclasses
 import inspect
 import itertools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,48 +23,22 @@ from lqrsim.errors import (
 )
 from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.stress.policies import DEFAULT_POLICIES, POLICIES, check_designed
 
-_FILES = 1_000_000  # of shards in a folder
-
-
-class PolicyKind(NamedTuple):
-    """How a policy is made.
-
-    Attributes:
-      solver: finds its plan.
-      controller: runs it, one of `trials.CONTROLLERS`.
-      told: whether it is made for stated disturbances.
-    """
-
-    solver: str = "smooth"
-    controller: str = "feedback"
-    told: bool = False
-
-
-KINDS = {
-    "smooth": PolicyKind(),
-    "ilqr": PolicyKind(solver="ilqr"),
-    "open_loop": PolicyKind(),
-    "replan": PolicyKind(controller="replan"),
-    "track": PolicyKind(told=True),  # its law is the policy of its solution
-    "offset_free": PolicyKind(controller="offset_free", told=True),
-}
-POLICIES = tuple(KINDS)
-TOLD = tuple(policy for policy, kind in KINDS.items() if kind.told)
-USUAL = tuple(policy for policy, kind in KINDS.items() if not kind.told)  # which are run unless others are asked for
+_MOST_FILES = 1_000_000  # shards in a folder
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A combination of policy, sweep and strength. All cells share the trials' random numbers.
+    """A combination of policy, disturbances and strength. All cells use the same random numbers.
 
     Attributes:
       policy: its name; see `Campaign`.
-      sweep: name of the disturbances.
+      sweep: the name of the disturbances.
       strength: factor by which they are scaled, 0 or more.
 
     Raises:
-      InputError: a name is empty or no text, or the strength is negative or not finite.
+      InputError: a name is empty or not text, or the strength is negative or not finite.
     """
 
     policy: str
@@ -81,10 +55,10 @@ class Cell:
 
     @classmethod
     def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
-        """One of `cells`, by its number or as policy,sweep,strength.
+        """Find a cell by its number or by its text, policy,sweep,strength.
 
         Args:
-          text: the number, from 0, or the three separated by commas.
+          text: the number, from 0, or the three parts separated by commas.
           cells: the cells to choose from.
 
         Returns:
@@ -107,7 +81,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Shard:
-    """The unit of work, which is lost or kept as a whole: some trials of a cell, which go into one file."""
+    """Consecutive trials of a cell that are run together and stored in one file."""
 
     cell: int
     first: int
@@ -119,14 +93,8 @@ class Shard:
 
     @property
     def file(self) -> str:
-        """The name of its file: the number of the cell and that of the first trial."""
+        """The name of its file: the numbers of the cell and of the first trial."""
         return f"{self.cell:04d}-{self.first:09d}.parquet"
-
-
-def shards_of(cell: int, trials: int, size: int) -> Iterator[Shard]:
-    """The shards of the cell with that number."""
-    for first in range(0, trials, size):
-        yield Shard(cell, first, min(size, trials - first))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,30 +102,30 @@ class Campaign:
     """The specification of a stress test.
 
     Attributes:
-      scenario: what is run, as `lqrsim solve` takes it.
+      scenario: as in `lqrsim solve`.
       sweeps: name -> disturbances at strength 1.
-      strengths: what they are multiplied by.
-      policies: which of POLICIES: "smooth" is lqrsim.smooth's, "ilqr" that of lqrsim.ilqr; "open_loop" is the plan of
-        smooth without feedback; "replan" solves again and again as it goes; "track" and "offset_free" keep to the plan
-        of smooth, by lqrsim.track and lqrsim.OffsetFree. By default the first four.
-      stated: the disturbances that "track" and "offset_free" are made for, whatever they then meet; by default those of
-        the preset "moderate", for one policy has to do for all strengths, and that is in the middle.
-      trials: of each cell.
+      strengths: factors by which the disturbances are scaled.
+      policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
+        of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
+        smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, whatever a trial then
+        meets. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
+      trials: number of trials of each cell.
       seed: of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-      goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
+      goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
       goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
-      shard: trials of a file.
-      time_limit: seconds that a shard may take before it counts as hung.
+      shard: trials per file.
+      time_limit: seconds after which a shard counts as hung.
 
     Raises:
-      InputError: something is not as described.
+      InputError: a field is not as described.
     """
 
     scenario: str
     sweeps: Mapping[str, tuple[Disturbance, ...]]
     strengths: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    policies: tuple[str, ...] = USUAL
+    policies: tuple[str, ...] = DEFAULT_POLICIES
     trials: int = 200
     seed: int = 0
     replan_every: float | None = None
@@ -165,64 +133,61 @@ class Campaign:
     goal_tolerance: float | None = None
     shard: int = 500
     time_limit: float = 300.0
-    stated: tuple[Disturbance, ...] | None = None
+    design_disturbances: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
+        def keep(field: str, value: object) -> None:
+            object.__setattr__(self, field, value)
+
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
+        keep("scenario", from_anywhere(self.scenario))  # workers and reports may run in other folders
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
-        object.__setattr__(self, "scenario", from_anywhere(self.scenario))  # workers and reports may be elsewhere
-        sweeps: dict[str, tuple[Disturbance, ...]] = {}
-        for name, disturbances in self.sweeps.items():
+        wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
+        for name in self.sweeps:
             check_text("sweeps: name", name, "a name without a comma")
             if "," in name:
                 raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")
-            wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
-            sweeps[name] = check_items(f"sweeps: {name}", disturbances, Disturbance, wanted)
+        sweeps = self.sweeps.items()
+        keep("sweeps", {name: check_items(f"sweeps: {name}", some, Disturbance, wanted) for name, some in sweeps})
         strengths = check_items("strengths", self.strengths, object, "a tuple of numbers", at_most=1000)
-        numbers = tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths)
+        keep("strengths", tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths))
         policies = check_items("policies", self.policies, object, f"a tuple of {', '.join(POLICIES)}", at_most=100)
-        for policy in policies:
-            check_name("policies", policy, POLICIES)
-        for field, values in (("strengths", numbers), ("policies", policies)):
+        keep("policies", tuple(check_name("policies", policy, POLICIES) for policy in policies))
+        for field in ("strengths", "policies"):
+            values = getattr(self, field)
             if not values or len(set(values)) < len(values):
                 raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
-            object.__setattr__(self, field, values)
-        object.__setattr__(self, "sweeps", sweeps)
-        if self.stated is not None:
-            check_told("stated", policies)
-            wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
-            stated = check_items("stated", self.stated, Disturbance, wanted)
-            if not stated:
-                raise InputError("stated: got none, want at least one disturbance, or None for the default")
-            object.__setattr__(self, "stated", stated)
+        if self.design_disturbances is not None:
+            check_designed(self.policies)
+            design = check_items("design_disturbances", self.design_disturbances, Disturbance, wanted)
+            if not design:
+                raise InputError(
+                    "design_disturbances: got none, want at least one disturbance, or None for the default"
+                )
+            keep("design_disturbances", design)
         for field in ("trials", "shard"):
-            object.__setattr__(self, field, check_count(field, getattr(self, field)))
-        object.__setattr__(self, "seed", check_seed("seed", self.seed))
+            keep(field, check_count(field, getattr(self, field)))
+        keep("seed", check_seed("seed", self.seed))
         files = -(-self.trials // self.shard) * len(self.cells)
-        if files > _FILES:
+        if files > _MOST_FILES:
             raise InputError(
-                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which are {files}"
-                f" files, want at most {_FILES}: fewer, or a larger shard"
+                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files}"
+                f" files, want at most {_MOST_FILES}: fewer trials, or larger shards"
             )
         for field in ("replan_every", "goal_radius", "goal_tolerance"):
             if (value := getattr(self, field)) is not None:
-                object.__setattr__(self, field, check_number(field, value, above=0.0))
-        object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
+                keep(field, check_number(field, value, above=0.0))
+        keep("time_limit", check_number("time_limit", self.time_limit, above=0.0))
 
     @property
     def cells(self) -> list[Cell]:
         """All combinations, in the order of their numbers."""
-        together = itertools.product(self.sweeps, self.strengths, self.policies)
-        return [Cell(policy, sweep, strength) for sweep, strength, policy in together]
-
-    def shards(self) -> Iterator[Shard]:
-        """All of the work, in order."""
-        for number in range(len(self.cells)):
-            yield from shards_of(number, self.trials, self.shard)
+        combinations = itertools.product(self.sweeps, self.strengths, self.policies)
+        return [Cell(policy, sweep, strength) for sweep, strength, policy in combinations]
 
     def disturbances(self, cell: Cell) -> list[Disturbance]:
-        """The disturbances that the trials of a cell meet.
+        """The disturbances of a cell's trials.
 
         Args:
           cell: one of the campaign's.
@@ -238,18 +203,18 @@ class Campaign:
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
     def as_json(self) -> dict[str, Any]:
-        """What `from_json` makes the same campaign of."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        sweeps = {
-            name: [disturbance_as_json(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()
+        """The campaign as plain data, from which `from_json` makes it again."""
+        design = self.design_disturbances
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {
+            "sweeps": {name: disturbances_as_json(disturbances) for name, disturbances in self.sweeps.items()},
+            "design_disturbances": None if design is None else disturbances_as_json(design),
+            "strengths": list(self.strengths),
+            "policies": list(self.policies),
         }
-        stated = None if self.stated is None else [disturbance_as_json(disturbance) for disturbance in self.stated]
-        lists = {"strengths": list(self.strengths), "policies": list(self.policies)}
-        return fields | {"sweeps": sweeps, "stated": stated} | lists
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """The campaign that `as_json` described; its scenario must have been resolved, if it has its own disturbances.
+        """Make a campaign from what `as_json` returned. Resolve its scenario first: that may define disturbances.
 
         Args:
           fields: what `as_json` returned.
@@ -258,33 +223,32 @@ class Campaign:
           A Campaign equal to the one described.
 
         Raises:
-          InputError: it is damaged, or has a disturbance that is not known here.
+          InputError: the data is damaged, or a disturbance is not known here.
         """
         check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:
-            sweeps = {
-                name: tuple(_disturbance_from_json(one) for one in sweep) for name, sweep in fields["sweeps"].items()
-            }
-            stated = fields["stated"]
-            if stated is not None:
-                stated = tuple(_disturbance_from_json(one) for one in stated)
-            return cls(**{**fields, "sweeps": sweeps, "stated": stated})
+            design = fields["design_disturbances"]
+            return cls(
+                **{
+                    **fields,
+                    "sweeps": {name: _disturbances_from_json(some) for name, some in fields["sweeps"].items()},
+                    "design_disturbances": None if design is None else _disturbances_from_json(design),
+                }
+            )
         except InputError:
             raise
-        except Exception as error:  # whatever a disturbance raises of settings that are not its own
+        except Exception as error:  # a disturbance may raise anything for settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 
-def check_told(field: str, policies: Sequence[str]) -> None:
-    """Raise InputError if none of the policies is made for stated disturbances."""
-    if not {*TOLD} & {*policies}:
-        raise InputError(f"{field}: got it with {', '.join(policies)}, want it with {' or '.join(TOLD)}, or none")
+def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
+    """The kind and the settings of each. Raises InputError if a setting is not plain data."""
+    return [_disturbance_as_json(one) for one in disturbances]
 
 
-def disturbance_as_json(disturbance: Disturbance) -> dict[str, Any]:
-    """Its kind and settings, for JSON. Raises InputError where they are not plain."""
+def _disturbance_as_json(disturbance: Disturbance) -> dict[str, Any]:
     if not dataclasses.is_dataclass(disturbance):
-        raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
+        raise InputError(f"{type(disturbance).__name__}: got a class that is no dataclass, want a dataclass")
     settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
     return {
         "kind": type(disturbance).__qualname__,
@@ -304,10 +268,14 @@ def _as_json(value: Any) -> Any:
     raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
 
 
-def _disturbance_from_json(fields: Mapping[str, Any]) -> Disturbance:
+def _disturbances_from_json(items: Iterable[Mapping[str, Any]]) -> tuple[Disturbance, ...]:
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
-    settings = {name: _with_tuples(value) for name, value in fields["settings"].items()}
-    return kinds[check_name("disturbance", fields["kind"], sorted(kinds))](**settings)
+    return tuple(
+        kinds[check_name("disturbance", item["kind"], sorted(kinds))](
+            **{name: _with_tuples(value) for name, value in item["settings"].items()}
+        )
+        for item in items
+    )
 
 
 def _with_tuples(value: Any) -> Any:
@@ -315,7 +283,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:
-    """Every kind that is defined here, users' own too; of one whose file was loaded twice, the newer."""
+    """Every kind of disturbance that is defined, users' own included; the newer one if a file was loaded twice."""
     for kind in base.__subclasses__():
         yield from _kinds(kind)
         defined = getattr(sys.modules.get(kind.__module__), kind.__qualname__, None) is kind

@@ -1,4 +1,4 @@
-"""How sure a number is: exact intervals of rates, paired comparisons, bootstrap intervals. SciPy does the work."""
+"""Statistics of trials: exact intervals of rates, paired comparisons, bootstrap intervals. Most of it is SciPy's."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,14 +8,23 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_number,
+    check_seed,
+    excerpt,
+)
 
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and the interval that it lies in with the given confidence."""
+    """A number with its confidence interval."""
 
     value: float
     low: float
@@ -27,7 +36,7 @@ class Estimate:
 
 
 def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with its exact (Clopper-Pearson) interval, which covers at least as often as it says.
+    """A success rate with its exact (Clopper-Pearson) interval, whose coverage is at least the confidence.
 
     Raises:
       InputError: no trials, or more successes than trials.
@@ -36,7 +45,7 @@ def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Esti
 
 
 def wilson(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """A success rate with Wilson's interval, which is narrower and covers as often as it says on average: for plots.
+    """A success rate with Wilson's interval, for plots: it is narrower, and its coverage is right on average.
 
     Raises:
       InputError: as `rate` does.
@@ -55,10 +64,11 @@ def _rate(successes: int, trials: int, confidence: float, method: Literal["exact
 
 @dataclass(frozen=True)
 class Pairs:
-    """Two policies on the same trials: in how many only one of them succeeded, and the exact McNemar test.
+    """A comparison of two policies on the same trials, with the exact McNemar test.
 
     Attributes:
-      p_value: how likely so uneven a split, or a less even one, were if neither was the better.
+      only_first, only_second: number of trials in which only this policy succeeded.
+      p_value: probability of a split that is at least as uneven, if both policies were equally good.
     """
 
     only_first: int
@@ -67,30 +77,38 @@ class Pairs:
 
 
 def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
-    """Whether each of two policies succeeded, trial by trial, (K,) each.
+    """Compare two policies trial by trial; `first` and `second` (K,) say whether each trial succeeded.
 
     Raises:
-      InputError: of different lengths, or none.
+      InputError: they have different lengths, or no trials, or are not booleans.
     """
-    one, other = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
-    if one.shape != other.shape or one.ndim != 1 or not len(one):
-        raise InputError(f"second: got shape {other.shape}, want that of first, {one.shape}, and at least one trial")
+    one, other = _flags("first", first), _flags("second", second)
+    if one.shape != other.shape:
+        raise InputError(f"second: got {len(other)} trials, want {len(one)}, as first has")
     only_first, only_second = int(np.sum(one & ~other)), int(np.sum(other & ~one))
-    split = only_first + only_second
-    return Pairs(only_first, only_second, float(stats.binomtest(only_first, split).pvalue) if split else 1.0)
+    different = only_first + only_second
+    p_value = float(stats.binomtest(only_first, different).pvalue) if different else 1.0
+    return Pairs(only_first, only_second, p_value)
+
+
+def _flags(field: str, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    array = check_array(field, values, (None,))
+    if not len(array) or not np.isin(array, (0, 1)).all():
+        raise InputError(f"{field}: got {excerpt(values)}, want at least one trial, each True or False")
+    return array.astype(bool)
 
 
 def paired_difference(only_first: int, only_second: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """How much more often the first of two policies succeeds, on the same trials, with Tango's score interval.
+    """The difference of the success rates of two policies on the same trials, with Tango's score interval.
 
-    It holds each difference that the score test does not reject, with the shares most likely under that difference
-    (Tango, Statistics in Medicine 17, 1998). It has a width also where no trial told the two apart.
+    The interval holds each difference that the score test does not reject, with the shares that are most likely under
+    that difference (Tango, Statistics in Medicine 17, 1998). It has a width even if the policies agree in all trials.
 
     Args:
-      only_first, only_second: in how many trials only that one succeeded. trials: in all.
+      only_first, only_second: number of trials in which only this policy succeeded. trials: number of all trials.
 
     Raises:
-      InputError: no trials, or fewer than those that tell the two apart.
+      InputError: there are no trials, or fewer than those with different results.
     """
     check_count("trials", trials)
     apart = check_count("only_first", only_first, at_least=0) + check_count("only_second", only_second, at_least=0)
@@ -111,9 +129,8 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
     return Estimate(surplus / trials, low, high, confidence)
 
 
-def _last(accepted: Callable[[float], bool], inside: float, end: float) -> float:
-    """The last number from `inside` to `end` that is accepted, by bisection to rounding."""
-    outside = end
+def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
+    """The last accepted number between `inside` and `outside`, by bisection to rounding."""
     for _ in range(60):
         middle = (inside + outside) / 2
         inside, outside = (middle, outside) if accepted(middle) else (inside, middle)
@@ -124,7 +141,7 @@ def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
     """The mean of a sample (K,) with Student's interval.
 
     Raises:
-      InputError: fewer than two numbers, or one that is not finite.
+      InputError: there are fewer than two numbers, or one is not finite.
     """
     numbers = check_array("sample", sample, (None,))
     if len(numbers) < 2:
@@ -136,8 +153,8 @@ def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
 
 
 def holm(p_values: npt.ArrayLike) -> Array:
-    """The p-values of several tests, made larger so that any one false alarm is as rare as they say (Holm, 1979)."""
-    values = np.asarray(p_values, dtype=np.float64)
+    """Adjust the p-values of several tests for their number (Holm, 1979). Raises InputError unless they are (K,)."""
+    values = check_array("p_values", p_values, (None,))
     order = np.argsort(values, kind="stable")
     raised = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
     adjusted = np.empty(len(values))
@@ -152,21 +169,33 @@ def bootstrap(
     resamples: int = 10_000,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic of samples (K,) that belong together, row by row, with its bootstrap interval (of percentiles).
+    """A statistic of paired samples, (K,) each, with its percentile bootstrap interval.
 
     Args:
-      statistic: of the samples and `axis`, as `scipy.stats.bootstrap` wants it; for example
+      statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example
         `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
+      samples: numbers (K,); row i of each belongs to the same trial.
+      confidence: of the interval.
+      resamples: number of bootstrap samples.
       seed: of the resampling.
 
     Raises:
-      InputError: fewer than two rows, or samples of different lengths.
+      InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such
+        function.
     """
-    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
-    if not arrays or any(array.shape != arrays[0].shape or array.ndim != 1 for array in arrays) or len(arrays[0]) < 2:
-        raise InputError(f"samples: got shapes {[array.shape for array in arrays]}, want one length of at least 2")
+    arrays = [check_array("samples", sample, (None,)) for sample in samples]
+    if not arrays or any(len(array) != len(arrays[0]) for array in arrays) or len(arrays[0]) < 2:
+        raise InputError(f"samples: got lengths {[len(array) for array in arrays]}, want one length of at least 2")
+    check_function("statistic", statistic, "a function of the samples and axis", optional=False)
     check_number("confidence", confidence, above=0, below=1)
     check_count("resamples", resamples, at_most=1_000_000)
+    seed = check_seed("seed", seed)
+    try:
+        value = float(statistic(*arrays, axis=0))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"statistic: got {excerpt(statistic)}, want a function of the samples and axis ({error})"
+        ) from None
     interval = stats.bootstrap(
         arrays,
         statistic,
@@ -178,4 +207,4 @@ def bootstrap(
         method="percentile",  # BCa is undefined for medians of counts, which we have
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    return Estimate(float(statistic(*arrays, axis=0)), float(interval.low), float(interval.high), confidence)
+    return Estimate(value, float(interval.low), float(interval.high), confidence)

@@ -1,7 +1,7 @@
-"""Trials as a function of the numbers that they draw: a vector of standard normal numbers decides on all of a trial.
+"""Trials as a function of their random numbers: a vector of standard normal numbers determines a trial.
 
-So what is rare can be searched for in the space of these vectors, whatever the disturbances are and remember. It is the
-standard normal space of reliability analysis; the score is its limit-state function, but positive where a trial fails.
+Rare failures can then be searched for in the space of these vectors, whatever the disturbances are. It is the standard
+normal space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,16 +32,16 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 
 Size = int | Sequence[int] | None
-_LARGEST = np.nextafter(1.0, 0.0)  # of what numpy calls random, which is below 1
+_LARGEST = np.nextafter(1.0, 0.0)  # of the numbers that NumPy's `random` draws from [0, 1)
 
 
 class PrescribedDraws:
-    """What a disturbance uses of NumPy's generators, with numbers that are made of given standard normal ones.
+    """The methods of NumPy's generators that disturbances use, with numbers made from given standard normal ones.
 
-    Each number that is drawn takes one of them, in turn. Uniform ones are the normal distribution's function of it.
+    Each number that is drawn uses the next of them. Uniform numbers are their normal distribution function.
 
     Attributes:
-      used: how many have been taken.
+      used: how many numbers have been used.
     """
 
     def __init__(self, numbers: Array) -> None:
@@ -54,7 +54,7 @@ class PrescribedDraws:
 
     def _take(self, count: int) -> Array:
         if self.used + count > len(self.numbers):
-            raise InputError(f"numbers: got {len(self.numbers)}, want as many as a trial draws, at least one more")
+            raise InputError(f"numbers: got {len(self.numbers)}, want more: a trial draws at least one more")
         self.used += count
         return self.numbers[self.used - count : self.used]
 
@@ -82,25 +82,28 @@ class PrescribedDraws:
     ) -> Any:
         options = np.arange(a) if isinstance(a, (int, np.integer)) else np.asarray(a)
         if not replace:
-            order = np.argsort(self.random(len(options)))  # a random order; p would need another way
             if p is not None:
-                raise InputError("choice: got p without replacement, want one of the two")
+                raise InputError("choice: got p and replace=False, want one of the two")
+            order = np.argsort(self.random(len(options)))
             return options[order[: 1 if size is None else int(np.prod(size))]].reshape(() if size is None else size)[()]
         shares = np.full(len(options), 1 / len(options)) if p is None else np.asarray(p, dtype=np.float64)
         which = np.searchsorted(np.cumsum(shares), self.random(size), side="right")
         return options[np.minimum(which, len(options) - 1)]
 
     def __getattr__(self, name: str) -> Any:
-        raise InputError(f"disturbance: got draws by {name}, want those that can be made of given normal numbers")
+        raise InputError(
+            f"disturbance: got one that draws with {name}, want standard_normal, normal, random, uniform, exponential,"
+            " integers or choice, which can be made from standard normal numbers"
+        )
 
 
 def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
-    """The size that NumPy's generators give what they draw."""
+    """The shape of what NumPy's generators draw with these arguments."""
     return size if size is not None else (np.broadcast_shapes(*(np.shape(one) for one in arguments)) or None)
 
 
 class _CountedDraws(PrescribedDraws):
-    """Has as many numbers as are asked for."""
+    """Counts the numbers that are drawn; each is zero."""
 
     def __init__(self) -> None:
         super().__init__(np.zeros(0))
@@ -110,21 +113,20 @@ class _CountedDraws(PrescribedDraws):
         return np.zeros(count)
 
 
-LEAST_DEPTH = 1e-9  # m; the score of a collision that no knot sees
+LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 
 
-def collision(rollout: Rollout) -> Array:
-    """How far into an obstacle each trial that collides gets, (K,), in metres; less the least clearance of the others.
+def collision_score(rollout: Rollout) -> Array:
+    """The depth in metres to which each trial gets into obstacles, (K,); minus the least clearance without a collision.
 
-    It is positive for all that collide or are lost, and only for them. How far is meant of runs without contacts, in
-    which the robot goes on through what it has run into. What is lost, or what its controller fails, counts as
-    infinitely far.
+    The score is positive exactly for trials that collide, diverge or whose controller fails; infinite for the latter
+    two. The depth needs a rollout without contacts, in which the robot moves on through the obstacles.
 
     Args:
       rollout: K trials.
 
     Returns:
-      (K,), in metres; positive where the trial fails.
+      (K,), in metres; positive if the trial fails.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     depth = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
@@ -133,50 +135,50 @@ def collision(rollout: Rollout) -> Array:
     return np.where(np.isin(outcome, ("diverged", "error")), np.inf, score)
 
 
-def miss(rollout: Rollout) -> Array:
-    """Positive for each trial that does not reach its goal, (K,): it collides, or ends too far away.
+def miss_score(rollout: Rollout) -> Array:
+    """How far each trial ends outside its goal, or its `collision_score` if that is larger, (K,).
 
-    In metres; where the goal has no position, of the scaled error by which it is judged.
+    In metres; for a goal without a position, the scaled error by which it is judged.
 
     Args:
       rollout: K trials.
 
     Returns:
-      (K,); positive where the trial fails.
+      (K,); positive if the trial does not reach its goal.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
-    return np.maximum(collision(rollout), outside)
+    return np.maximum(collision_score(rollout), outside)
 
 
 @dataclass
 class TrialScore:
-    """Scores of trials as a function of what they draw: call it with numbers (K, size) for scores (K,).
+    """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 
-    A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
+    A trial fails if its score is positive. Standard normal numbers give trials distributed as those of `simulate`.
 
     Args:
       plant: what is run.
-      solution: with the plan, and the policy unless there is a controller.
+      solution: the plan, and the policy unless there is a controller.
       disturbances: as in `simulate`.
       controller: as in `simulate`.
-      failure: scores a rollout's trials, (K,).
+      failure: returns the scores (K,) of a rollout.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       contacts: as in `simulate`.
-      batch: how many trials are run at once.
+      batch: number of trials that are run at once.
       threads: as in `simulate`.
 
     Attributes:
-      sizes: how many numbers each disturbance draws.
-      simulations: how many trials have been run.
+      sizes: number of random numbers that each disturbance draws.
+      simulations: number of trials that have been run.
     """
 
     plant: Plant
     solution: Solution
     disturbances: Sequence[Disturbance]
     controller: ControllerLike | None = None
-    failure: Callable[[Rollout], Array] = collision
+    failure: Callable[[Rollout], Array] = collision_score
     goal_radius: float | None = None
     goal_tolerance: float | None = None
     contacts: bool = False
@@ -197,11 +199,11 @@ class TrialScore:
 
     @property
     def size(self) -> int:
-        """How many numbers a trial draws."""
+        """Number of random numbers of a trial."""
         return sum(self.sizes)
 
     def __call__(self, numbers: npt.ArrayLike) -> Array:
-        """The scores of trials that draw the given numbers.
+        """The scores of trials with the given random numbers.
 
         Args:
           numbers: (K, size).
@@ -210,7 +212,7 @@ class TrialScore:
           (K,); positive is failure.
 
         Raises:
-          InputError: not numbers of that shape, or the scores are not numbers.
+          InputError: the shape is wrong, or a score is NaN.
         """
         vectors = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
@@ -219,14 +221,14 @@ class TrialScore:
         return np.concatenate(scores) if scores else np.zeros(0)
 
     def _score(self, rollout: Rollout) -> Array:
-        """One number a trial, which is not NaN. Raises InputError for anything else."""
+        """The scores of a rollout. Raises InputError unless they are one number per trial."""
         scores = shaped("failure: returned", self.failure(rollout), (rollout.trials,))
         if np.isnan(scores).any():
-            raise InputError(f"failure: got {excerpt(scores.tolist())} returned, want numbers: positive is failure")
+            raise InputError(f"failure: returned {excerpt(scores.tolist())}, want numbers: positive is failure")
         return scores
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
-        """The trials with these numbers, (K, size), in full; their `seed` means nothing.
+        """Run the trials with the given random numbers. The `seed` of the result means nothing.
 
         Args:
           numbers: (K, size).
@@ -260,5 +262,6 @@ class TrialScore:
 
 
 def normal_tail(distance: float) -> float:
-    """Probability that a standard normal number is larger."""
+    """The probability that a standard normal number is larger."""
+
     return float(ndtr(-distance))

@@ -1,7 +1,7 @@
-"""Tables of trials as parquet: written whole or not at all, and checked when they are read.
+"""Tables of trials as parquet files: written whole or not at all, and checked when they are read.
 
-A file holds the columns of `Outcomes`, and `reason`, which says why a trial is an "error". Its metadata names the
-campaign, the cell and the trials, and has a hash of all that, and of the columns.
+A file has the columns of `Outcomes`, and `reason`, the cause of an error. Its metadata names the campaign, the cell and
+the trials, and has a hash of these and of the columns.
 """
 
 import io
@@ -25,11 +25,11 @@ _KEY = b"lqrsim shard"
 
 
 class Damaged(Exception):
-    """A file that is not what was written."""
+    """A file that differs from what was written."""
 
 
 def pack(table: Table, shard: Shard, campaign: str) -> bytes:
-    """A table as the bytes of a file; `campaign` is the digest of the one that it belongs to."""
+    """Encode a table as a file; `campaign` is the digest of its campaign."""
     about = _about(shard, campaign)
     meta = json.dumps(about | {"sha256": _digest(table, about)}).encode()
     arrow = pa.table({name: pa.array(column) for name, column in table.items()}).replace_schema_metadata({_KEY: meta})
@@ -39,25 +39,25 @@ def pack(table: Table, shard: Shard, campaign: str) -> bytes:
 
 
 def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
-    """The table again. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
+    """Decode a table. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
     about = _about(shard, campaign)
     try:
         file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
-        if file.metadata.num_rows != shard.count:  # before room for them is taken
+        if file.metadata.num_rows != shard.count:  # checked before memory is allocated for the rows
             raise ValueError(f"{file.metadata.num_rows} rows")
         arrow = file.read(use_threads=False)
         meta = json.loads((arrow.schema.metadata or {})[_KEY])
         table = {name: _column(arrow[name]) for name in arrow.column_names}
         good = meta == about | {"sha256": _digest(table, about)}
-    except Exception as error:  # whatever a parser says of bytes that something else wrote
+    except Exception as error:  # a parser may raise anything for damaged bytes
         raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
     if not good or any(len(column) != shard.count for column in table.values()):
-        raise Damaged("its contents are not those that were written")
+        raise Damaged("its contents have changed")
     return table
 
 
 def write(contents: bytes, path: Path) -> None:
-    """Have the file on the disk, whole or not at all. Raises InputError where it cannot be, as on a full disk."""
+    """Write a file to the disk, whole or not at all. Raises InputError if it cannot, as on a full disk."""
     with replacing(path) as unfinished, unfinished.open("wb") as file:
         file.write(contents)
         file.flush()
@@ -65,7 +65,8 @@ def write(contents: bytes, path: Path) -> None:
 
 
 def read(path: Path, shard: Shard, campaign: str) -> Table:
-    """The table of a file. Raises Damaged for what is not to be trusted, or cannot be read."""
+    """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
+
     try:
         contents = path.read_bytes()
     except OSError as error:

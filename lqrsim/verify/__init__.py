@@ -1,1 +1,1 @@
-"""Tracking verified from pixels: where the robot is in pictures, against what the record of the run says."""
+"""Verification of runs from pixels: positions in pictures, compared with the record of the run."""

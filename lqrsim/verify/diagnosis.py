@@ -1,21 +1,23 @@
-"""What is likely to be wrong with pictures that do not show what a run's record says."""
+"""A diagnosis of pictures that do not match the record of a run."""
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-FEW_FRAMES = 4  # frames that may be wrong one by one
+FEW_FRAMES = 4  # up to so many wrong frames are named one by one
 
 
 def diagnose(
     numbers: npt.NDArray[np.intp], times: Array, seen: Array, actual: Array, bound: float, interval: float
 ) -> str:
-    """The explanation after which nearly all positions fit within twice the bound, in a line.
+    """The explanation that leaves nearly all positions within twice the bound, as a line.
 
     Args:
-      numbers: (k,) of the frames in which the robot is seen. times, seen, actual: of all frames.
-      bound: in metres. interval: seconds between frames.
+      numbers: (k,) of the frames in which the robot is seen.
+      times, seen, actual: of all frames.
+      bound: on the error, in metres.
+      interval: seconds between frames.
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
@@ -23,7 +25,7 @@ def diagnose(
     if 0 < len(wrong) <= FEW_FRAMES:
         return _single_frames(wrong, numbers, where, truth, 2 * bound)
     for axis, name in zip(range(truth.shape[1]), "xyz", strict=False):
-        # Mirrored in one of two views that see it, it seems to stand still.
+        # Mirrored in one of the two views that show it, a coordinate seems to stand still.
         spread = truth[:, axis] - truth[:, axis].mean()
         slope = spread @ (where[:, axis] - where[:, axis].mean()) / max(spread @ spread, 1e-12)
         if slope < 0.25 and spread.std() > 5 * bound:
@@ -38,7 +40,7 @@ def diagnose(
     if abs(late) > interval / 4:
         shown = _positions_at(times, actual, times[numbers] + late)
         candidates.append((where - shown, f"pictures show the run {_in_frames(late, interval)}"))
-    if abs(ahead) > interval / 4 and split > FEW_FRAMES:  # before that, it is late or early as a whole
+    if abs(ahead) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
         shown = _positions_at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
         said = "left out" if ahead > 0 else "shown twice"
         said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(ahead, interval)}"
@@ -55,13 +57,13 @@ def diagnose(
 def _single_frames(
     wrong: npt.NDArray[np.intp], numbers: npt.NDArray[np.intp], seen: Array, actual: Array, near: float
 ) -> str:
-    """Which frames do not show their moment, and whether two show each other's."""
+    """The frames that do not show their time, and whether two of them are swapped."""
     if len(wrong) == 2:
         first, second = wrong
         crossed = seen[[first, second]] - actual[[second, first]]
         if _lengths(crossed).max() <= near:
             return f"frames {numbers[first]} and {numbers[second]} are swapped"
-    return f"frames that do not show their moment: {', '.join(str(numbers[one]) for one in wrong)}"
+    return f"frames that do not show their time: {', '.join(str(numbers[one]) for one in wrong)}"
 
 
 def _slope(error: Array, velocity: Array) -> float:
@@ -69,10 +71,10 @@ def _slope(error: Array, velocity: Array) -> float:
 
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
-    """The frame from which on errors are velocity times a number of seconds, and before which there are none."""
+    """The frame from which on errors are velocity times a delay, and the delay; before it there are no errors."""
     products, squares = ((error * velocity).sum(axis=1), (velocity**2).sum(axis=1))
     tails = [np.cumsum(part[::-1])[::-1] for part in (products, squares)]
-    gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # by how much a break there reduces the squares
+    gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # the reduction of the squares by a break there
     split = int(gained.argmax())
     return split, float(tails[0][split] / max(tails[1][split], 1e-12))
 
@@ -86,10 +88,10 @@ def _in_frames(seconds: float, interval: float) -> str:
 
 
 def _lengths(vectors: Array) -> npt.NDArray[np.float64]:
-    """Of vectors (..., d)."""
+    """Lengths (...) of vectors (..., d)."""
     return np.linalg.norm(vectors, axis=-1)
 
 
 def _quantile_95(vectors: Array) -> float:
-    """The length that all but one in twenty stay below."""
+    """The 95 % quantile of the lengths."""
     return float(np.quantile(_lengths(vectors), 0.95))

@@ -1,4 +1,4 @@
-"""Verifying a run by drawing it."""
+"""Verification of a run by drawing it."""
 
 from collections.abc import Iterator, Sequence
 
@@ -18,8 +18,8 @@ from lqrsim.view.cameras import Camera
 from lqrsim.view.recorded_trial import place_in, robot_body
 
 SIZE = (640, 480)
-POSITION_BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
-# Their silhouettes, seen orthographically, are symmetric about their centre, however they are turned.
+POSITION_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged ones
+# Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
 SYMMETRIC_KINDS = (
     Geom.mjGEOM_SPHERE,
     Geom.mjGEOM_CAPSULE,
@@ -32,24 +32,24 @@ SYMMETRIC_KINDS = (
 def verify_run(
     rollout: Rollout, trial: int = 0, *, solution: Solution | None = None, progress: Progress | None = None
 ) -> Verification:
-    """Draws what a rollout recorded for drawing, reads positions from the pixels, and compares them with its states.
+    """Draw the frames of a rollout, read positions from the pixels, and compare them with its states.
 
     Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
-    plane, and from both if it moves in space. The pictures are
-    segmentations that show nothing but a part of the robot that can collide: X-rays, in which obstacles hide nothing.
-    Of a robot without a position it is where its last ball is that is read.
+    plane, and from both if it moves in space. The pictures are segmentations that show only a part of the robot that
+    can collide, like X-rays, in which obstacles hide nothing. For a robot without a position, the place of its last
+    ball is read.
 
     Args:
-      rollout: what `simulate` returned, with frames.
+      rollout: of `simulate`, with frames.
       trial: row of the rollout.
-      solution: of which the run is, to tell whether the plan in the rollout is the one that was followed.
-      progress: called after each frame with the number of frames done and of all frames.
+      solution: that was run, to check the plan in the rollout.
+      progress: called after each frame with the numbers of frames that are done and of all frames.
 
     Returns:
       The Verification.
 
     Raises:
-      InputError: there is no such trial, nothing to draw, or no OpenGL.
+      InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.
     """
     ground_truth.check_arguments(solution, progress)
     model = ground_truth.drawable_model(rollout, trial)
@@ -57,7 +57,7 @@ def verify_run(
     if rollout.balls is not None and not rollout.state_coordinates.position:
         body = rollout.balls.tracked[0]
     geom = _tracked_geom(model, body)
-    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
+    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout.plane)]
     times, rows = ground_truth.frames_at_states(rollout, trial)
     measured: list[Array] = []
     offsets: list[Array] = []
@@ -89,19 +89,21 @@ def verify_run(
 
 
 def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
-    """The largest geom of the robot's body that can collide and whose silhouette's middle is its centre."""
+    """The largest geom of the robot's body that can collide and has a symmetric silhouette."""
     kinds = [kind.value for kind in SYMMETRIC_KINDS]
     fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
     fits &= (model.geom_contype | model.geom_conaffinity) != 0
     if not fits.any():
-        raise InputError("rollout.model: got no sphere, capsule, ellipsoid, cylinder or box that is the robot's")
+        raise InputError(
+            "rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box of the robot"
+        )
     return int(np.argmax(np.where(fits, model.geom_rbound, -1)))
 
 
 def _silhouettes(
     model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera]
 ) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
-    """For each frame (nq,): a mask (height, width) of the geom in each view, and where it is from the robot's place."""
+    """For each frame (nq,): masks (height, width) of the geom in each view, and its offset from the robot's place."""
     gl.bind()
     body = robot_body(model, rollout.body)
     model.geom_group[:], model.geom_group[geom] = 1, 0
@@ -118,7 +120,7 @@ def _silhouettes(
             for view in views:
                 renderer.update_scene(data, scene_option=options)
                 view.place(renderer.scene, SIZE[0] / SIZE[1])
-                # Numbers for colours, the renderer's own segmentation, without looking up what the one geom is.
+                # The renderer's own segmentation, without looking up the only geom.
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
                 masks.append(renderer.render()[..., 0] > 0)

@@ -1,83 +1,74 @@
-"""What came out of a verification: positions, how they compare, and a verdict in tests with bounds."""
+"""The result of a verification: positions from pixels, and tests of their errors against bounds."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt, shaped
+from lqrsim.errors import Array, InputError
+from lqrsim.results.fields import LINE, Line, check_fields
 from lqrsim.verify.diagnosis import diagnose
 
-HIDDEN = 0.05  # of the frames that may not show what is tracked
-SCALE = 0.002
+HIDDEN = 0.05  # share of the frames in which the robot may be hidden
+SCALE = 0.002  # largest error of the scale
 VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """One thing that must hold.
+    """One test of a verification.
 
     Attributes:
-      passed: None if it cannot be told. detail: what was measured and what was wanted.
+      name: of the test.
+      passed: None if it could not be checked.
+      detail: what was measured, and what was wanted.
     """
 
-    __test__ = False  # it is no test of pytest's
+    __test__ = False  # pytest would collect it
 
-    name: str
+    name: Line
     passed: bool | None
-    detail: str
+    detail: Line
 
     def __post_init__(self) -> None:
-        for name in ("name", "detail"):
-            check_kind(f"Criterion: {name}", getattr(self, name), str, "text")
-        if self.passed not in (True, False, None):
-            raise InputError(f"Criterion: passed: got {excerpt(self.passed)}, want True, False or None")
+        check_fields(self)
 
 
 @dataclass(frozen=True)
 class Verification:
-    """A run's positions as pixels tell them, N frames with d coordinates, and what they prove.
+    """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
 
     Attributes:
       subject: what was verified.
-      method: how its position was read from pixels.
-      times: (N,) seconds after the run's start that the frames should show.
+      method: how positions were read from pixels.
+      times: (N,) seconds after the start of the run that the frames should show.
       seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
-      actual: (N, d) the simulator's.
-      planned: (N, d) the plan's.
+      actual: (N, d) positions in the simulator.
+      planned: (N, d) positions in the plan.
       rms: root mean square of the distance between seen and actual, in metres.
       worst: largest distance between seen and actual, in metres.
-      shift: by how many seconds the pictures are ahead of the run.
-      scale: of the seen motion to the actual one.
+      shift: of the pictures ahead of the run, in seconds.
+      scale: of the seen motion relative to the actual one.
       tests: each with a verdict.
-      likely: what is wrong, if one failed; empty if none did.
+      likely: the likely cause if a test failed; otherwise empty.
     """
 
-    subject: str
-    method: str
-    times: Array
-    seen: Array
-    actual: Array
-    planned: Array
+    subject: Annotated[str, 10 * LINE]
+    method: Annotated[str, 10 * LINE]
+    times: Annotated[Array, "N"]
+    seen: Annotated[Array, "N d"]
+    actual: Annotated[Array, "N d"]
+    planned: Annotated[Array, "N d"]
     rms: float
     worst: float
     shift: float
     scale: float
     tests: tuple[Criterion, ...]
-    likely: str
+    likely: Annotated[str, 10 * LINE]
 
     def __post_init__(self) -> None:
-        for name in ("subject", "method", "likely"):
-            check_kind(f"Verification: {name}", getattr(self, name), str, "text")
-        times = shaped("Verification: times", self.times, (None,))
-        if not len(times):
-            raise InputError("Verification: times: got none, want one a frame")
-        object.__setattr__(self, "times", times)
-        seen = shaped("Verification: seen", self.seen, (len(times), None))
-        for name in ("seen", "actual", "planned"):
-            object.__setattr__(self, name, shaped(f"Verification: {name}", getattr(self, name), seen.shape))
-        for name in ("rms", "worst", "shift", "scale"):
-            object.__setattr__(self, name, float(shaped(f"Verification: {name}", getattr(self, name), ())))
-        object.__setattr__(self, "tests", check_items("Verification: tests", self.tests, Criterion, "a tuple of tests"))
+        if not check_fields(self)["N"]:
+            raise InputError("Verification: times: got none, want one for each frame")
 
     @property
     def passed(self) -> bool:
@@ -86,7 +77,7 @@ class Verification:
 
     @property
     def tracking_error(self) -> Array:
-        """Distance from the plan as pixels tell it, in metres, (N,)."""
+        """Distance from the plan by pixels, in metres, (N,)."""
         return np.linalg.norm(self.seen - self.planned, axis=1)
 
     def summary(self) -> str:
@@ -107,12 +98,14 @@ class Verification:
 
 @dataclass(frozen=True)
 class Positions:
-    """Where the robot is in N frames, d coordinates each, in metres.
+    """Positions of the robot in N frames, d coordinates each, in metres.
 
     Attributes:
-      times: (N,) seconds after the run's start. seen: (N, d) from pixels; NaN where the robot is hidden.
-      actual: (N, d) the simulator's. planned: (N, d) the plan's.
-      apart: (N,) by which the views differ about the same place.
+      times: (N,) seconds after the start of the run.
+      seen: (N, d) from pixels; NaN where the robot is hidden.
+      actual: (N, d) in the simulator.
+      planned: (N, d) in the plan.
+      apart: (N,) disagreement of the views.
     """
 
     times: Array
@@ -131,12 +124,12 @@ def compare(
     interval: float,
     others: tuple[Criterion, ...] = (),
 ) -> Verification:
-    """Compares what was seen with what there was.
+    """Compare the positions from pixels with the actual ones.
 
     Args:
       bound: on the distance between seen and actual, in metres, in any frame.
       interval: seconds between two frames; the shift must be less than a quarter of it.
-      others: tests made already.
+      others: tests that have been made already.
     """
     times, seen, actual = positions.times, positions.seen, positions.actual
     good = np.asarray(np.isfinite(seen).all(axis=1))
@@ -148,16 +141,16 @@ def compare(
     if good.sum() < 3:
         return Verification(
             subject, method, times, seen, actual, positions.planned, np.nan, np.nan, np.nan, np.nan,
-            (*others, visible), "the robot is not in the pictures, or is too small in them",
+            (*others, visible), "the robot is not in the pictures, or too small",
         )  # fmt: skip
     error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
     distance = np.linalg.norm(error, axis=1)
     (shift, shift_error), (scale, scale_error) = _fit(error, velocity, actual[good])
-    # What hardly moves, or hardly anywhere, tells neither; then the fit's own uncertainty is what it is held to.
+    # A robot that hardly moves determines neither shift nor scale; the bound is then the uncertainty of the fit.
     most, stretch = max(interval / 4, 4 * shift_error), max(SCALE, 4 * scale_error)
     number = int(np.flatnonzero(good)[distance.argmax()])
     most_apart, agreement = float(positions.apart[good].max()), ()
-    if most_apart > 0:  # only one view leaves nothing to disagree about
+    if most_apart > 0:  # a single view cannot disagree
         detail = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
         agreement = (Criterion("views agree", most_apart <= bound, detail),)
     tests = (
@@ -179,7 +172,7 @@ def compare(
 
 
 def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: float, interval: float) -> str:
-    """What is wrong, in a line; empty if no test failed."""
+    """The likely cause of a failure, as a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
     if "mark" in failed:
         return "the panes are too small: render the video larger, or with fewer of them"
@@ -187,19 +180,19 @@ def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: flo
         visible = np.flatnonzero(np.isfinite(positions.seen).all(axis=1))
         return diagnose(visible, positions.times, positions.seen, positions.actual, bound, interval)
     causes = {
-        "run": "the video is of another run, or this run's file is not what it was",
+        "run": "the video is of another run, or the file of this run has changed",
         "plan": "the plan in this file is not the one that the policy followed",
         "frames": "frames were cut from the video or added to it, or its speed was changed",
-        "record": "the file's pictures and states are not of the same run",
-        "seen": "something covers the robot, or it leaves the pictures",
+        "record": "frames and states in the file are not of the same run",
+        "seen": "something covers the robot, or it leaves the picture",
     }
     return "; ".join(cause for name, cause in causes.items() if name in failed)
 
 
 def _fit(error: Array, velocity: Array, actual: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Shift in seconds and stretch that explain the errors (k, d), and their standard errors; an offset is free.
+    """The shift in seconds and the stretch that fit the errors (k, d), each with its standard error.
 
-    error = offset + shift * velocity + stretch * (actual - its mean), by least squares.
+    error = offset + shift * velocity + stretch * (actual - mean of actual), by least squares with a free offset.
     """
     columns = [(part - part.mean(axis=0)).ravel() for part in (velocity, actual)]
     inverse, rest = np.linalg.pinv(np.stack(columns, axis=1)), (error - error.mean(axis=0)).ravel()

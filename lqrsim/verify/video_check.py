@@ -1,4 +1,4 @@
-"""Verifying the video of a run, from its file."""
+"""Verification of a run from its video."""
 
 import contextlib
 import os
@@ -21,12 +21,12 @@ from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video_metadata import Pane, VideoMetadata
 
-POSITION_BOUND = 1 / 35  # the worst error that is allowed, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
-RECORD_BOUND = 1 / 350  # between what was recorded for drawing and the states
+POSITION_BOUND = 1 / 35  # largest error, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
+RECORD_BOUND = 1 / 350  # largest distance between frames and states, in radii of the robot
 
 
 def run_beside(path: str | os.PathLike[str]) -> Path:
-    """The rollout's file in the video's folder that the video says it shows. Raises InputError if there is none."""
+    """The file, in the folder of a video, of the rollout that it shows. Raises InputError if there is none."""
     metadata, folder = video_metadata.read(path), Path(path).parent
     for found in sorted(folder.glob("*.npz")):
         with contextlib.suppress(InputError):  # a solution, or what is damaged
@@ -105,22 +105,23 @@ def verify_video(
 
 
 def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Criterion, ...]:
-    """Whether the file is of the run of that digest, with its frames at their times, and its marks large enough.
+    """Whether the video shows the run of that digest, with frames at their times and marks large enough.
 
     Args:
-      frames: that were decoded. off: seconds between when one is shown and when it should be, at most.
+      frames: number of frames that were decoded.
+      off: largest error of the time of a frame, in seconds.
       area: of the smallest mark, in pixels.
     """
     return (
         Criterion(
             "run",
             digest in metadata.runs,
-            f"the video says that it shows {', '.join(metadata.runs)}, this run is {digest}",
+            f"the video shows {', '.join(metadata.runs)}, this run is {digest}",
         ),
         Criterion(
             "frames",
             frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
-            f"got {frames}, want the {metadata.frames} that were written; {1e3 * off:.1f} ms from their times at most",
+            f"got {frames}, want the {metadata.frames} that were written; at most {1e3 * off:.1f} ms from their times",
         ),
         Criterion(
             "mark",
@@ -131,7 +132,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
 
 
 def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
-    """Each frame (height, width, 3), and when a player shows it, in seconds."""
+    """Each frame (height, width, 3), and the time at which a player shows it, in seconds."""
     try:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
@@ -141,8 +142,8 @@ def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[
 
 
 def _measure_marker(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
-    """What the view measures (2,) of the mark of that radius in metres."""
+    """The measurement (2,) of the mark of this radius in metres, in one view."""
     part = image[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width]
     if part.shape[:2] != (pane.height, pane.width):
-        raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want them as lqrsim wrote them")
+        raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want the size that lqrsim wrote")
     return view.measure(pixels.marker_centre(part, radius * pane.height / view.height), (pane.width, pane.height))

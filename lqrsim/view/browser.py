@@ -1,11 +1,10 @@
 """MuJoCo's viewer in a browser, on loopback only.
 
-MuJoCo 4.0's server listens to the whole network, without a password, takes files from whoever asks, and lets pages of
-any site in. It has no options about that. So what makes its socket and its server is replaced while it starts. It
-answers only requests that call it by its own name and port: a site whose name is made to point to this machine calls it
-by that name. Of pages it answers only its own: any other, be it of another port of this machine, has another origin.
-Then it is tried out: if anything but loopback answers, or it lets in what it should not, it is closed again and nothing
-is shown.
+MuJoCo 4.0's server listens on all network interfaces, has no password, accepts uploads from anyone and requests from
+the pages of any site. It has no options for that. The functions that make its socket and its server are therefore
+replaced while it starts. It then answers only requests with its own host name and port, which rules out DNS rebinding,
+and only pages of its own origin. Before anything is shown the server is tested: if it answers elsewhere than on
+loopback, or lets in a foreign request, it is closed.
 """
 
 import contextlib
@@ -36,32 +35,32 @@ from lqrsim.view.viewer_base import PUSHES, Viewer
 
 TESTED_VERSION = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
-HOST_NAMES = LOOPBACK, "localhost"  # that it may be called by
-# What it sends is for its own pages alone: no other page may read it, embed it, or show it in a frame.
+HOST_NAMES = LOOPBACK, "localhost"  # by which requests may address it
+# No other page may read, embed or frame what it sends.
 PRIVATE_HEADERS = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
 SHARING_HEADER = "Access-Control-Allow-Origin"
-START_TIMEOUT = 10.0  # s, that the server may take to start
-# What a dragged goal comes with, and what it comes without; an earlier state of the run has both.
+START_TIMEOUT = 10.0  # s, for the server to start
+# A message about a dragged goal has the first and not the second; one about an earlier state of the run has both.
 MOCAP, TIME = mujoco.mjtState.mjSTATE_MOCAP_POS.value, mujoco.mjtState.mjSTATE_TIME.value
-RELEASE_AFTER = 0.5  # s; a hand that is not heard of for so long has let go
+RELEASE_AFTER = 0.5  # s without a message, after which a drag counts as released
 
 
 class _SceneUpdate(messages.Snapshot):
-    """From the simulation to the viewer: what to draw beside the model, and what to say."""
+    """From the simulation to the viewer: overlays and caption."""
 
     def __init__(self, geoms: list[mujoco.MjvGeom], caption: str) -> None:
         self.geoms, self.caption = geoms, caption
 
 
 class _KeyPress(messages.Event):
-    """From the viewer to the simulation: a key was pressed that moves something."""
+    """From the viewer to the simulation: a key that pushes the robot or moves the goal."""
 
     def __init__(self, key: str, azimuth: float) -> None:
         self.key, self.azimuth = key, azimuth
 
 
 class _ViewerSide(plugin.ViewerPlugin):
-    """The viewer's side."""
+    """The plugin on the viewer's side."""
 
     studio: app.App
 
@@ -78,7 +77,7 @@ class _ViewerSide(plugin.ViewerPlugin):
         self.viewer.extra_geoms[:] = event.geoms
         self.studio.status = f"{self.title}: {'; '.join(event.caption.splitlines())}"
 
-    @messages.handler(priority=0)  # after the viewer has set up its own
+    @messages.handler(priority=0)  # after the viewer's own handler
     def on_model(self, event: messages.PostModelEvent) -> None:
         self.owner.aim_camera(self.viewer.camera)
         self.viewer.perturb.select = self.owner.robot
@@ -97,7 +96,7 @@ class _ViewerSide(plugin.ViewerPlugin):
 
 
 class _SimulationSide(plugin.SimPlugin):
-    """The simulation's side: what the person does reaches the Browser, and nothing reaches anything else."""
+    """The plugin on the simulation's side: all input goes to the Browser, none to MuJoCo's own simulation."""
 
     def __init__(self, owner: Viewer) -> None:
         self.owner, self.last_drag, self.edited = owner, 0.0, mujoco.MjData(owner.model)
@@ -134,11 +133,11 @@ class _SimulationSide(plugin.SimPlugin):
         ):
             mujoco.mj_setState(model, self.edited, event.state, kinds)
             owner.move_goal(owner.space.of_world(self.edited.mocap_pos[model.body_mocapid[owner.goal_body]]))
-        return True  # the rest of the state is the simulation's
+        return True  # the rest of the state belongs to the simulation
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_load(self, event: messages.LoadModelEvent) -> bool:
-        return True  # and so is the model
+        return True  # and so does the model
 
     @messages.handler
     def on_step(self, event: messages.StepEvent) -> None:
@@ -147,23 +146,25 @@ class _SimulationSide(plugin.SimPlugin):
 
 
 class Browser(Viewer):
-    """A viewer in a browser. Use it with `with`: its server runs as long as the block. One in a process: MuJoCo's user
-    interface is global, and a second one may crash.
+    """A viewer in a browser, to be used with `with`: its server runs as long as the block.
+
+    There can be one in a process: MuJoCo's user interface is global, and a second one may crash.
 
     Args:
-      port: 0 takes the first free one from 8080 on. title: of the page. The others are those of a Viewer.
+      port: 0 takes the first free port from 8080 on.
+      title: of the page. The other arguments are those of a Viewer.
 
     Attributes:
-      port: that it listens on.
+      port: on which the server listens.
 
     Raises:
-      InputError: the port is taken, MuJoCo is not one of the versions whose server is known, or others can reach it.
+      InputError: the port is taken, MuJoCo's version is not a tested one, or other machines can reach the server.
     """
 
     def __init__(self, *arguments: Any, port: int = 0, title: str = "", **options: Any) -> None:
         super().__init__(*arguments, **options)
         if not mujoco.__version__.startswith(TESTED_VERSION):
-            known = f"{TESTED_VERSION}x, whose server is known to keep to this machine"
+            known = f"{TESTED_VERSION}x, whose server can be kept to this machine"
             raise InputError(f"browser: got MuJoCo {mujoco.__version__}, want {known}; or a display, for a window")
         viewer_side = _ViewerSide(self, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
@@ -173,7 +174,7 @@ class Browser(Viewer):
             self._handle = launch_web.launch(config, plugins=[app.App(layout), viewer_side, _SimulationSide(self)])
             try:
                 while not viewer_side.started.wait(0.02):
-                    self._handle.is_running()  # raises what the viewer's thread did
+                    self._handle.is_running()  # raises the exception of the viewer's thread
                 self.port = sockets[0].getsockname()[1] if sockets else port
                 _check_private(self.port)
             except RuntimeError as error:
@@ -191,7 +192,7 @@ class Browser(Viewer):
 
     @property
     def instructions(self) -> str:
-        """How to get there."""
+        """How to open the page."""
         tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
         return (
             f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
@@ -218,20 +219,20 @@ class Browser(Viewer):
 
 @contextlib.contextmanager
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
-    """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit its own pages.
+    """A block in which MuJoCo's server starts on loopback only, refuses uploads, and admits only its own pages.
 
-    Three functions of MuJoCo are replaced. None has an option in 4.0; what happens without each was tried with 4.0.0:
+    Three functions of MuJoCo are replaced, for which 4.0 has no option. What each prevents was tried with 4.0.0:
 
-    - `web_server.bind_public_socket`: the viewer passes `::` to it. The server then answers at 127.0.0.2, ::1 and the
-      machine's addresses in the network.
-    - `web_server.serve`, whose handlers it wraps: a page of another site then opens the WebSockets /state and /drop,
-      which takes models; a request that calls the server by another name gets the model; and an answer may be read by
-      any page (Access-Control-Allow-Origin).
-    - `web_viewer._print_url_banner`: it then prints an address in the network, where nothing answers, and warns that
-      others can connect.
+    - `web_server.bind_public_socket`: the viewer passes `::` to it, and the server answers at 127.0.0.2, at ::1 and at
+      the machine's addresses in the network.
+    - `web_server.serve`, whose handlers are wrapped: a page of another site can open the WebSockets /state and /drop,
+      which takes models; a request with another host name gets the model; and any page may read the answer
+      (Access-Control-Allow-Origin).
+    - `web_viewer._print_url_banner`: it prints an address in the network, where nothing answers, and warns that others
+      can connect.
 
     Args:
-      sockets: gets what it listens on.
+      sockets: a list to which the listening socket is appended.
     """
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
 
@@ -267,18 +268,18 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
 
 
 def _refusal(request: Any, port: int) -> str:
-    """Why a request is refused; empty if it is not."""
+    """The reason for which a request is refused; empty if it is admitted."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     ours = [f"{name}:{port}" for name in HOST_NAMES] + (list(HOST_NAMES) if port == 80 else [])
     if len(hosts) != 1 or hosts[0] not in ours:
-        return f"this server is called {' or '.join(ours)}"
+        return f"the host of this server is {' or '.join(ours)}"
     if origins and origins != [f"http://{hosts[0]}"]:
-        return "only pages of this server are let in"
-    return "no files are taken" if request.path.split("?")[0] == "/drop" else ""
+        return "only pages of this server are admitted"
+    return "uploads are refused" if request.path.split("?")[0] == "/drop" else ""
 
 
 def _with_private_headers(response: Any) -> Any:
-    """The response as no other page may use it."""
+    """The response with headers that keep other pages from using it."""
     for name in (SHARING_HEADER, *PRIVATE_HEADERS):
         if name in response.headers:
             del response.headers[name]
@@ -287,15 +288,15 @@ def _with_private_headers(response: Any) -> Any:
 
 
 def _check_private(port: int) -> None:
-    """Raises InputError unless the server answers on loopback, and at no other address of this machine."""
+    """Raises InputError unless the server answers on loopback only, and refuses foreign requests."""
     until = time.monotonic() + START_TIMEOUT
-    while not _listens(LOOPBACK, port):  # it is started on a thread of its own
+    while not _listens(LOOPBACK, port):  # it starts on another thread
         if time.monotonic() > until:
-            raise InputError(f"browser: got a server that does not answer at {LOOPBACK}:{port}, want one that does")
+            raise InputError(f"browser: the server does not answer at {LOOPBACK}:{port} after {START_TIMEOUT:g} s")
         time.sleep(0.02)
     for address in _other_addresses():
         if _listens(address, port):
-            raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")
+            raise InputError(f"browser: others can reach the server at {address}, port {port}; it was closed")
     here = f"{LOOPBACK}:{port}"
     for path, host, origin in (
         ("/drop", here, f"http://{here}"),
@@ -306,26 +307,26 @@ def _check_private(port: int) -> None:
     ):
         if _request(path, host, origin, port)[0] != http.HTTPStatus.FORBIDDEN:
             who = origin or f"http://{host}"
-            raise InputError(f"browser: got a server that lets {who} in to {path}, port {port}; it was closed")
+            raise InputError(f"browser: the server admits {who} to {path}, port {port}; it was closed")
     for path in ("/", "/model"):
         if _request(path, here, None, port)[1]:
-            raise InputError(f"browser: got a server that lets any page read {path}, port {port}; it was closed")
+            raise InputError(f"browser: the server lets any page read {path}, port {port}; it was closed")
 
 
 def _other_addresses() -> list[str]:
-    """Addresses of this machine at which a server that listens to the network answers, and ours must not."""
+    """Addresses of this machine at which a server on all interfaces answers, and ours must not."""
     found = {"127.0.0.2", "::1"}  # a server on all interfaces answers there, one on 127.0.0.1 does not
     with contextlib.suppress(OSError):
         found |= {str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None)}
     for family, elsewhere in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((elsewhere, 9))  # sends nothing; says which address would be used
+            probe.connect((elsewhere, 9))  # sends nothing, but selects the address that would be used
             found.add(probe.getsockname()[0])
     return sorted(found - {LOOPBACK})
 
 
 def _request(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:
-    """The status of an answer, and whether other pages may read it; with an origin, to the opening of a WebSocket."""
+    """Status of the answer, and whether other pages may read it; with an origin, a WebSocket is opened."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=START_TIMEOUT)
     with contextlib.closing(connection):
         headers = {"Host": host}

@@ -1,4 +1,4 @@
-"""Where a pane is seen from: calibrated cameras, one that sees it all, one that follows, and those of the model."""
+"""The views of panes: calibrated, overview, chase, and the model's own cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,13 +12,12 @@ from lqrsim.view.cameras import Camera
 from lqrsim.view.options import CALIBRATED, VIEWS
 from lqrsim.view.recorded_trial import RecordedTrial
 
-OVERVIEW_ASPECT = (
-    1.7  # models' overviews are made for pictures of 16 : 9; in narrower ones they would cut off both sides
-)
-OBLIQUE = np.array([0.30, 0.75, -0.60])  # where an overview looks, in a scene without one
+# The overview cameras of models are made for 16:9; in a narrower picture they would cut off both sides.
+OVERVIEW_ASPECT = 1.7
+OBLIQUE = np.array([0.30, 0.75, -0.60])  # direction of an overview in a scene without an overview camera
 FIELD_OF_VIEW = 40.0  # degrees, of cameras that are not the model's
-DISTANCE, HEIGHT = 11.0, 4.5  # of the one that follows, in robots' radii
-TURN_SECONDS = 0.8  # seconds over which it turns
+DISTANCE, HEIGHT = 11.0, 4.5  # of the chase camera, in radii of the robot
+TURN_SECONDS = 0.8  # s, over which the chase camera averages its direction
 
 
 @dataclass(frozen=True)
@@ -26,8 +25,8 @@ class CameraView:
     """A view of one trial.
 
     Attributes:
-      place: puts the cameras of a scene, after its update, where they are at a time.
-      camera: the calibrated one, if it is one.
+      place: sets the cameras of a scene, after its update, for a time.
+      camera: the calibrated camera, if the view has one.
     """
 
     place: Callable[[mujoco.MjvScene, mujoco.MjData, float], None]
@@ -35,10 +34,10 @@ class CameraView:
 
 
 def camera_view(name: str, recorded: RecordedTrial, aspect: float) -> CameraView:
-    """The view of that name in a pane of width / height `aspect`: one of VIEWS, or another camera of the model.
+    """The view of that name in a pane of this aspect ratio: one of VIEWS, or another camera of the model.
 
     Raises:
-      InputError: there is none of that name.
+      InputError: there is no view of that name.
     """
     model, of_model = recorded.model, _model_cameras(recorded)
     check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
@@ -55,7 +54,7 @@ def camera_view(name: str, recorded: RecordedTrial, aspect: float) -> CameraView
 
 
 def leaves_room_for_captions(name: str, recorded: RecordedTrial, aspect: float) -> bool:
-    """Whether captions may lie over a view: it is wide, and not made to fit what it shows."""
+    """Whether a view is wide, and not fitted to its content, so that captions may cover a part."""
     return (
         aspect >= OVERVIEW_ASPECT and name not in CALIBRATED and (name == "chase" or name in _model_cameras(recorded))
     )
@@ -68,7 +67,7 @@ def _model_cameras(recorded: RecordedTrial) -> list[str]:
 
 
 def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> CameraView:
-    """All of the run and what is around it, looked at as a camera of the model does."""
+    """A view that contains the run and its surroundings, in the direction of a camera of the model."""
     model, data = recorded.model, mujoco.MjData(recorded.model)
     recorded.pose(data, 0.0)
     forward, field_of_view = OBLIQUE / np.linalg.norm(OBLIQUE), FIELD_OF_VIEW
@@ -78,11 +77,11 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
     up, points = np.cross(right, forward), _extent_points(recorded, data)
-    # From where every point is within both angles: as far back as the worst of each side asks for.
+    # As far back as it takes to have every point within both angles of view.
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
     back = 0.0
-    for _ in range(20):  # each centres what the one before saw
+    for _ in range(20):  # each centres the view of the one before
         local = points - middle
         x, y, z = local @ right, local @ up, local @ forward
         back = float(np.max(np.maximum(np.abs(x) / (rise * aspect), np.abs(y) / rise) - z))
@@ -94,7 +93,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
 
 
 def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
-    """Points (k, 3): corners of what is drawn and does not move, as far as it is near the run, and the run."""
+    """Points (k, 3) of the run, and corners of fixed geoms as far as they are near it."""
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
     if recorded.rollout.balls is not None:
         run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
@@ -104,7 +103,7 @@ def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
     corners = [run]
     for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
         middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE.value:  # it has no box, and may be infinite
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE.value:  # a plane has no box, and may be infinite
             middle, half = np.zeros(3), np.where(model.geom_size[geom] > 0, model.geom_size[geom], margin) * [1, 1, 0]
         seen = data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
         corners.append(np.clip(seen, low - margin, high + margin))
@@ -112,11 +111,11 @@ def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
 
 
 def _chase(recorded: RecordedTrial) -> CameraView:
-    """From behind and above; it turns smoothly, for it knows where the plan goes."""
+    """From behind and above; it turns smoothly with the direction of the plan."""
     times = np.linspace(0, recorded.end, max(int(20 * recorded.end), 2))
     planned, driven = recorded.planned(times), recorded.driven(times)
     motion = np.gradient(planned, times, axis=0)[:, :2]
-    # Without a direction of its of_model, as at rest or straight up, it is that of the whole way.
+    # At rest, or straight up, the direction is that from the start of the plan to its end.
     motion += 1e-3 * (planned[-1] - planned[0])[:2] + [1e-9, 0.0]
     direction = _smooth(motion, times, TURN_SECONDS)
     azimuth = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
@@ -139,7 +138,7 @@ def _chase(recorded: RecordedTrial) -> CameraView:
 
 
 def _smooth(values: Array, times: Array, width: float) -> Array:
-    """Values (k, n) at even times, averaged with a Gaussian of that standard deviation in seconds."""
+    """Values (k, n) at even times, smoothed by a Gaussian of this standard deviation in seconds."""
     weights = np.exp(-0.5 * ((times[:, None] - times) / width) ** 2)
     return weights @ values / weights.sum(axis=1, keepdims=True)
 
@@ -147,11 +146,11 @@ def _smooth(values: Array, times: Array, width: float) -> Array:
 def _set_perspective(
     scene: mujoco.MjvScene, model: mujoco.MjModel, eye: Array, forward: Array, up: Array, field_of_view: float
 ) -> None:
-    """Makes a scene one that is seen from a point; the field of view is in degrees from bottom to top."""
+    """Set the cameras of a scene to a perspective from `eye`; the vertical field of view is in degrees."""
     near = model.vis.map.znear * model.stat.extent
     for camera in scene.camera:
         camera.pos, camera.forward, camera.up, camera.orthographic = eye, forward, up, 0
         camera.frustum_near, camera.frustum_far = near, model.vis.map.zfar * model.stat.extent
         camera.frustum_top = near * np.tan(np.radians(field_of_view) / 2)
         camera.frustum_bottom, camera.frustum_center = -camera.frustum_top, 0
-        camera.frustum_width = 0  # as wide as the pane
+        camera.frustum_width = 0  # follows from the pane

@@ -1,8 +1,8 @@
-"""Calibrated views: cameras that stand still and whose pixels are measurements of where something is.
+"""Calibrated cameras: fixed, so that pixels measure positions.
 
-They are orthographic, as on an engineering drawing: a metre is as many pixels wherever it is seen. So the middle of a
-ball's pixels is its centre, exactly, at any distance and anywhere in the picture; and where a camera stands along its
-line of sight does not matter, so that it cannot be wrong either.
+They are orthographic, as an engineering drawing is: a metre has the same number of pixels everywhere. The centre of a
+ball's pixels is therefore exactly its own centre, at any distance and anywhere in the picture, and the place of a
+camera along its line of sight does not matter.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_number
+from lqrsim.errors import Array, InputError, check_array, check_number, excerpt
 from lqrsim.results.rollout import Rollout
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 
-NEAR, FAR = 0.01, 1000.0  # metres; depth is even along an orthographic view, so that this much costs nothing
+NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so that a wide range is no loss
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Camera:
     """An orthographic view of the world. Pixels are (column, row) from the upper left corner, centres at halves.
 
     Attributes:
-      position: what is in the middle of the picture is on the line from here along `forward`. In metres.
-      forward, up: unit vectors, at right angles.
-      height: how much of the world the picture shows from its bottom to its top, in metres.
+      position: in metres; the line from here along `forward` meets the middle of the picture.
+      forward, up: orthogonal unit vectors.
+      height: of the picture, in metres of the world.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Camera:
 
     @property
     def axes(self) -> Array:
-        """(2, 3), unit vectors to the right and up in the picture: the two directions that it measures."""
+        """(2, 3), unit vectors to the right and up in the picture: the directions that it measures."""
         return np.array([np.cross(self.forward, self.up), self.up])
 
     def place(self, scene: "mujoco.MjvScene", aspect: float) -> None:
-        """Makes a scene, after its `update_scene`, one that is seen from here in a picture of width / height."""
+        """Set the cameras of a scene, after its update, to this view in a picture of aspect ratio width / height."""
         for camera in scene.camera:
             camera.pos, camera.forward, camera.up = self.position, self.forward, self.up
             camera.orthographic = 1
@@ -54,74 +54,69 @@ class Camera:
             camera.frustum_width = 0.5 * self.height * aspect
 
     def project(self, points: npt.ArrayLike, size: tuple[int, int]) -> Array:
-        """Pixels (..., 2) at which points (..., 3) are seen in a picture of `size` width and height."""
+        """Pixels (..., 2) of points (..., 3) in a picture of `size` width and height."""
         seen = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
         return 0.5 * np.array(size) + seen * (size[1] / self.height) * [1, -1]
 
     def measure(self, pixels: npt.ArrayLike, size: tuple[int, int]) -> Array:
-        """Coordinates (..., 2) along `axes`, in metres from the world's origin, of what is seen at pixels (..., 2)."""
+        """Coordinates (..., 2) along `axes`, in metres from the world's origin, of pixels (..., 2)."""
         off = (np.asarray(pixels, dtype=np.float64) - 0.5 * np.array(size)) * [1, -1]
         return self.axes @ self.position + off * (self.height / size[1])
 
     def as_json(self) -> dict[str, Any]:
-        """What `from_json` makes the same camera of."""
+        """The camera as JSON, for `from_json`."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, parts: Mapping[str, Any]) -> "Camera":
-        """Raises InputError unless it is what `as_json` gives."""
+        """The camera of `as_json`. Raises InputError for anything else."""
         try:
             name, height = str(parts["name"]), parts["height"]
             vectors = {key: check_array(f"camera.{key}", parts[key], (3,)) for key in ("position", "forward", "up")}
         except (KeyError, TypeError) as error:
-            raise InputError(f"camera: got {parts!r}, want a camera's parts ({error})") from None
+            raise InputError(f"camera: got {excerpt(parts)}, want the parts of a camera ({error})") from None
         directions = np.array([vectors["forward"], vectors["up"]])
         if not np.allclose(directions @ directions.T, np.eye(2), rtol=0, atol=1e-6):
-            raise InputError(f"camera: got forward and up {directions.tolist()}, want unit vectors at right angles")
+            raise InputError(f"camera: got forward and up {directions.tolist()}, want orthogonal unit vectors")
         position, forward, up = (tuple(vector.tolist()) for vector in vectors.values())
         return cls(name, position, forward, up, check_number("camera.height", height, above=0))
 
 
 def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
-    """From above: all of a run, its plan and all trials, with a margin, in a picture of width / height `aspect`."""
+    """A camera above that shows the plan and all trials with a margin, in a picture of this aspect ratio."""
     low, high = _bounds(rollout)
     right = _right(high - low, aspect)
     return _camera("top", low, high, right, np.cross([0.0, 0.0, 1.0], right), aspect)
 
 
 def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
-    """From the side, level, so that the longer way lies across; the rest is as for `top`."""
+    """A level camera at the side that shows the same, the longer horizontal side across."""
     low, high = _bounds(rollout)
     plane = rollout.plane
     level = plane.replace("z", "")
-    # A vertical plane is seen from across.
+    # A vertical plane is seen at a right angle.
     right = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(high - low, 1.0)
     return _camera("side", low, high, right, np.array([0.0, 0.0, 1.0]), aspect)
 
 
-def measuring(rollout: Rollout) -> tuple[str, ...]:
-    """The cameras, of `top` and `side`, that it takes to tell where the robot is."""
-    return measuring_of(rollout.plane)
-
-
-def measuring_of(plane: str) -> tuple[str, ...]:
-    """The same for robots in that plane, or in space."""
+def measuring(plane: str) -> tuple[str, ...]:
+    """The cameras, of `top` and `side`, that together measure positions along these axes of the world."""
     return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
 
 
 def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
     span, forward = high - low, np.cross(up, right)
     height = max(float(abs(up) @ span), float(abs(right) @ span) / aspect)
-    # So far away that nothing around the run is behind it.
+    # Far enough to have all of the surroundings in front.
     position = 0.5 * (low + high) - (10 + 5 * float(span.max())) * forward
     vectors = (tuple(vector.tolist()) for vector in (position, forward, up))
     return Camera(name, *vectors, height=height)
 
 
 def _bounds(rollout: Rollout) -> tuple[Array, Array]:
-    """The lowest and highest corner (3,) of what a fixed camera shows; robots seen from above are at height zero.
+    """The lowest and highest corner (3,) of the run with a margin; robots seen from above are at height zero.
 
-    Of a robot without a position it is all of its balls.
+    A robot without a position counts with all of its balls.
     """
     places = np.vstack([rollout.planned_places, *(rollout.places(trial) for trial in range(rollout.trials))])
     if rollout.balls is not None and not rollout.state_coordinates.position:
@@ -132,5 +127,5 @@ def _bounds(rollout: Rollout) -> tuple[Array, Array]:
 
 
 def _right(span: Array, aspect: float) -> Array:
-    """The direction to the right in the picture: x or y, so that the longer side lies along the picture's."""
+    """The direction to the right in the picture: x or y, so that the longer sides coincide."""
     return np.array([1.0, 0.0, 0.0] if (span[0] >= span[1]) == (aspect >= 1) else [0.0, 1.0, 0.0])

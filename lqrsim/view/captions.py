@@ -1,4 +1,4 @@
-"""What the captions of pictures say: of each run what disturbs it and how it is doing, and of all what colours mean."""
+"""Captions of pictures: title, disturbances and readings of each run, and the legend of all."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,21 +12,21 @@ from lqrsim.view.overlays import Overlays, Scale
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Pixels
 
-HEADER_SHARES = 0.4, 0.75  # of the height of a picture, that what disturbs may take: above the picture, and over it
-LETTER_HEIGHTS = 44, 54  # heights of a letter in the height of a picture, and in the width of a narrow one
+HEADER_SHARES = 0.4, 0.75  # of the height of a picture, for the header: above the picture, and over it
+LETTER_HEIGHTS = 44, 54  # lines of text in the height of a picture, and in the width of a narrow one
 
 
 class Caption:
-    """Of one run, in the upper left corner of its part of the picture.
+    """The caption of one run, in the upper left corner of its part of the picture.
 
     Attributes:
-      height: of all of it, in pixels; it does not change.
+      height: in pixels, the same at all times.
     """
 
     def __init__(
         self, recorded: RecordedTrial, overlays: Overlays, box: Box, title: str | None, speed: float, *, over: bool
     ) -> None:
-        """Over the picture it is narrow, in a strip of its own as wide as that."""
+        """With `over` it is narrow and covers a part of the picture; otherwise it is a strip above it."""
         run = recorded.rollout
         self.recorded, self.overlays, self.speed, self.over = recorded, overlays, speed, over
         self.letter_height = _letter_height(box.width, box.height)
@@ -34,7 +34,7 @@ class Caption:
         title = title or f"{run.robot} in {run.scene}{which}".replace("_", " ")
         self.width = box.width // 4 if over else box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
-        # Where they are, readings stay: beside the title in a strip that is wide enough, else in lines of their own.
+        # Readings keep their place: beside the title in a strip that is wide enough, otherwise in lines of their own.
         longest = self._readings_width(1)
         bare_title = text_tiles.text_tile((title,), self.letter_height, width=0)
         beside = not over and bare_title.shape[1] + longest < self.width
@@ -44,7 +44,7 @@ class Caption:
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
     def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
-        """The title and as much of what disturbs as leaves most of the picture free, and how many more there are."""
+        """The title, as many disturbances as leave most of the picture free, and the number of the others."""
         tile = np.empty((0, 0, 4), dtype=np.uint8)
         for count in range(len(what), -1, -1):
             left = len(what) - count
@@ -59,12 +59,12 @@ class Caption:
         return tile
 
     def draw(self, area: Pixels, time: float) -> None:
-        """Writes it into the run's part of the picture, in place."""
+        """Draw the caption into the run's part of the picture, in place."""
         margin = self.letter_height if self.over else 0
         text_tiles.blend(area, self.header, left=margin, top=margin)
         readings = self._readings_tile(time)
         if self.place[0]:
-            readings = readings[: round(1.85 * self.letter_height)]  # the next line begins there
+            readings = readings[: round(1.85 * self.letter_height)]  # up to the next line
         text_tiles.blend(area, readings, left=margin + self.place[0], top=margin + self.place[1])
 
     def _readings_tile(self, time: float) -> Pixels:
@@ -73,7 +73,7 @@ class Caption:
         return text_tiles.text_tile(lines, self.letter_height, width=width, bold=False)
 
     def _readings_width(self, lines: int) -> int:
-        """The width in pixels that readings in so many lines take, with some room for numbers that are longer."""
+        """The width in pixels of the readings in so many lines, with room for longer numbers."""
         run, times = self.recorded.rollout, [0.0, self.recorded.end]
         if (funnel := self.overlays.funnel) is not None:
             times.append(float(run.times[funnel.said.index(max(funnel.said, key=len))]))
@@ -82,7 +82,7 @@ class Caption:
         return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
 
     def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
-        """The readings in so many lines, or one a line if they are fewer."""
+        """The readings in at most so many lines."""
         readings = self._readings(time)
         count = min(most, len(readings))
         cuts = [len(readings) * number // count for number in range(count + 1)]
@@ -105,15 +105,15 @@ class Caption:
 
 
 class Legend:
-    """Of all runs, in the lower left corner.
+    """The legend of all runs, in the lower left corner.
 
     Attributes:
-      height: in pixels; 0 where there is nothing to explain.
+      height: in pixels; 0 for an empty legend.
     """
 
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
         named = dict(entry for one in overlays for entry in one.legend_entries())
-        # What holds of one run's tube and more of another's is said once, with more.
+        # Of two labels where one begins with the other, as tubes drawn in part and in full have, the longer one stays.
         entries: dict[str, text_tiles.Colour | None] = {
             text: colour
             for text, colour in named.items()
@@ -131,7 +131,7 @@ class Legend:
         self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2
 
     def draw(self, image: Pixels) -> None:
-        """Writes it into the picture, in place."""
+        """Draw the legend into the picture, in place."""
         if self.tile is not None:
             if not self.margin:
                 image[-self.height :] = 255

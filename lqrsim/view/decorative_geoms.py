@@ -14,7 +14,7 @@ MARK_RGB = (0.0, 1.0, 0.0)
 RIM = (
     1.8  # radius of the black ball, in radii of the green one: what a video blurs into the mark is the same all around
 )
-PLAN_RGB = (0.78, 0.08, 0.42)  # the plan's colour; none of the error map, and of no robot
+PLAN_RGB = (0.78, 0.08, 0.42)  # of the plan; neither the error map nor a robot has it
 
 
 def decorate(
@@ -25,7 +25,7 @@ def decorate(
     rgba: npt.ArrayLike,
     rotation: Array | None = None,
 ) -> mujoco.MjvGeom:
-    """Makes of a geom one of this kind, size (3,), place (3,) and colour (4,), that throws no shadow; returns it."""
+    """Give a geom this kind, size (3,), place (3,) and colour (4,), without a shadow; returns the geom."""
     mujoco.mjv_initGeom(
         geom,
         kind,
@@ -39,14 +39,14 @@ def decorate(
 
 
 def mark_radius(rollout: Rollout) -> float:
-    """Of the mark that a robot wears, in metres."""
+    """Radius of the mark of a robot, in metres."""
     return 0.25 * rollout.radius
 
 
 def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:
-    """Adds the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
+    """Add the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
 
-    It is drawn close to the camera, where nothing hides it. In an orthographic picture it is in the same place there.
+    It is drawn close to the camera, where nothing hides it. In an orthographic picture its place is the same.
     """
     forward = np.array(camera.forward)
     centre = centre - (forward @ (centre - camera.position)) * forward

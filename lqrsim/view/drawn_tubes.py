@@ -1,4 +1,4 @@
-"""Ellipsoids along the plan of a run as pictures draw them: a predicted tube, that of the cost, and a funnel."""
+"""Ellipsoids along the plan in pictures: a predicted tube, that of the cost, and a funnel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +12,11 @@ from lqrsim.results.solution import Solution
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.recorded_trial import RecordedTrial
 
-OPACITY = {True: 0.43, False: 0.2}  # of all of a tube: flat on a floor, with the lines above; and around the lines
-BETWEEN = {True: 0.4, False: 0.18}  # the same where the level of a funnel is interpolated
-CERTIFIED = {True: 0.4, False: 0.16}  # of each ellipsoid of a funnel that is certified
+# Opacity, for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a certified
+# ellipsoid.
+OPACITY = {True: 0.43, False: 0.2}
+BETWEEN = {True: 0.4, False: 0.18}
+CERTIFIED = {True: 0.4, False: 0.16}
 MOST_ELLIPSOIDS = 80  # more take too long to draw
 LIFT = 0.006  # metres between the floor and the lines on it
 
@@ -24,8 +26,10 @@ class DrawnTube:
     """Ellipsoids in the world.
 
     Attributes:
-      knots: (k,) of the plan, where they are. label: what the legend says of it. opacity: of each.
+      knots: (k,) of the plan.
       in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
+      label: in the legend.
+      opacity: of each ellipsoid.
     """
 
     knots: npt.NDArray[np.int64]
@@ -40,8 +44,8 @@ class DrawnFunnel:
 
     Attributes:
       certified: its ellipsoids at knots that have a level, if there are any.
-      between: some of those of interpolated levels, if there are any.
-      said: (T+1) where the run was at each step, in words.
+      between: some ellipsoids of interpolated levels, if there are any.
+      said: (T+1) whether the run was in the funnel at each step, in words.
     """
 
     certified: DrawnTube | None
@@ -50,7 +54,7 @@ class DrawnFunnel:
 
 
 def predicted(recorded: RecordedTrial) -> DrawnTube | None:
-    """The tube that was predicted for the run, if it was, and has any width."""
+    """The predicted tube of the run; None if there is none, or it has no width."""
     run = recorded.rollout
     if run.tube is None or run.tube.max() < 1e-12:
         return None
@@ -59,30 +63,30 @@ def predicted(recorded: RecordedTrial) -> DrawnTube | None:
 
 
 def of_cost(recorded: RecordedTrial, solution: Solution | None) -> DrawnTube:
-    """Where the solution's total cost is near its least."""
+    """The ellipsoids in which the solution's total cost is near its least."""
     run = recorded.rollout
     if solution is None:
-        raise InputError("solution: got None with the overlay cost_tube, want the Solution that was executed")
+        raise InputError("solution: got None with the overlay cost_tube, want the Solution that was run")
     if not run.state_coordinates.position:
-        raise InputError("overlays: got cost_tube of a run of a robot without a position, want others")
+        raise InputError("overlays: got cost_tube for a robot without a position, want other overlays")
     if not np.array_equal(solution.trajectory.states, run.plan.states):
-        raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
+        raise InputError("solution: got one with another plan than the run's, want the Solution that was run")
     ellipsoids = Ellipsoids.of_cost(solution, run.state_coordinates.position)
     return _tube(recorded, ellipsoids, np.arange(len(ellipsoids.centres)), OF_COST)
 
 
 def of_funnel(recorded: RecordedTrial, funnel: Funnel | None) -> DrawnFunnel:
-    """The shadows on the position of a funnel, from its first knot to its last one, where there is a level.
+    """The projection of a funnel onto the position, from its first knot to its last, where it has a level.
 
     Raises:
-      InputError: there is none, it is about another plan, or the position is not among its states.
+      InputError: there is no funnel, it has another plan, or the position is not among its states.
     """
     run = recorded.rollout
     if funnel is None:
         raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
     if not np.array_equal(funnel.plan.states, run.plan.states):
-        raise InputError("funnel: got one about another plan than that of the run, want one about the run's")
-    covariances = funnel.position_covariance / SIGMAS**2  # whose half axes are then of the level
+        raise InputError("funnel: got one with another plan, want a funnel about the plan of the run")
+    covariances = funnel.position_covariance / SIGMAS**2  # so that half axes are those of the level
     every = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
     levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))
     drawn = (levels > 0) & (knots >= funnel.knots[0]) & (knots <= funnel.knots[-1])
@@ -108,12 +112,12 @@ def _tube(
     label: str,
     opaque: Mapping[bool, float] = OPACITY,
 ) -> DrawnTube:
-    """Some of the ellipsoids at these knots, which together are about as opaque as is said."""
+    """Some of the ellipsoids at these knots, which overlap to about this opacity."""
     one = Ellipsoids(every.centres[among], every.covariances[among])
     chosen = one.spread(MOST_ELLIPSOIDS)
     apart = np.linalg.norm(np.diff(one.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
     overlap = 2 * float(one.axes()[0][chosen].mean()) / apart if apart > 0 else 1.0
-    # With too few to overlap much, more of it would show as stripes on the lines within.
+    # Ellipsoids that hardly overlap must not be too opaque: they would show as stripes on the lines within.
     opacity = 1 - (1 - opaque[recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
     knots = among[chosen]
     return DrawnTube(knots, _in_world(recorded, every, knots), label, float(opacity))
@@ -125,13 +129,13 @@ def _in_world(recorded: RecordedTrial, every: Ellipsoids, knots: npt.NDArray[np.
     size, count = len(space.position), len(knots)
     lengths, turns = (part[knots] for part in every.axes())
     half_axes, rotations = np.full((count, 3), 0.1 * LIFT), np.zeros((count, 3, 3))
-    half_axes[:, :size] = np.maximum(lengths, 0.1 * LIFT)  # one without width cannot be drawn
+    half_axes[:, :size] = np.maximum(lengths, 0.1 * LIFT)  # an ellipsoid without width cannot be drawn
     rotations[:, list(space.world_axes), :size] = turns
-    if size == 2:  # what is flat is thin across
+    if size == 2:  # the third axis of a flat ellipsoid
         rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
     return space.in_world(every.centres[knots], height=recorded.floor), half_axes, rotations
 
 
 def _some_of(knots: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """All of them, or as many as can be drawn."""
+    """At most as many knots as can be drawn, evenly spread."""
     return knots[np.linspace(0, len(knots) - 1, min(MOST_ELLIPSOIDS, len(knots))).astype(np.int64)]

@@ -1,4 +1,4 @@
-"""Ellipsoids along a plan: where a run is predicted to be, or where the total cost is near its least."""
+"""Ellipsoids along a plan: of a predicted tube, or of a total cost near its least."""
 
 from dataclasses import dataclass
 
@@ -8,22 +8,23 @@ import numpy.typing as npt
 from lqrsim.errors import Array
 from lqrsim.results.solution import Solution
 
-SIGMAS = 2.0  # of the ellipsoids
-COST_ABOVE_LEAST = SIGMAS**2 / 2  # the total cost on those of the cost, above its least
+SIGMAS = 2.0  # standard deviations at which ellipsoids are drawn
+COST_ABOVE_LEAST = SIGMAS**2 / 2  # total cost above its least, on an ellipsoid of the cost
 PREDICTED = f"predicted: {SIGMAS:g} sigma, 95 % in each direction"
 OF_COST = f"{SIGMAS:g} sigma of the cost: total ≤ least + {COST_ABOVE_LEAST:g}"
 
-WIDEST = 0.2  # half axis of the largest that is drawn, in lengths of the plan's extent: a wider one hides the picture
-APART = 0.8  # from one to the next, in half axes
+WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the plan: a larger one hides the picture
+APART = 0.8  # distance between neighbours, in half axes
 
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """Along a plan, at some of its knots or all.
+    """Ellipsoids at the knots of a plan, or at some of them.
 
     Attributes:
-      centres: (k, d). covariances: (k, d, d).
-      end: half axis in metres at which they are not drawn any more; None where all are.
+      centres: (k, d).
+      covariances: (k, d, d).
+      end: half axis in metres from which on they were left out; None if all are there.
     """
 
     centres: Array
@@ -32,7 +33,7 @@ class Ellipsoids:
 
     @classmethod
     def predicted(cls, centres: Array, covariances: Array) -> "Ellipsoids":
-        """Those of a tube about positions (T+1, d), up to where it gets too wide for a picture of them."""
+        """The ellipsoids of a tube about positions (T+1, d), up to the first that is too wide for a picture."""
         largest = float(np.linalg.norm(np.ptp(centres, axis=0))) * WIDEST
         wide = SIGMAS * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)) > largest
         last = int(np.argmax(wide)) if wide.any() else len(wide)
@@ -40,9 +41,9 @@ class Ellipsoids:
 
     @classmethod
     def of_cost(cls, solution: Solution, states: tuple[int, ...]) -> "Ellipsoids":
-        """Where the total cost is at most its least plus `COST_ABOVE_LEAST`, at each knot, as seen in d of the states.
+        """The states whose total cost is at most `COST_ABOVE_LEAST` above its least, projected onto d of the states.
 
-        What is an ellipsoid of the whole state casts one on them, with that block of the covariance.
+        The projection of an ellipsoid has the corresponding block of its covariance.
 
         Raises:
           InputError: the solution has no total cost.
@@ -52,29 +53,29 @@ class Ellipsoids:
 
     @property
     def label(self) -> str:
-        """What a legend says of a predicted tube."""
+        """The label of a predicted tube in a legend."""
         return PREDICTED if self.end is None else f"{PREDICTED}; drawn up to {self.end:.2g} m"
 
     def axes(self) -> tuple[Array, Array]:
-        """Half axes (k, d) and rotations (k, d, d), whose columns are their directions."""
+        """Half axes (k, d), and rotations (k, d, d) whose columns are their directions."""
         covariances = 0.5 * (self.covariances + np.swapaxes(self.covariances, 1, 2))
         variances, rotations = np.linalg.eigh(covariances)
         rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
         return SIGMAS * np.sqrt(np.maximum(variances, 0.0)), rotations
 
     def seen_in(self, onto: Array) -> "Ellipsoids":
-        """Their shadows on a plane, in its coordinates: onto (2, d) has the directions of its axes."""
+        """Their projections onto a plane, whose axes are the rows of `onto` (2, d)."""
         return Ellipsoids(self.centres @ onto.T, onto @ self.covariances @ onto.T, self.end)
 
     def outlines(self, points: int = 48) -> Array:
-        """The outlines (k, points, 2) of ellipses."""
+        """Outlines (k, points, 2) of ellipses."""
         half_axes, rotations = self.axes()
         around = np.linspace(0, 2 * np.pi, points, endpoint=False)
         circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
         return self.centres[:, None, :] + np.einsum("kij,kj,pj->kpi", rotations, half_axes, circle)
 
     def spread(self, most: int) -> npt.NDArray[np.int64]:
-        """Which of them overlap to a tube of about the same depth everywhere: the first, the last, some in between."""
+        """Indices of ellipsoids that overlap to a tube of even depth: the first, the last and some in between."""
         half_axes = self.axes()[0].mean(axis=1)
         chosen = [0] if len(self.centres) else []
         for knot in range(1, len(self.centres)):

@@ -50,24 +50,24 @@ def mark_ends(axes: Axes, path: Array) -> None:
 
 
 def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Array]:
-    """The lowest and highest corner of what to show: places (k, 2 or 3) and the obstacles, with a margin in metres."""
+    """The lowest and highest corner of places (k, 2 or 3) and obstacles, with a margin in metres."""
     size = places.shape[1]
     places = np.vstack([places, *(obstacle.position[None, :size] for obstacle in world.obstacles)])
     return np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
 
 
 def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: float, *, plane: str = "xy") -> None:
-    """Obstacles between two corners (2,), and, paler, where they are closer than the robot's radius in metres.
+    """Draw obstacles between two corners (2,), and paler the places closer to them than the robot's radius.
 
     Args:
-      flat: the world as a robot in that plane sees it.
+      flat: the world in the plane of the robot.
     """
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.set(xlabel=f"{plane[0]} (m)", ylabel=f"{plane[1]} (m)")
     if not flat.obstacles:
         return
-    # What the planner sees, whatever the obstacles are made of: the distance itself, and where it is the radius.
-    # Grid lines through the obstacles' positions keep the corners of walls sharp.
+    # Contours of the planner's own distance, whatever the obstacles are made of. Grid lines through the obstacles'
+    # positions keep the corners of walls sharp.
     spacing, places = float((high - low).max()) / 130, [obstacle.position for obstacle in flat.obstacles]
     x, y = (
         np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))
@@ -80,25 +80,25 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
 
 
 def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
-    """The surfaces of obstacles between two corners (3,), seen through."""
+    """Draw translucent surfaces of obstacles between two corners (3,)."""
     for obstacle in world.obstacles:
-        if obstacle.kind != "plane":  # they are the sides of the box that is drawn
+        if obstacle.kind != "plane":  # planes are the sides of the box
             x, y, z = surface(obstacle, low, high)
             axes.plot_surface(x, y, z, color=SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.zaxis.set_rotate_label(False)  # it would stand on its head
+    axes.zaxis.set_rotate_label(False)  # it would be upside down
     axes.set_zlabel("z (m)", rotation=90)
     axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
     axes.view_init(elev=27, azim=-110)
 
 
 def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: int, up: int) -> None:
-    """The shadows of obstacles between two corners (3,) on the plane of two of the axes x, y, z, seen through."""
+    """Draw translucent projections of obstacles between two corners (3,) onto the plane of two axes."""
     for obstacle in world.obstacles:
         if obstacle.kind != "plane":
             points = surface(obstacle, low, high).reshape(3, -1)[[across, up]].T
-            outline = points[ConvexHull(points).vertices]  # obstacles have no hollows
+            outline = points[ConvexHull(points).vertices]  # all obstacles are convex
             axes.fill(*outline.T, facecolor=(SOLID, 0.35), edgecolor=EDGE, linewidth=0.6)
     names = "xyz"
     axes.set(xlabel=f"{names[across]} (m)", ylabel=f"{names[up]} (m)", aspect="equal")
@@ -106,7 +106,7 @@ def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: in
 
 
 def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
-    """Points (3, i, j) on an obstacle's surface; infinite ones end at the sides of the box from `low` to `high`."""
+    """Points (3, i, j) on an obstacle's surface; an infinite one ends at the box from `low` to `high`."""
     around, (radius, half, _) = np.linspace(0, 2 * np.pi, 25)[:, None], obstacle.size
     if obstacle.kind == "sphere":
         up = np.linspace(0, np.pi, 13)
@@ -126,7 +126,7 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
 
 
 def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: str) -> None:
-    """Ellipses as one area, and the outlines of some of them, unless these would be beads on a string."""
+    """Draw ellipses as one area, with some of their outlines, unless these would look like beads on a string."""
     every = ellipses.outlines()
     axes.add_collection(PolyCollection(list(every), facecolors=face, edgecolors="none", zorder=1.5, label=label))
     chosen = np.unique(np.linspace(0, len(every) - 1, OUTLINES).astype(int)) if len(every) else np.arange(0)
@@ -137,7 +137,7 @@ def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: 
 
 
 def draw_tube_in_space(axes: Axes3D, ellipsoids: Ellipsoids, label: str, *, face: str, edge: str) -> None:
-    """The shadows that ellipsoids cast along the line of sight, each at its own place, of some that overlap."""
+    """Draw ellipsoids as their projections along the line of sight, each at its own place."""
     up, around = np.radians(axes.elev), np.radians(axes.azim)
     right = np.array([-np.sin(around), np.cos(around), 0.0])
     forward = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -147,11 +147,11 @@ def draw_tube_in_space(axes: Axes3D, ellipsoids: Ellipsoids, label: str, *, face
     around_centres = flat.outlines()[chosen] - flat.centres[chosen, None, :]
     discs = ellipsoids.centres[chosen, None, :] + around_centres @ onto
     axes.add_collection3d(Poly3DCollection(list(discs), facecolors=to_rgba(edge, 0.15), edgecolors="none"))
-    axes.plot([], [], [], color=face, linewidth=7, label=label)  # as the legend shows it
+    axes.plot([], [], [], color=face, linewidth=7, label=label)  # for the legend
 
 
 def draw_chances(axes: Axes, curves: Sequence[tuple[Array, Array, str]]) -> None:
-    """The chance of being in collision at each knot, of several: times (T+1,), chances (T+1,) and a colour each."""
+    """Draw chances of being in collision at each knot: times (T+1,), chances (T+1,) and colour of each curve."""
     most = LEAST
     for times, chances, colour in curves:
         axes.plot(times, np.where(chances > 0, chances, np.nan), color=colour)

@@ -1,4 +1,4 @@
-"""The figure of a funnel: its shadow on the position along the plan, and its levels over time."""
+"""The figure of a funnel: its projection onto the position, and its levels over time."""
 
 import os
 from pathlib import Path
@@ -20,9 +20,9 @@ FACE, EDGE, CERTIFIED = "#cfe3f5", "#5f97c9", RUNS[0]
 def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, radius: float) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a funnel; returns its path.
 
-    At the knots that are certified the outlines are dark; between them the level is interpolated, and pale. What is
-    drawn is the shadow of ellipsoids of all states: where in it a run may begin depends on the other states. A robot in
-    space is seen from above and from the side.
+    Outlines are dark at certified knots and pale between them, where the level is interpolated. The ellipsoids of all
+    states are projected onto the position: whether a run may begin at a place also depends on the other states. A robot
+    in space is seen from above and from the side.
 
     Args:
       funnel: with the position among its states.
@@ -57,7 +57,7 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
 def _shadow(
     axes: Axes, funnel: Funnel, covariances: np.ndarray, world: World, radius: float, plane: tuple[int, int]
 ) -> None:
-    """The shadow, the plan and the obstacles, as seen along the axis that is not of the plane."""
+    """The projection, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
     figure_parts.draw_obstacles(axes, space, world, plan, radius, plane)
@@ -66,7 +66,7 @@ def _shadow(
     else:
         axes.set_title(f"funnel, from {'above' if plane == (0, 1) else 'the side'}")
     onto = np.eye(len(space.position))[list(plane)]
-    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # whose outlines are then of the level
+    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # so that outlines are those of the level
     last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)

@@ -1,8 +1,8 @@
 """An OpenGL context that needs no display, bound when the first picture is drawn.
 
-On Linux MuJoCo chooses its OpenGL while it is imported and takes the one that needs a display, unless MUJOCO_GL names
-another; with MUJOCO_GL=egl and no EGL library it cannot even be imported. So nothing is chosen ahead of time: EGL, or
-else OSMesa, is put in place once MuJoCo is there and a library is found. macOS and Windows bring their own OpenGL.
+On Linux MuJoCo chooses its OpenGL on import: the one that needs a display, unless MUJOCO_GL names another. With
+MUJOCO_GL=egl and no EGL library even the import fails. Therefore nothing is chosen in advance: EGL, or otherwise
+OSMesa, is put in place after the import, if its library is found. macOS and Windows have their own OpenGL.
 """
 
 import functools
@@ -18,20 +18,20 @@ INSTALL = "sudo apt-get install -y libegl1 libgl1-mesa-dri libopengl0"
 
 @functools.cache
 def bind() -> None:
-    """Makes sure that MuJoCo can draw without a display; a choice made in MUJOCO_GL is kept.
+    """Make sure that MuJoCo can draw without a display; a choice in MUJOCO_GL is kept.
 
     Raises:
-      InputError: there is no OpenGL library, or it does not work; the message says how to get one.
+      InputError: there is no OpenGL library, or it does not work; the message says how to install one.
     """
     if sys.platform != "linux":
         return
     choice = os.environ.get("MUJOCO_GL", "").strip().lower()
     if choice in ("0", "disable", "disabled", "false", "off"):
-        raise InputError(f"MUJOCO_GL: got {choice!r}, which turns pictures off, want it unset")
+        raise InputError(f"MUJOCO_GL: got {choice!r}, which turns rendering off, want it unset")
     backend = choice or _installed()
     if not backend:
-        raise InputError(f"OpenGL: got neither EGL nor OSMesa, want one of them to draw pictures: {INSTALL}")
-    # PyOpenGL and the drivers raise what they like, AttributeError and TypeError included.
+        raise InputError(f"OpenGL: got neither EGL nor OSMesa, want one of them: {INSTALL}")
+    # PyOpenGL and drivers raise exceptions of any kind, AttributeError and TypeError included.
     try:
         from mujoco.rendering.classic import gl_context
 
@@ -44,7 +44,7 @@ def bind() -> None:
 
 
 def available() -> bool:
-    """Whether pictures can be drawn here; if not, `bind` says why."""
+    """Whether pictures can be drawn here; if not, `bind` raises the reason."""
     try:
         bind()
     except InputError:
@@ -53,7 +53,7 @@ def available() -> bool:
 
 
 def _installed() -> str:
-    """The first backend whose libraries are there, or an empty string. PyOpenGL's EGL needs an OpenGL library too."""
+    """The first backend that is installed, or an empty string. PyOpenGL's EGL also needs an OpenGL library."""
     if find_library("EGL") and (find_library("OpenGL") or find_library("GL")):
         return "egl"
     return "osmesa" if find_library("OSMesa") else ""

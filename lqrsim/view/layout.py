@@ -1,14 +1,14 @@
-"""Where things are in a picture: the parts of runs side by side, and the panes within a part, as boxes of pixels."""
+"""The layout of a picture: parts of runs side by side, and the panes within a part."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 
-INSETS_SHARE = 0.4  # of a run's part of the picture, for its insets
+INSETS_SHARE = 0.4  # of a run's part, for its insets
 
 
 @dataclass(frozen=True)
 class Box:
-    """A part of the picture, in pixels from its upper left corner."""
+    """A rectangle of the picture, in pixels from the upper left corner."""
 
     left: int
     top: int
@@ -21,7 +21,7 @@ class Box:
 
 
 def side_by_side(count: int, size: tuple[int, int]) -> list[Box]:
-    """Equal parts of a picture of `size` width and height, in rows of three at most; their edges are even."""
+    """Equal parts of a picture of `size` width and height, up to three in a row, with even edges."""
     columns = count if count <= 3 else -(-count // 2)
     rows = -(-count // columns)
     x = [2 * round(size[0] * column / columns / 2) for column in range(columns + 1)]
@@ -31,7 +31,7 @@ def side_by_side(count: int, size: tuple[int, int]) -> list[Box]:
 
 
 def split_into_panes(box: Box, insets: int) -> list[Box]:
-    """The first pane and those of insets: in a column on its right, or in a row below it if the box is higher."""
+    """The first pane and the insets: in a column on its right, or in a row below it if the box is higher than wide."""
     wide = box.width >= box.height
     length, across = (box.width, box.height) if wide else (box.height, box.width)
     edge = 2 * round(length * (1 - INSETS_SHARE) / 2) if insets else length

@@ -1,4 +1,4 @@
-"""What pictures show beside the scene: drawn as geoms of MuJoCo's, over what the model has."""
+"""Overlays of pictures, drawn as geoms of MuJoCo beside those of the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,24 +18,25 @@ from lqrsim.view.options import Overlay
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Colour
 
-# As PLAN_RGB, no colours of the error map, and none of the robots.
+# Like PLAN_RGB, these colours are neither in the error map nor on a robot.
 FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
-FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; no green, which marks have
-SLIM = 0.65  # width of lines in a tube, in those of others: it is often hardly wider than they are
-SEGMENTS = 120  # a line is drawn with no more than this many
-DOTS = 30  # measured states that are shown, the last ones
-END_ON = 0.9  # cosine of the angle to the line of sight
+FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; no green, which is the mark's
+SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than they are
+SEGMENTS = 120  # of a line, at most
+DOTS = 30  # latest measured states that are drawn
+END_ON = 0.9  # cosine of the angle to the line of sight, from which on an arrow is not drawn
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What colours and lengths mean, the same for all runs in a picture.
+    """The meaning of colours and lengths, the same for all runs in a picture.
 
     Attributes:
-      error: in metres, the end of the colours of the trace. force: in N, that of the longest arrow.
+      error: at the end of the trace's colours, in metres.
+      force: of the longest arrow, in N.
     """
 
     error: float
@@ -43,23 +44,23 @@ class Scale:
 
 
 def common_scale(recordings: Sequence[RecordedTrial]) -> Scale:
-    """One for all of them, and all of their time."""
+    """The scale for all of these runs, at all times."""
     error = max(float(recorded.error.max()) for recorded in recordings)
     force = max(float(np.linalg.norm(recorded.force, axis=1).max()) for recorded in recordings)
     return Scale(_round_up(max(error, 0.01)), force)
 
 
 class Overlays:
-    """Those of one trial.
+    """The overlays of one trial.
 
     Args:
-      solution: of which the run is, for the tube of its cost.
-      show: which; those of which there is nothing to show are left out, as the tube where none was predicted.
+      solution: that was run, for the tube of its cost.
+      show: names of overlays; those with nothing to show are left out, as a tube that was not predicted.
       funnel: about the plan of the run.
 
     Raises:
-      InputError: the solution or the funnel is not that of the run, or is missing; the solution has no total cost, or
-        the funnel not the position among its states.
+      InputError: the solution or the funnel is missing or does not belong to the run; the solution has no total cost,
+        or the funnel does not include the position.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Overlays:
         self.knots = recorded.rollout.times[knots]
         self.plan, self.trace = recorded.planned(self.knots), recorded.driven(self.knots)
         self.errors = np.interp(self.knots, recorded.times, recorded.error)
-        self.measured = recorded.shown()
+        self.measured = recorded.measured_places()
         if not len(self.measured) or np.array_equal(recorded.measured, recorded.states):
             self.show.discard("measured")
         if scale.force < 1e-6:
@@ -89,7 +90,7 @@ class Overlays:
             self.width *= SLIM
 
     def legend_entries(self) -> list[tuple[str, Colour]]:
-        """What the colours mean, but for those of the trace."""
+        """Labels and colours, except for the trace."""
         entries = {
             "plan": ("planned", PLAN_RGB),
             "forces": (f"force, longest {self.scale.force:.2g} N", FORCE),
@@ -99,7 +100,7 @@ class Overlays:
         return found + [(tube.label, colour) for tube, colour, _ in reversed(self._tubes())]
 
     def _tubes(self) -> list[tuple[drawn_tubes.DrawnTube, Colour, float]]:
-        """Those that there are, with their colours and heights above a floor, in lifts of the lines."""
+        """The tubes with their colours, and their heights above a floor relative to LIFT."""
         certified, between = (None, None) if self.funnel is None else (self.funnel.certified, self.funnel.between)
         tubes = (
             (between, BETWEEN, 0.1),
@@ -110,7 +111,7 @@ class Overlays:
         return [(tube, colour, height) for tube, colour, height in tubes if tube is not None]
 
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
-        """Appends the geoms of a moment to the scene; `data` is posed as it was then."""
+        """Append the geoms of a moment to the scene; `data` is posed at that time."""
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         for tube, colour, height in self._tubes():
@@ -139,10 +140,10 @@ class Overlays:
                     pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
 
     def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
-        """Appends the arrow of what disturbs the robot, as one camera is to see it.
+        """Append the arrow of the disturbing force, for the camera that is set in the scene.
 
-        It begins where the robot's circle ends. None points at the camera or away from it: that would show nothing, and
-        hide the robot.
+        It begins at the edge of the robot's circle. An arrow along the line of sight is left out: it would show nothing
+        and hide the robot.
         """
         if "forces" not in self.show:
             return
@@ -159,7 +160,7 @@ class Overlays:
 
 
 class _Pen:
-    """Appends geoms to a scene. Flat: lines lie on a floor, and the sun is on them; else they hang in space."""
+    """Appends geoms to a scene; with `flat` lines lie on a floor in the light, otherwise they hang in space."""
 
     def __init__(self, scene: mujoco.MjvScene, *, flat: bool) -> None:
         self.scene, self.flat = scene, flat
@@ -173,7 +174,7 @@ class _Pen:
         return geom
 
     def ribbon(self, points: Array, width: float, colours: Array) -> None:
-        """A line through points (k, 3) with a colour (k-1, 4) each segment, of boxes: far cheaper than capsules."""
+        """A line through points (k, 3), with a colour (k-1, 4) for each segment; boxes are cheaper than capsules."""
         along = np.diff(points, axis=0)
         length = np.linalg.norm(along, axis=1, keepdims=True)
         z = along / np.where(length > 0, length, 1)
@@ -187,6 +188,6 @@ class _Pen:
 
 
 def _round_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 5, 7, 10, 15, ..."""
+    """Round up to one of 1, 1.5, 2, 3, 5, 7, 10, 15, ..."""
     power = 10.0 ** np.floor(np.log10(value) + 1e-9)
     return float(power * next(step for step in (1, 1.5, 2, 3, 5, 7, 10) if step * power >= value * (1 - 1e-9)))

@@ -1,4 +1,4 @@
-"""The whole picture: a renderer for each run, side by side, with captions; and how well it is drawn."""
+"""The whole picture: runs side by side, with captions, in a chosen quality."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,17 +23,17 @@ from lqrsim.view.scene_renderer import SceneRenderer, open_renderer
 from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import Pane
 
-LARGEST = 8192  # pixels of a side: what OpenGL can surely draw
-MOST_RUNS = 6  # more cannot be told apart side by side
+LARGEST = 8192  # pixels of a side, which every OpenGL can draw
+MOST_RUNS = 6  # side by side; more are too small
 MOST_INSETS = 3
-READABLE = 300  # height of a picture in pixels from which on captions take a small part of it
-LEAST_HEIGHT = 16  # pixels, of what is shown below a caption
+READABLE = 300  # height of a picture in pixels from which on captions may cover a part of it
+LEAST_HEIGHT = 16  # pixels that a caption must leave
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # between panes, and behind captions
 
 
 @dataclass(frozen=True)
 class QualitySettings:
-    """Of a quality: its size, samples for smooth edges, resolution of shadows (0: none), and x264's settings."""
+    """Settings of a quality: size, samples for smooth edges, resolution of shadows (0: none), and those of x264."""
 
     size: tuple[int, int]
     samples: int
@@ -51,10 +51,10 @@ QUALITIES: dict[Quality, QualitySettings] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions:
-    """What is shown of runs, and how: the arguments of `render` and `still` of these names, which say what they mean.
+    """The arguments of `render` and `render_still` of these names, which explain them.
 
     Raises:
-      InputError: a text, a name or a size is wrong. What depends on the runs is checked by `open_picture`.
+      InputError: a text, a name or a size is wrong. `open_picture` checks what depends on the runs.
     """
 
     trial: int | Sequence[int] = 0
@@ -77,7 +77,7 @@ class PictureOptions:
         overlays = check_items("overlays", self.overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
         for overlay in overlays:
             check_name("overlays", overlay, ALL_OVERLAYS)
-        titles = check_items("titles", self.titles, str, "a tuple of texts, one a run", at_most=MOST_RUNS)
+        titles = check_items("titles", self.titles, str, "a tuple of texts, one for each run", at_most=MOST_RUNS)
         for title in titles:
             check_text("titles", title, "a title", at_most=100, empty=True)
         if len(insets) > MOST_INSETS:
@@ -87,7 +87,7 @@ class PictureOptions:
 
     @property
     def settings(self) -> QualitySettings:
-        """Those of the quality."""
+        """The settings of the quality."""
         return QUALITIES[self.quality]
 
     @property
@@ -98,7 +98,7 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class RunPart:
-    """A run's part of the picture: its own caption, and below it panes, whose boxes are in the part's."""
+    """A run's part of the picture: its caption, and panes with boxes relative to the part."""
 
     recorded: RecordedTrial
     box: Box
@@ -109,7 +109,7 @@ class RunPart:
 
 @contextlib.contextmanager
 def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
-    """What `render` and `still` draw from; to be used with `with`, for it holds OpenGL contexts.
+    """Open a picture of runs, to be used with `with`, for it holds OpenGL contexts.
 
     Raises:
       InputError: an option does not fit the runs, captions fill the picture, or there is no OpenGL.
@@ -140,7 +140,9 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
         captions = [Caption(*each, options.speed, over=over) for each in each_run]
     strip = max(0 if one is None or over else one.height for one in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
-        raise InputError(f"size: got {size[0]} x {size[1]}, which captions fill, want more, or overlays without them")
+        raise InputError(
+            f"size: got {size[0]} x {size[1]}, which captions fill, want a larger one, or overlays without caption"
+        )
     with contextlib.ExitStack() as stack:
         parts: list[RunPart] = []
         for recorded, box, overlay, caption in zip(recordings, boxes, overlays, captions, strict=True):
@@ -159,11 +161,13 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
 
 
 class Picture:
-    """All runs at any moment.
+    """A picture of all runs at any time.
 
     Attributes:
-      runs: the rollouts that are shown, each once. panes: what is where. size: width and height in pixels.
-      end: seconds until the last of them ends.
+      runs: the rollouts, each once.
+      panes: what is where.
+      size: width and height in pixels.
+      end: of the last run, in seconds.
     """
 
     def __init__(
@@ -179,14 +183,14 @@ class Picture:
 
     @property
     def markers(self) -> tuple[float, ...]:
-        """Radii in metres of the marks that the runs' robots wear in calibrated panes."""
+        """Radii in metres of the robots' marks in calibrated panes."""
         return tuple(mark_radius(run) for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
-        """The picture (height, width, 3) at `time`, with the robot also where it was earlier.
+        """The picture (height, width, 3) at `time`, with the robot also at earlier times.
 
         Args:
-          fade: the most by which opacities may change since the picture before.
+          fade: largest change of an opacity since the picture before.
         """
         earlier = list(earlier)
         image = np.empty((self.size[1], self.size[0], 3), dtype=np.uint8)
@@ -206,13 +210,14 @@ class Picture:
 
 
 class LivePicture:
-    """Draws one trial, with its plan.
+    """Draws one trial that goes on, with its plan: opened at the first frame, and drawn anew for each.
 
     Args:
-      camera, size: as in `render`, but "chase", which needs to know where the robot will go.
+      camera: as in `render`, except "chase", which needs the whole run.
+      size: as in `render`.
 
     Raises:
-      InputError: a size or a text is wrong, or that camera.
+      InputError: the camera or the size is wrong.
     """
 
     def __init__(self, camera: str, size: tuple[int, int]) -> None:
@@ -223,10 +228,10 @@ class LivePicture:
         self._picture: Picture | None = None
 
     def draw(self, so_far: Callable[[], Rollout], frame: Array, time: float) -> Pixels:
-        """The picture (height, width, 3) with MuJoCo's qpos at `frame` (nq,).
+        """The picture (height, width, 3) of MuJoCo's qpos `frame` (nq,).
 
         Args:
-          so_far: the run that it is of, asked for when the picture is opened.
+          so_far: returns the run so far; called when the picture is opened.
 
         Raises:
           InputError: there is no such camera, or no OpenGL.
@@ -256,7 +261,7 @@ def _checked_size(size: Any) -> tuple[int, int]:
 def _runs_and_trials(
     runs: Rollout | Sequence[Rollout], trial: int | Sequence[int]
 ) -> tuple[list[Rollout], list[tuple[int, int]]]:
-    """The rollouts, each once, and which run and trial each part of the picture shows."""
+    """The rollouts, each once, and the run and trial of each part of the picture."""
     if isinstance(runs, Rollout):
         rows: tuple[Any, ...] = (trial,)
         if isinstance(trial, Sequence) and not isinstance(trial, str):
@@ -272,7 +277,7 @@ def _runs_and_trials(
 
 
 def _one_each(field: str, values: Any, of: Sequence[object]) -> list[Any]:
-    """One value for each of them: what is given once for all, or once for each."""
+    """One value for each run, given once for all or once for each."""
     if not isinstance(values, Sequence) or isinstance(values, str):
         return [values] * len(of)
     if len(values) != len(of):
@@ -283,12 +288,12 @@ def _one_each(field: str, values: Any, of: Sequence[object]) -> list[Any]:
 def _set_quality(recorded: RecordedTrial, settings: QualitySettings) -> None:
     quality = recorded.model.vis.quality
     quality.shadowsize, quality.offsamples = settings.shadows, settings.samples
-    # Lines are boxes, whose sides one quadrilateral does for, with the sun far away; MuJoCo takes 16.
+    # Lines are boxes under a distant sun, for which one quadrilateral a side suffices; MuJoCo's default is 16.
     quality.numquads = 1
 
 
 def _draw_edge(image: Pixels, box: Box) -> None:
-    """A line along the left and the upper side of a box, but for those of the picture."""
+    """Draw the left and the upper edge of a box, unless they are the picture's."""
     if box.left:
         image[box.top : box.top + box.height, box.left] = LINE
     if box.top:

@@ -1,4 +1,4 @@
-"""The figure of a run: path and tube, tracking error, controls, and how the solver got there."""
+"""The figure of a run: path and tube, tracking error, controls, and the convergence of the solver."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 MOMENTS = 7  # at which the balls of a robot are drawn
-AREA = "area: "  # before what the legend says of a tube
+AREA = "area: "  # begins the label of a tube
 
 
 def plot_run(
@@ -29,14 +29,14 @@ def plot_run(
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
 
-    Of a robot without a position it shows the balls at several times.
+    For a robot without a position it shows the balls at several times.
 
-    Runs whose tube was predicted have it about the plan, 2 standard deviations wide, as far as that is not too wide to
-    be shown, and below it their chance of collision step by step.
+    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown; below
+    is the chance of collision at each step.
 
     Args:
       solution: whose plan the rollouts follow.
-      rollouts: by what the legend calls them, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
+      rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
       trial: row of each rollout.
@@ -107,7 +107,7 @@ def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, worl
 
 
 def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> list[tuple[str, str, str, Array]]:
-    """Label, colour, line style and places (T+1, 2 or 3) of each path; the plan comes last, to lie on top."""
+    """Label, colour, line style and places (T+1, 2 or 3) of each path; the plan is last, on top."""
     position = list(solution.policy.state_coordinates.position)
     driven = [(name, color, "-", run.places(trial)) for (name, run), color in zip(rollouts.items(), RUNS, strict=False)]
     planned = solution.trajectory.states[:, position] if position else next(iter(rollouts.values())).planned_places
@@ -115,7 +115,7 @@ def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> l
 
 
 def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[str, str]]]:
-    """Those that were predicted and have any width, with their label and colours."""
+    """The predicted tubes that have a width, with label and colours."""
     for (name, run), color in zip(rollouts.items(), RUNS, strict=False):
         if run.tube is not None and run.tube.any():
             plan = run.plan.states[:, list(run.state_coordinates.position)]
@@ -138,7 +138,7 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
 
 
 def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
-    """The balls of the first run several times, and the way of the last one; seen along where they move least."""
+    """The balls of the first run at several times and the path of the last, seen along the axis of least motion."""
     first = next(iter(rollouts.values()))
     assert first.balls is not None
     driven, radii = first.balls.driven[trial], first.balls.radii
@@ -174,7 +174,7 @@ def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Roll
 def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> None:
     errors = {name: run.tracking_error[trial] for name, run in rollouts.items()}
     worst = np.array([np.nanmax(error) for error in errors.values()])
-    # Runs that differ by decades need a logarithmic axis, which has no place for the zero that they start from.
+    # Runs that differ by decades need a logarithmic axis, where the zero at the start is left out.
     decades = bool(worst.max() > 30 * worst.min())
     of = next(iter(rollouts.values())).tracking_unit
     factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
@@ -192,7 +192,7 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
 def _controls(strips: list[Axes], plan: Trajectory, rollouts: Mapping[str, Rollout], trial: int) -> None:
     space = next(iter(rollouts.values())).control_coordinates
     for number, axes in enumerate(strips):
-        # Disturbed runs first, so that the calm one is not hidden.
+        # Disturbed runs come first, so that the undisturbed one is not hidden.
         for (_, run), color in reversed(list(zip(rollouts.items(), RUNS, strict=False))):
             axes.stairs(run.commanded[trial, :, number], run.times, color=color, baseline=None, linewidth=1.0)
         axes.stairs(plan.controls[:, number], plan.times, color=PLAN, baseline=None, linestyle="--", linewidth=0.9)

@@ -28,17 +28,17 @@ def plot_policy(
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
 
-    With a tube it shows where runs are predicted to be, 2 standard deviations about the plan, as far as that is not too
-    wide to be shown, and the chance of collision step by step. Without, it shows the positions whose total cost is near
-    its least, which says nothing of disturbances; solutions of `ilqr` have no total cost, there the plan is alone. A
-    robot in space is seen from above and from the side. Of one without a position, the plan's states are there instead.
+    With a tube it shows the predicted region of 2 standard deviations about the plan, up to where it is too wide to be
+    shown, and the chance of collision at each step. Without a tube it shows the positions whose total cost is near its
+    least, which does not depend on disturbances; solutions of `ilqr` have no total cost, and show the plan alone. A
+    robot in space is seen from above and from the side. A robot without a position has the plan's states instead.
 
     Args:
       solution: with a policy.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
       radius: of the robot, in metres.
-      tube: what `predict_tube` says of the solution and what runs it.
+      tube: of the solution, from `predict_tube`.
 
     Returns:
       The path.
@@ -52,11 +52,11 @@ def plot_policy(
     radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
         raise InputError(
-            f"solution: got one without a cost-to-go ({solution.status.name}), want one of a solve that was"
+            f"solution: got one without a cost-to-go ({solution.status.name}), want one of a completed solve"
         )
     check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
-        raise InputError("tube: got one of another plan, want that of the solution")
+        raise InputError("tube: got one of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
         raise InputError("tube: got one of a robot without a position, want None")
     with style.figure(path, size=(11, 7.5)) as figure:
@@ -65,7 +65,7 @@ def plot_policy(
 
 
 def draw(figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None) -> None:
-    """Draws it all."""
+    """Draw the figure of a policy."""
     policy = solution.policy
     grid = figure.add_gridspec(1, 2, left=0.07, right=0.97, bottom=0.12, top=0.95, wspace=0.2, width_ratios=(1, 1.1))
     if policy.state_coordinates.position:
@@ -97,7 +97,7 @@ def draw(figure: Figure, solution: Solution, world: World, radius: float, tube: 
 def _tube(
     axes: Axes, solution: Solution, world: World, radius: float, plane: tuple[int, int], tube: Tube | None
 ) -> None:
-    """The tube, the plan and the obstacles, as seen along the axis that is not of the plane."""
+    """The tube, the plan and the obstacles, seen along the axis that is not in `plane`."""
     position = solution.policy.state_coordinates.position
     plan = solution.trajectory.states[:, list(position)]
     figure_parts.draw_obstacles(axes, solution.policy.state_coordinates, world, plan, radius, plane)
@@ -116,7 +116,7 @@ def _tube(
 
 
 def _states(strips: list[Axes], units: list[str], solution: Solution) -> None:
-    """The plan's states over time, those of a unit together."""
+    """The planned states over time, one strip for each unit."""
     space, plan = solution.policy.state_coordinates, solution.trajectory
     for axes, unit in zip(strips, units, strict=True):
         for i, name in enumerate(space.names):
@@ -130,7 +130,7 @@ def _states(strips: list[Axes], units: list[str], solution: Solution) -> None:
 
 
 def _cost(axes: Axes, solution: Solution) -> None:
-    """The cost-to-go at the plan's states and, above it up to the total, what it cost to come there."""
+    """The cost-to-go at the planned states and, above it, the cost-to-come up to the total."""
     times, states = solution.trajectory.times, solution.trajectory.states
     assert solution.cost_to_go is not None
     to_go = solution.cost_to_go(states)
@@ -145,7 +145,7 @@ def _cost(axes: Axes, solution: Solution) -> None:
 
 
 def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolicy, times: Array) -> None:
-    """For each unit of the states, how strongly each control answers to them."""
+    """The gains of each control, for each unit of the states."""
     controls = policy.control_coordinates
     for axes, (answer, deviation) in zip(strips, units, strict=True):
         for number, (name, unit) in enumerate(zip(controls.names, controls.units, strict=True)):
@@ -168,6 +168,6 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
 
 
 def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
-    """Norm (T,) of one control's gains on the states of a unit: its answer to 1 in the worst direction."""
+    """Norm (T,) of a control's gains on the states of a unit: its largest response to a unit deviation."""
     chosen = [number for number, one in enumerate(policy.state_coordinates.units) if one == unit]
     return np.linalg.norm(policy.gain[:, control, chosen], axis=-1)

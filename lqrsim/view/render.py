@@ -23,9 +23,9 @@ from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25
 MOST_FRAMES = 1_000_000  # frames of a video
-SMALLEST_GIF = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
-PALETTE_SAMPLES = 12  # moments that the palette of a GIF is made of
-LARGEST_SHOWN = 30_000_000  # bytes of a file that is put into a notebook; larger ones make it slow
+SMALLEST_GIF = 480, 270  # pixels, by default, so that captions can be read
+PALETTE_SAMPLES = 12  # frames from which the palette of a GIF is made
+LARGEST_SHOWN = 30_000_000  # bytes of a file that is embedded in a notebook; a larger one makes it slow
 MEDIA_TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".png": "image/png"}
 
 
@@ -61,18 +61,18 @@ def render(
     speed: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> PictureFile:
-    """Writes a video of a run, or of several side by side and in step: mp4 (h264) or GIF, by the suffix.
+    """Write a video of a run, or of several side by side: mp4 (h264) or GIF, by the suffix.
 
-    What stands between a camera and the robot fades. A trial that diverged stands still from there on. The file is
-    whole or not there, also after an error or Ctrl-C; the same runs give the same frames, to the last bit. An mp4 says
-    in its metadata what it shows, so that `lqrsim verify` can measure it.
+    Obstacles between a camera and the robot fade. A trial that diverged stands still from then on. The file is complete
+    or absent, also after an error or Ctrl-C, and the same runs give the same frames, bit for bit. The metadata of an
+    mp4 describes its content, so that `lqrsim verify` can measure it.
 
     Args:
       runs: one rollout, or several to be shown side by side.
       path: FILE.mp4 or FILE.gif.
-      trial: row of the rollout; several are shown side by side. With several rollouts, one for all or one each.
+      trial: row of the rollout; several are shown side by side. With several rollouts, one for all or one for each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another of the model's.
-      insets: more cameras, in panes of their own beside the first. In panes of `top` and `side` robots wear a marker.
+      insets: more cameras, in panes beside the first. In panes of `top` and `side` robots have a green mark.
       titles: of the runs, in the place of robot and scene.
       overlays: what is drawn over the scene. plan. ghost: the planned path, and a disc or ball where it should be
         now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last

@@ -1,6 +1,6 @@
-"""A trial as a recording of Rerun's viewer: geometry, plan, tube and numbers over one timeline, in seconds.
+"""A trial as a recording for Rerun's viewer: geometry, plan, tube and numbers on one timeline, in seconds.
 
-Rerun is a package of its own, `rerun-sdk`, in the extra `rerun`.
+Rerun is the package `rerun-sdk`, in the extra `rerun`.
 """
 
 import importlib
@@ -25,9 +25,9 @@ from lqrsim.view.recorded_trial import RecordedTrial
 
 TIMELINE = "time"
 DRIVEN = (0.0, 0.45, 0.7)
-SHOWN_GROUPS = 3  # of MuJoCo's groups of geoms, those that its own pictures show
-FLAT = 1e-4  # m: half the depth of what has none
-ARROW = 0.2  # of the scene's extent: the longest force
+SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
+FLAT = 1e-4  # m, half thickness of flat shapes
+ARROW = 0.2  # length of the longest force, relative to the extent of the scene
 
 
 def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> list[str]:
@@ -37,14 +37,14 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
       rollout: what `simulate` returned, with frames.
       path: of the file.
       trial: row of the rollout.
-      funnel: about the plan of the run, as the overlay of this name has it.
+      funnel: about the plan of the run.
 
     Returns:
-      The names of the geoms that are left out, because Rerun has no such shape.
+      The names of the geoms that are left out, because Rerun has no shape for them.
 
     Raises:
-      InputError: no such trial, nothing of it to draw, a funnel that is not of its plan or has no position, a file that
-        cannot be written, or the package is missing.
+      InputError: there is no such trial, nothing of it can be drawn, the funnel has another plan or no position, the
+        file cannot be written, or the package is missing.
     """
     path = check_path("path", path, "the path of a file")
     rerun, recorded = _package(path), RecordedTrial(rollout, trial)
@@ -72,7 +72,7 @@ def _package(path: Path) -> Any:
 
 
 def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> list[str]:
-    """The geoms of the model: what stands still once, what moves at each recorded frame."""
+    """Draw the geoms of the model: fixed ones once, moving ones at each recorded frame."""
     model, left_out = recorded.model, []
     data = mujoco.MjData(model)
     frames, places, turns = recorded.frame_times, [], []
@@ -102,7 +102,7 @@ def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> list[str]:
 
 
 def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
-    """What Rerun draws for a geom, in the geom's own axes; None for what it has no shape for."""
+    """Rerun's shape of a geom, in the geom's own axes; None if it has none."""
     size, kind, colours = model.geom_size[geom], Geom(int(model.geom_type[geom])), [_bytes(colour)]
     solid = {"colors": colours, "fill_mode": "solid"}
     if kind == Geom.mjGEOM_PLANE:
@@ -114,7 +114,7 @@ def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
         return rerun.Ellipsoids3D(half_sizes=[size if kind == Geom.mjGEOM_ELLIPSOID else [size[0]] * 3], **solid)
     if kind == Geom.mjGEOM_CYLINDER:
         return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
-    if kind == Geom.mjGEOM_CAPSULE:  # Rerun's begins at its origin
+    if kind == Geom.mjGEOM_CAPSULE:  # Rerun's capsule begins at its origin
         lower = [[0, 0, -size[1]]]
         return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
     if kind == Geom.mjGEOM_MESH:
@@ -126,7 +126,7 @@ def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
 
 
 def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """The plan and the path as lines; where the robot should be, the tube and the force at their times."""
+    """Draw plan and path as lines; and over time the planned place, the tube and the force."""
     run = recorded.rollout
     plan, driven = recorded.planned(run.times), recorded.driven(recorded.times)
     thin = 0.002 * recorded.model.stat.extent
@@ -160,7 +160,7 @@ def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
 
 
 def _draw_funnel(rerun: Any, stream: Any, funnel: drawn_tubes.DrawnFunnel) -> None:
-    """Its ellipsoids, which are there at all times: those that are certified, and those in between."""
+    """Draw the certified and the interpolated ellipsoids, at all times."""
     for name, tube, colour in (("certified", funnel.certified, FUNNEL), ("interpolated", funnel.between, BETWEEN)):
         if tube is not None:
             centres, half_axes, turns = tube.in_world
@@ -172,7 +172,7 @@ def _draw_funnel(rerun: Any, stream: Any, funnel: drawn_tubes.DrawnFunnel) -> No
 
 
 def _draw_numbers(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """States, controls, tracking error, clearance and the chance of collision, each over time."""
+    """Draw states, controls, tracking error, clearance and chance of collision over time."""
     run, trial, begun = recorded.rollout, recorded.trial, len(recorded.times)
     numbers = {("error", f"tracking error, {run.tracking_unit}"): recorded.error}
     if np.isfinite(recorded.clearance).all():
@@ -198,18 +198,18 @@ def _send(rerun: Any, stream: Any, entity: list[str], times: Array, columns: Any
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> Array:
-    """(4,): of its material, if it has one."""
+    """The colour (4,) of a geom, or of its material if it has one."""
     material = int(model.geom_matid[geom])
     return np.array(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material], dtype=np.float64)
 
 
 def _bytes(colour: Array) -> list[int]:
-    """A colour of numbers from 0 to 1."""
+    """A colour in bytes, from numbers between 0 and 1."""
     return np.round(255 * np.clip(colour, 0, 1)).astype(int).tolist()
 
 
 def _quaternion(matrix: Array) -> Array:
-    """Of a rotation (3, 3), scalar last, as Rerun has it."""
+    """The quaternion of a rotation (3, 3), scalar last, as in Rerun."""
     found = np.empty(4)
     mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
     return np.roll(found, -1)

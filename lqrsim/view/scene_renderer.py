@@ -1,4 +1,4 @@
-"""One trial, drawn by MuJoCo at any moment: its panes, what fades before the robot, and what is drawn over it all."""
+"""One trial, drawn by MuJoCo at any time: panes, overlays, and occluders that fade."""
 
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,8 +17,8 @@ from lqrsim.view.overlays import Overlays
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Pixels
 
-FADED_OPACITY = 0.10  # what is left of the opacity of something that hides the robot
-MOST_ROBOTS = 50  # more of them in one picture cannot be told apart
+FADED_OPACITY = 0.10  # of a geom that hides the robot
+MOST_ROBOTS = 50  # in one picture; more cannot be told apart
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
 
 
@@ -26,9 +26,9 @@ DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups t
 def open_renderer(
     recorded: RecordedTrial, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]
 ) -> Iterator["SceneRenderer"]:
-    """A trial in a picture of `size`, with the boxes in it that show it; needs OpenGL to be bound."""
+    """Open a renderer of a trial for a picture of `size` with these panes; OpenGL must be bound."""
     model = recorded.model
-    # A larger buffer than the picture costs as much as a larger picture, a smaller one is refused.
+    # A larger buffer costs as much as a larger picture, and a smaller one is refused.
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     window = gl_context.GLContext(*size)
     try:
@@ -45,9 +45,9 @@ def open_renderer(
 
 
 class SceneRenderer:
-    """What `open_renderer` gives; draws into its own OpenGL context.
+    """Draws a trial into an OpenGL context of its own; made by `open_renderer`.
 
-    MuJoCo's `Renderer` does the same for one view of a scene, with a copy of the picture more.
+    MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
     """
 
     def __init__(
@@ -65,16 +65,16 @@ class SceneRenderer:
         self.scene = mujoco.MjvScene(self.model, maxgeom=1000 + (MOST_ROBOTS + 1) * self.model.ngeom)
         self.visual_options = mujoco.MjvOption(), mujoco.MjvPerturb()
         self.pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
-        # A plane is seen through from behind as it is, and from the front it hides nothing.
+        # A plane is transparent from behind anyway, and hides nothing from the front.
         solid = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
         self.can_occlude = solid & (self.model.body_weldid[self.model.geom_bodyid] == 0)
         self.faded = np.zeros((len(views), self.model.ngeom))
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
-        """The picture (height, width, 3) at `time`, with the robot also where it was earlier; the next overwrites it.
+        """The picture (height, width, 3) at `time`, with the robot also at earlier times; the next call overwrites it.
 
         Args:
-          fade: the most by which opacities may change since the picture before.
+          fade: largest change of an opacity since the picture before.
         """
         model, data, scene = self.model, self.data, self.scene
         self.recorded.pose(data, time)
@@ -105,13 +105,13 @@ class SceneRenderer:
         return self.pixels[::-1]
 
     def _move_headlight(self) -> None:
-        """The headlight goes where the camera went."""
+        """Move the headlight to the camera."""
         for light in self.scene.lights[: self.scene.nlight]:
             if light.headlight:
                 light.pos, light.dir = self.scene.camera[0].pos, self.scene.camera[0].forward
 
     def _occluders(self) -> npt.NDArray[np.bool_]:
-        """Which geoms (ngeom,) stand between the camera and the robot's centre or outline."""
+        """Which geoms (ngeom,) are between the camera and the robot's centre or outline."""
         view = self.scene.camera[0]
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
@@ -120,9 +120,9 @@ class SceneRenderer:
         eye = np.array(view.pos, dtype=np.float64)
         for offset in (0 * up, up, -up, right, -right):
             target = centre + radius * offset
-            # Through an orthographic camera all is seen along the same direction.
+            # The rays of an orthographic camera are parallel.
             start = target + forward * (forward @ (eye - target)) if view.orthographic else eye
-            for _ in range(100):  # surfaces between; more do not matter
+            for _ in range(100):  # surfaces at most
                 ray = target - start
                 hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN_GROUPS, True, -1, geom)
                 if not 0 <= hit < 1:
@@ -133,7 +133,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _fade(self, faded: Array, own: int) -> Iterator[None]:
-        """The scene with what hides the robot faded by these shares (ngeom,)."""
+        """A block in which geoms of the scene are faded by these shares (ngeom,)."""
         before: list[tuple[int, float, int]] = []
         for number in range(own if faded.any() else 0):
             geom = self.scene.geoms[number]

@@ -1,4 +1,4 @@
-"""How figures look and how they are written: one style for all, and the same data gives the same bytes."""
+"""The style of figures, and how they are written: the same data gives the same bytes."""
 
 import contextlib
 import os
@@ -14,7 +14,7 @@ from lqrsim.errors import InputError, check_path, excerpt
 from lqrsim.results.save_load import replacing
 
 PLAN = "#222222"
-RUNS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # told apart by the colour-blind, and in grey by their lightness
+RUNS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # distinct for the colour-blind, and in grey by lightness
 SOLID, MARGIN, LIMIT = "#8c96a3", "#dfe3e8", "#7a7a7a"
 # No date and no version in the files: the same data gives the same bytes.
 METADATA = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
@@ -27,23 +27,23 @@ STYLE = {
     "font.size": 9,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
-    "pdf.fonttype": 42,  # text in the file is text, which journals ask for
+    "pdf.fonttype": 42,  # TrueType text, which journals require
     "savefig.dpi": 150,
     "svg.fonttype": "none",
-    "text.parse_math": False,  # names are names, dollars and all
+    "text.parse_math": False,  # dollar signs in names are not mathematics
     "svg.hashsalt": "lqrsim",
 }
 
 
 @contextlib.contextmanager
 def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure, `size` inches wide and high, that is written to each path as the block ends: png, pdf or svg.
+    """A figure, `size` inches wide and high, that is written to each path when the block ends: png, pdf or svg.
 
-    A block that fails writes nothing. Lay it out with `Figure.set_layout_engine("tight", ...)`, which works as the
-    file is written: `tight_layout` would make room for the tick labels that logarithmic axes have before.
+    A block that fails writes nothing. For the layout use `Figure.set_layout_engine("tight", ...)`, which runs when the
+    file is written: `tight_layout` would run before the tick labels of logarithmic axes are replaced.
 
     Raises:
-      InputError: a name ends otherwise, or a file cannot be written.
+      InputError: a path has another suffix, or a file cannot be written.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:
@@ -57,7 +57,7 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
         yield drawn
         for axes in drawn.axes:
             for axis in (axes.xaxis, axes.yaxis):
-                if isinstance(axis.get_major_formatter(), LogFormatter):  # its powers would be mathematics
+                if isinstance(axis.get_major_formatter(), LogFormatter):  # it writes powers as mathematics
                     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
                     axis.set_minor_formatter(NullFormatter())
         for suffix, file in unfinished:
@@ -65,7 +65,7 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
 
 
 def plain_decades(*axes: Axis) -> None:
-    """Ticks of logarithmic axes over a few decades at 1, 2, 5, 10, 20, ..., in plain numbers."""
+    """Set the ticks of logarithmic axes over a few decades to 1, 2, 5, 10, 20, ..., in plain numbers."""
     for axis in axes:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_minor_locator(NullLocator())

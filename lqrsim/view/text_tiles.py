@@ -1,4 +1,4 @@
-"""Small print on frames: tiles of text and a legend, drawn with Pillow and blended into images (height, width, 3)."""
+"""Text on frames: tiles of text and a legend, drawn with Pillow and blended into images (height, width, 3)."""
 
 import functools
 from pathlib import Path
@@ -18,7 +18,7 @@ INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
 def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = True) -> Pixels:
     """Lines of text on translucent paper, (h, w, 4), at least `width` pixels wide.
 
-    The letters are `height` pixels high, and the first line is bold unless it is not to be.
+    The letters are `height` pixels high; with `bold` the first line is bold.
     """
     fonts = [_font(height, bold=bold and number == 0) for number in range(len(lines))]
     needed = max(font.getlength(line) for font, line in zip(fonts, lines, strict=True))
@@ -30,7 +30,7 @@ def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = T
 
 @functools.lru_cache(maxsize=16)
 def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
-    """What the colours mean, (h, w, 4), in rows of at most `width` pixels; None is the map of the tracking error."""
+    """A legend (h, w, 4) in rows of at most `width` pixels; the colour None is the map of the tracking error."""
     font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
     rows: list[list[tuple[float, str, Colour | None]]] = [[]]
     x = widest = space
@@ -55,12 +55,12 @@ def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, wid
 
 
 def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Colours (n, 4) of errors given as fractions (n,) of the full scale."""
+    """Colours (n, 4) of errors as fractions (n,) of the full scale."""
     return np.asarray(matplotlib.colormaps["cividis"](np.asarray(fractions, dtype=np.float64)))
 
 
 def wrap(words: str, height: int, width: int) -> list[str]:
-    """The text in lines of at most `width` pixels, if no word is longer, in letters that are `height` pixels high."""
+    """The words in lines of at most `width` pixels, unless a word is longer, in letters `height` pixels high."""
     font, lines = _font(height), [""]
     for word in words.split():
         longer = f"{lines[-1]} {word}" if lines[-1] else word
@@ -72,7 +72,7 @@ def wrap(words: str, height: int, width: int) -> list[str]:
 
 
 def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
-    """Blends a tile into the image, in place, that many pixels from the left and the top or the bottom edge."""
+    """Blend a tile into the image, in place, so many pixels from the left and from the top or the bottom."""
     room = image.shape[0] - tile.shape[0]
     start = max(top if top is not None else room - (bottom or 0), 0)
     area = image[start : start + tile.shape[0], left : left + tile.shape[1]]

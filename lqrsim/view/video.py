@@ -1,9 +1,9 @@
-"""Frames to a file: h264 in an mp4 that browsers play while they load it, or a GIF that plays anywhere and loops."""
+"""Video files from frames: h264 in an mp4 that browsers can stream, or a looping GIF."""
 
+import collections
 import contextlib
-import queue
-import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from PIL import Image
 from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import VideoMetadata
 
-QUEUE_LENGTH = 3  # frames that may wait to be encoded
+QUEUE_LENGTH = 3  # frames that wait to be encoded, at most
 COLOURS = 192  # of a GIF
 
 
@@ -23,18 +23,20 @@ COLOURS = 192  # of a GIF
 def encoder(
     path: Path, size: tuple[int, int], rate: Fraction, *, crf: int, preset: str, metadata: VideoMetadata | None = None
 ) -> Iterator[Callable[[Pixels], None]]:
-    """A function that appends a frame (height, width, 3), and keeps it; `size` is width and height.
+    """A function that appends a frame (height, width, 3), which must not change afterwards.
 
     Args:
-      rate: frames a second. crf, preset: x264's, for how good and how small the video is.
-      metadata: what the file says of itself.
+      size: width and height.
+      rate: frames a second.
+      crf, preset: x264's settings of quality and compression.
+      metadata: embedded in the file.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
             metadata.embed(container)
         stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        # Say which matrix makes RGB of the pixels; players guess differently when it is left open.
+        # Without a stated colour matrix players guess differently.
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = 1
 
         def encode(pixels: Pixels) -> None:
@@ -48,8 +50,8 @@ def encoder(
 
 @contextlib.contextmanager
 def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Callable[[Pixels], None]]:
-    """As `encoder`, for a GIF; one palette for all of it, of the samples, so that colours do not flicker."""
-    # Also colours of which there is little, as of lines, which are what matters.
+    """As `encoder`, for a GIF, with one palette from the samples, so that colours do not flicker."""
+    # Maximum coverage keeps rare colours, such as those of lines.
     palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
     frames: list[Image.Image] = []
 
@@ -58,7 +60,7 @@ def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Calla
 
     with _on_another_thread(encode) as put:
         yield put
-    # A GIF counts in hundredths of a second: frames last as long as keeps the whole in time.
+    # A GIF counts in hundredths of a second: durations are rounded so that the sum keeps time.
     ends = [round(100 * (number + 1) / rate) for number in range(len(frames))]
     durations = (10 * np.diff([0, *ends])).tolist()
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False)
@@ -66,29 +68,15 @@ def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Calla
 
 @contextlib.contextmanager
 def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pixels], None]]:
-    """A function that has `work` done on another thread, in order, while its caller draws the next frame."""
-    waiting: queue.Queue[Pixels | None] = queue.Queue(maxsize=QUEUE_LENGTH)
-    failed: list[BaseException] = []
-
-    def run() -> None:
-        while (pixels := waiting.get()) is not None:
-            if not failed:
-                try:
-                    work(pixels)
-                except BaseException as error:  # raised again by who puts
-                    failed.append(error)
+    """A function that hands frames to `work` on another thread, in order, while the caller draws the next."""
+    waiting: collections.deque[Future[None]] = collections.deque()
 
     def put(pixels: Pixels) -> None:
-        if failed:
-            raise failed[0]
-        waiting.put(pixels)
+        if len(waiting) == QUEUE_LENGTH:
+            waiting.popleft().result()  # raises what `work` did
+        waiting.append(executor.submit(work, pixels))
 
-    thread = threading.Thread(target=run, name="encoder", daemon=True)
-    thread.start()
-    try:
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="encoder") as executor:
         yield put
-    finally:
-        waiting.put(None)
-        thread.join()
-    if failed:
-        raise failed[0]
+        for one in waiting:
+            one.result()

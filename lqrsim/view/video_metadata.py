@@ -1,4 +1,4 @@
-"""What a video says of itself, in the comment of its file: whose runs it shows, when, and through which cameras."""
+"""Metadata of a video, in the comment of its file: the runs it shows, the times, and the cameras."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_path
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_path, excerpt
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.cameras import Camera
@@ -24,11 +24,12 @@ FORMAT, VERSION = "lqrsim footage", 1
 
 @dataclass(frozen=True)
 class Pane:
-    """A part of the picture, in pixels from the upper left corner, that shows one trial.
+    """A part of the picture that shows one trial, in pixels from the upper left corner.
 
     Attributes:
-      run: number of the rollout among those of the metadata. trial: row of it.
-      camera: which calibrated one it is seen through; None if it moves, or is of the scene.
+      run: number of the rollout among those of the metadata.
+      trial: row of the rollout.
+      camera: the calibrated camera; None for any other.
     """
 
     left: int
@@ -42,12 +43,14 @@ class Pane:
 
 @dataclass(frozen=True)
 class VideoMetadata:
-    """What identifies a video: frame `number` shows the moment `number / rate * speed` seconds after a run's start.
+    """The content of a video. Frame k shows a run `k / rate * speed` seconds after its start.
 
     Attributes:
-      runs: digests of the rollouts. markers: radius in metres of the ball that each one's robot wears in panes with a
-        camera; see `decorative_geoms.py`.
-      rate: frames a second. speed: seconds of the run in a second of the video. frames: how many there are.
+      runs: digests of the rollouts.
+      markers: radius in metres of each robot's mark in panes with a camera; see `decorative_geoms.py`.
+      rate: frames a second.
+      speed: seconds of the run in a second of the video.
+      frames: number of frames.
     """
 
     runs: tuple[str, ...]
@@ -58,7 +61,7 @@ class VideoMetadata:
     panes: tuple[Pane, ...]
 
     def as_json(self) -> str:
-        """What `from_json` makes the same metadata of."""
+        """The metadata as JSON, for `from_json`."""
         panes = [vars(pane) | {"camera": pane.camera and pane.camera.as_json()} for pane in self.panes]
         parts = {"format": FORMAT, "version": VERSION, "runs": self.runs, "rate": str(self.rate), "speed": self.speed}
         parts |= {"frames": self.frames, "markers": self.markers, "panes": panes}
@@ -66,13 +69,13 @@ class VideoMetadata:
 
     @classmethod
     def from_json(cls, text: str) -> "VideoMetadata":
-        """Raises InputError unless it is what `as_json` gives, of this version."""
+        """The metadata of `as_json`. Raises InputError for anything else, and for another version."""
         try:
             parts = json.loads(text)
         except ValueError:
             parts = None
         if not isinstance(parts, dict) or parts.get("format") != FORMAT:
-            raise InputError("video metadata: got none, want a video that `lqrsim render` wrote, with its metadata")
+            raise InputError("video metadata: got none, want a video of `lqrsim render`")
         if parts.get("version") != VERSION:
             got = parts.get("version")
             raise InputError(f"video metadata: got version {got}, want version {VERSION}: render the video again")
@@ -88,22 +91,22 @@ class VideoMetadata:
             good = metadata.rate > 0 and len(metadata.markers) == len(metadata.runs)
             good = good and all(pane.run < len(metadata.runs) for pane in metadata.panes)
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(f"video metadata: got {text[:40]}..., which is damaged ({error})") from None
+            raise InputError(f"video metadata: got {excerpt(text)}, which is damaged ({error})") from None
         if not good:
-            raise InputError(f"video metadata: got {text[:40]}..., which contradicts itself")
+            raise InputError(f"video metadata: got {excerpt(text)}, whose parts do not fit together")
         return metadata
 
     def times(self) -> np.ndarray:
-        """Seconds after the run's start that the frames show, (frames,)."""
+        """Times of the frames in seconds after the start of a run, (frames,)."""
         return np.arange(self.frames) * (self.speed / float(self.rate))
 
     def embed(self, container: "OutputContainer") -> None:
-        """Writes it into a video that is being written; before its first frame."""
+        """Write it into a video, before its first frame."""
         container.metadata["comment"] = self.as_json()
 
 
 def read(path: str | os.PathLike[str]) -> VideoMetadata:
-    """What the video says of itself. Raises InputError if it is none that lqrsim wrote."""
+    """The metadata of a video. Raises InputError if lqrsim did not write it."""
     path = check_path("video", path)
     if not os.path.isfile(path):  # not the method, which raises where a folder cannot be read
         raise InputError(f"video: got {path}, want a file that exists")
@@ -116,7 +119,7 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
 
 
 def digest(rollout: Rollout) -> str:
-    """What tells a rollout from any other: a hash of its plan, states, controls, and where its draws came from."""
+    """Hash of a rollout: of its plan, states, controls, seed and first trial."""
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     parts: list[str | Array] = [f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}"]
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):

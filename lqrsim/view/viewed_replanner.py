@@ -1,4 +1,4 @@
-"""A robot in a viewer that plans again and again as it goes, on the wall's clock, to a goal that a person moves."""
+"""Live re-planning in a viewer, in wall-clock time, to a goal that a person may move."""
 
 from dataclasses import replace
 
@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import Controller, ControllerRun
-from lqrsim.control.live_replanner import LiveReplanner
 from lqrsim.control.replan_rule import ActivePlan
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of
@@ -20,20 +20,20 @@ from lqrsim.scenes.scene import free_name
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.viewer_base import Viewer
 
-LONGEST_RUN = 600.0  # s; then a run starts again, for all of it is recorded
-RECENT = 100  # solves that the caption's median is of
-GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the plan's colour nor the trace's
-GOAL_SIZE = 0.5  # of the robot's radius: a robot that is there can still be seen, and clicked on
+LONGEST_RUN = 600.0  # s, after which a run restarts, for all of it is recorded
+RECENT = 100  # solves of which the caption shows the median
+GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the colour of the plan nor that of the trace
+GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
 
 
 class MovableGoal:
-    """The place that a problem's final cost asks for.
+    """The goal position of a problem's final cost, which can be moved.
 
     Attributes:
-      place: where it is in the problem, (2 or 3,).
+      place: in the problem, (2 or 3,).
 
     Raises:
-      InputError: it cannot be moved, for there is none, or more than one.
+      InputError: the final cost has no goal position, or several.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -43,12 +43,14 @@ class MovableGoal:
             raise InputError("goal: got a robot without a position, want one with a position to move its goal")
         held = [space.names[i] for i in goals_of(problem.constraints, problem.dynamics) if i in self._position]
         if held:
-            raise InputError(f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost to move it")
+            raise InputError(
+                f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost, whose goal can be moved"
+            )
         self._terms = terms_of(problem.final_cost)
         found = [i for i, term in enumerate(self._terms) if self._weighs_place(term)]
         if len(found) != 1:
             raise InputError(
-                f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move it"
+                f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
         (self._number,) = found
         self.place = self._cost.about[self._position]
@@ -63,7 +65,7 @@ class MovableGoal:
         return isinstance(term, QuadraticCost) and bool(term.weight[self._position].any())
 
     def cost_at(self, place: Array) -> Cost:
-        """The final cost with the goal there, (2 or 3,); all else that it asks for stays."""
+        """The final cost with its goal at another place (2 or 3,)."""
         about = self._cost.about.copy()
         about[self._position] = place
         terms = list(self._terms)
@@ -72,7 +74,7 @@ class MovableGoal:
 
 
 def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
-    """The plant's model with a body that is the goal, which mice can drag and nothing collides with; and its name."""
+    """The plant's model with a body for the goal, which a mouse can drag and nothing collides with; and its name."""
     spec = mujoco.MjSpec.from_string(plant.scene.xml)
     space, radius = plant.robot.dynamics.state_coordinates, GOAL_SIZE * plant.robot.radius
     name = free_name("goal", [body.name for body in spec.bodies])
@@ -85,21 +87,21 @@ def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, st
 
 
 class ViewedReplanner(Controller):
-    """A live re-planner as the controller of one run, and what a viewer shows of it.
+    """A live re-planner as the controller of a run that a viewer shows.
 
-    What it decides depends on how fast this machine is.
+    Its decisions depend on the speed of this machine.
     """
 
     def __init__(self, live: LiveReplanner, plant: Plant, viewer: Viewer, goal: MovableGoal | None) -> None:
         self.live, self.plant, self.viewer, self.goal = live, plant, viewer, goal
 
     def start(self, trials: int) -> ControllerRun:
-        """The run of the one robot there is."""
+        """The run of the single robot."""
         return _ViewedRun(self)
 
     @property
     def digest(self) -> str:
-        """Of what it plans for; what it decides depends on the clock, too."""
+        """Hash of its problem; its decisions also depend on the clock."""
         return sha256(f"live {self.live.problem.digest}")[:16]
 
     @property
@@ -109,11 +111,11 @@ class ViewedReplanner(Controller):
 
 
 class _ViewedRun(ControllerRun):
-    """It begins with the goal and the plan at the problem's own."""
+    """A run, which begins with the goal and the plan of the problem."""
 
     def __init__(self, of: ViewedReplanner) -> None:
         self._live, self._plant, self._viewer, self._goal = of.live, of.plant, of.viewer, of.goal
-        self._place = np.zeros(0) if of.goal is None else of.goal.place  # that is planned for
+        self._place = np.zeros(0) if of.goal is None else of.goal.place  # of the goal that is planned for
         if of.goal is not None:
             of.viewer.move_goal(of.goal.place)
         self._show(of.live.active)
@@ -132,7 +134,7 @@ class _ViewedRun(ControllerRun):
         return self._live.summary()
 
     def _take_goal(self) -> None:
-        """Plan for where the person has moved the goal to."""
+        """Plan for the goal where the person has moved it."""
         if self._goal is None or np.array_equal(self._viewer.goal, self._place):
             return
         self._place = self._viewer.goal
@@ -145,7 +147,7 @@ class _ViewedRun(ControllerRun):
 
 
 def caption(live: LiveReplanner, t: float) -> str:
-    """Which law is in force at a time and how the solves went, in lines, with what may be long at the end."""
+    """The plan in force and its age, and statistics of the solves, as lines."""
     begun, log = live.active.first * live.problem.dt, live.log
     took, kept = [1e3 * one.seconds for one in log.records[-RECENT:]], log.kept
     if not took:
@@ -162,7 +164,7 @@ def caption(live: LiveReplanner, t: float) -> str:
 
 
 def lengthened(solution: Solution) -> Solution:
-    """The solution with a plan that stays at its end, for as long as a run may be: its law is the re-planner's."""
+    """The solution with its end repeated up to the longest run, for `simulate`; the control is the re-planner's."""
     plan, policy = solution.trajectory, solution.policy
     more = max(int(LONGEST_RUN / plan.dt) - plan.steps, 0)
 

@@ -1,4 +1,4 @@
-"""Runs in MuJoCo's own viewer: executed ones, and live ones in which a person interferes."""
+"""Runs in MuJoCo's own viewer: recorded ones, and live ones in which a person interferes."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.live_replanner import LiveReplanner
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -27,12 +27,12 @@ from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClos
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
 Space pauses, Backspace starts again."""
 GOAL_KEYS = "Enter, or a double click on the orange goal: the same keys and mouse move the goal; and back to the robot."
-PAUSE_SECONDS = 1.0  # s, between the end of a run and the next
+PAUSE_SECONDS = 1.0  # s, between two runs
 GLFW_KEYS = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
 
 
 class Window(Viewer):
-    """A viewer in a window. Use it with `with`: it is open as long as the block. The arguments are a Viewer's."""
+    """A viewer in a window, to be used with `with`: it is open as long as the block. The arguments are a Viewer's."""
 
     instructions = "A window has opened; closing it, or Ctrl-C here, ends it."
 
@@ -56,7 +56,7 @@ class Window(Viewer):
         others = set(threading.enumerate())
         try:
             self._viewer = viewer.launch_passive(self.model, self.data, key_callback=pressed, show_right_ui=False)
-        except RuntimeError as error:  # on macOS it wants to be run by mjpython
+        except RuntimeError as error:  # on macOS mjpython has to run it
             raise InputError(f"window: {' '.join(str(error).split())}; or use --viewer browser") from None
         self._threads = set(threading.enumerate()) - others
         with self._viewer.lock():
@@ -68,13 +68,13 @@ class Window(Viewer):
 
     def __exit__(self, *_: object) -> None:
         self._viewer.close()
-        for thread in self._threads:  # the process would crash if it ended before them
+        for thread in self._threads:  # the process would crash if it ended before these threads
             thread.join(timeout=5.0)
 
     def refresh(self) -> bool:
         if not self._viewer.is_running():
             return False
-        self._viewer.sync()  # which takes the goal to where it is dragged
+        self._viewer.sync()  # which moves the dragged goal
         with self._viewer.lock():
             self._viewer.perturb.select = self.hold(self._viewer.perturb.select)
         self.drag(self.data.xfrc_applied)
@@ -95,21 +95,21 @@ class Window(Viewer):
 
 
 def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Window | Browser:
-    """A viewer that is a `window` or a `browser`; the options are a Viewer's. To be used with `with`."""
+    """Open a `window` or a `browser`, to be used with `with`; the options are a Viewer's."""
     return Window(**options) if kind == "window" else Browser(port=port, title=title, **options)
 
 
 def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
-    """What a Viewer needs to show one trial."""
+    """Arguments of a Viewer for one trial."""
     model = model_of(rollout, trial)
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
-        raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
+        raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be shown")
     where = {"space": rollout.state_coordinates, "body": rollout.body, "radius": rollout.radius}
     return {"model": model, "plan": rollout.plan, "balls": rollout.balls, **where}
 
 
 def arguments_for_plant(plant: Plant, solution: Solution, goal: MovableGoal | None = None) -> dict[str, Any]:
-    """What a Viewer needs to show a live run, and to move its goal."""
+    """Arguments of a Viewer for a live run, and for moving its goal."""
     robot = plant.robot
     where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
     states = solution.trajectory.states
@@ -119,7 +119,7 @@ def arguments_for_plant(plant: Plant, solution: Solution, goal: MovableGoal | No
 
 
 class _UserForces(Disturbance):
-    """What the person before a viewer does, as forces on the robot."""
+    """Forces of the person at the viewer on the robot."""
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
@@ -135,7 +135,7 @@ class _UserForces(Disturbance):
 
 
 def play(rollout: Rollout, viewer: Viewer, *, trial: int = 0, loop: bool = True) -> None:
-    """Show the frames of one trial, each at its time, until the viewer is closed; once, or again and again."""
+    """Show the frames of one trial in time, once or in a loop, until the viewer is closed."""
     whole = np.isfinite(rollout.frames[trial]).all(axis=1)
     frames = list(zip(rollout.frame_times[whole].tolist(), rollout.frames[trial][whole], strict=True))
     with contextlib.suppress(ViewerClosed):
@@ -158,15 +158,15 @@ def live(
     seed: int = 0,
     ended: Callable[[str], object] = lambda line: None,
 ) -> None:
-    """Run a policy, as `simulate` does, as fast as it is shown, under what the person does, until the viewer is closed.
+    """Simulate in step with the viewer, under the forces of the person, until the viewer is closed.
 
-    It starts again at the end of the horizon, and when the robot is lost: further from its plan than the scene is
-    large, or when the simulation becomes unstable. Run k has the random numbers of trial k of that seed.
+    A run restarts at the end of the horizon, and when the robot is lost: if its distance from the plan exceeds the size
+    of the scene, or the simulation becomes unstable. Run k has the random numbers of trial k of the seed.
 
     Args:
-      planner: makes what plans again as the robot goes, for each run, in place of a controller: `replanner.live`. A run
-        then goes on after the plan's horizon, for ten minutes at most.
-      goal: that a person moves, with a planner and a viewer that shows it.
+      planner: makes a live re-planner for each run, in place of a controller: `replanner.live`. A run then continues
+        after the plan's horizon, for at most ten minutes.
+      goal: to be moved by the person, with a planner and a viewer that shows it.
       ended: called with a line on each run that has ended.
     """
 
@@ -177,7 +177,7 @@ def live(
             raise RestartRequested
 
     def once() -> str:
-        """One run to its end, and how it went."""
+        """One run to its end, and a line on it."""
         options = {"disturbances": everything, "seed": seed, "first_trial": run, "watch": watch}
         if planner is None:
             rollout = simulate(plant, solution, controller=controller, **options)
@@ -205,7 +205,7 @@ def has_display() -> bool:
 
 
 def _check_window_opens() -> None:
-    """Raises InputError if no window can be opened, for which MuJoCo's viewer would wait for ever."""
+    """Raises InputError if no window can be opened: MuJoCo's viewer would wait for ever."""
     import glfw
 
     with warnings.catch_warnings():
@@ -217,4 +217,4 @@ def _check_window_opens() -> None:
             usable = bool(window)
             glfw.terminate()
     if not usable:
-        raise InputError("window: got a display that opens none, want one with OpenGL; or --viewer browser")
+        raise InputError("window: the display opens no window, want one with OpenGL; or use --viewer browser")

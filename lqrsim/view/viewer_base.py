@@ -1,4 +1,4 @@
-"""What a viewer shows while time goes by: a moving model with its plan and trace, and a person who interferes."""
+"""Viewers: a moving model with its plan and trace, and a person who interferes."""
 
 import abc
 import copy
@@ -20,11 +20,11 @@ from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # of the plan; the trace has twice as many
-LIFT = 0.008  # metres between the floor and the lines on it
-STRONGEST_DRAG = 2.0  # times the robot's weight that someone drags it with at most
-GOAL_STEP = 0.1  # metres, by which a key moves the goal
-MOST_DELAY = 0.2  # s; what a slow machine is behind by more than that is not made up for
-# Where a key pushes the robot, or moves the goal, seen from the camera: right, away, up.
+LIFT = 0.008  # m, between the floor and the lines on it
+STRONGEST_DRAG = 2.0  # largest force of a drag, relative to the robot's weight
+GOAL_STEP = 0.1  # m, by which a key moves the goal
+MOST_DELAY = 0.2  # s of delay that a slow machine makes up for, at most
+# The direction of each key, seen from the camera: right, away, up.
 PUSHES = {
     "LeftArrow": (-1.0, 0.0, 0.0),
     "RightArrow": (1.0, 0.0, 0.0),
@@ -36,26 +36,34 @@ PUSHES = {
 
 
 class ViewerClosed(Exception):
-    """The viewer was closed, or has been open for as long as it should."""
+    """The viewer was closed, or its time is over."""
 
 
 class RestartRequested(Exception):
-    """Someone wants to see it from the start."""
+    """The person asks to start again."""
 
 
 class Viewer(abc.ABC):
-    """A viewer. Subclasses say how it draws, and call `push`, `drag` and so on when someone interferes.
+    """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
-      radius: of the robot, in metres. balls: of one without a position, where they should be.
-      goal: name of the body that is the goal, a mocap body, if it can be moved; see `MovableGoal`.
-      push: what a key adds to its velocity, in m/s.
-      speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
+      model: to be shown.
+      plan: of the run.
+      space: coordinates of the plan's states.
+      body: name of the robot's body in the model.
+      radius: of the robot, in metres.
+      balls: with the planned places, for a robot without a position.
+      goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
+      push: velocity that a key adds, in m/s.
+      speed: of the time shown; 1 is real time.
+      seconds: after which the viewer closes; never by default.
 
     Attributes:
-      data: what is shown now. caption: says in words what is going on, in lines. remark: what it says besides.
-      wrench: force and torque (6,) of a hand. holds_goal: whether mouse and keys move the goal, or the robot.
+      data: the state that is shown.
+      caption: the state in words, as lines.
+      remark: further lines of the caption.
+      wrench: force and torque (6,) of a drag.
+      holds_goal: whether mouse and keys move the goal instead of the robot.
     """
 
     def __init__(
@@ -75,7 +83,7 @@ class Viewer(abc.ABC):
         if not space.position and balls is None:
             wanted = "the 2 or 3 states that are the position, or balls"
             raise InputError(f"state_coordinates.position: got none, want {wanted}")
-        # A copy: a viewer has sliders for gravity and the like.
+        # A copy, for a viewer has sliders for gravity and the like.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.space, self.robot = space, robot_body(model, body)
@@ -86,7 +94,7 @@ class Viewer(abc.ABC):
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
         if self._balls is not None:
-            _ = self._balls.tracked  # which says what is missing
+            _ = self._balls.tracked  # which raises if no site is named
         self.follow(plan, self._balls)
         self._apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS  # of points of the trace
         self._time, self._ahead, self._restart = 0.0, 0.0, False
@@ -96,13 +104,13 @@ class Viewer(abc.ABC):
 
     @abc.abstractmethod
     def refresh(self) -> bool:
-        """Draw what there is now and look what the person does; whether the viewer is still open."""
+        """Draw the current state and read the person's input; returns whether the viewer is still open."""
 
     def show(self, time: float, qpos: Array) -> Array:
-        """Wait until it is `time` and show the model at `qpos`; where it is then, (3,).
+        """Wait until `time`, show the model at `qpos`, and return the place of the robot, (3,).
 
         Raises:
-          ViewerClosed, RestartRequested: the person wants that.
+          ViewerClosed, RestartRequested: the person asked for it.
         """
         begins = time <= self._time or not self._trace
         self._wait(max(time - self._time, 0.0))
@@ -120,45 +128,45 @@ class Viewer(abc.ABC):
         if self.remark:
             self.caption += f"\n{self.remark}"
         if self.goal_body:
-            self.move_goal(self.goal)  # what was dragged off the floor, or turned, is put back
+            self.move_goal(self.goal)  # a goal that was dragged off the floor, or turned, is put back
         return place
 
     def follow(self, plan: Trajectory, balls: BallRecord | None, *, begins: float = 0.0) -> None:
-        """From now on that is the plan, with where its balls are if it has no position; it begins at a time."""
+        """Show this plan from now on, with its balls if the robot has no position; it begins at a time."""
         self._times, self._places = begins + plan.times, plan.states[:, list(self.space.position)]
         if not self.space.position and balls is not None:
             self._places = balls.planned[:, -1]
 
     @property
     def goal(self) -> Array:
-        """Where the goal is that can be moved, in the coordinates of a plan's position, (2 or 3,)."""
+        """Place of the movable goal, in the coordinates of the plan's position, (2 or 3,)."""
         return self.space.of_world(self.data.mocap_pos[self.model.body_mocapid[self.goal_body]])
 
     def move_goal(self, place: Array) -> None:
-        """Put the goal there, (2 or 3,)."""
+        """Move the goal to a place (2 or 3,)."""
         number = self.model.body_mocapid[self.goal_body]
         self.data.mocap_pos[number], self.data.mocap_quat[number] = self._on_floor(place), (1.0, 0.0, 0.0, 0.0)
 
     def of_world(self, points: Array) -> Array:
-        """The coordinates (..., 2 or 3) of points (..., 3) that a plan has, too."""
+        """Points (..., 3) in the coordinates of the plan's position, (..., 2 or 3)."""
         return self.space.of_world(points) if self._balls is None else points
 
     def wait(self, seconds: float) -> None:
-        """Stand still for a while. Raises what `show` does."""
+        """Stand still for a while. Raises as `show`."""
         self._wait(seconds * self.speed)
 
     def hold(self, selected: int) -> int:
-        """Someone has selected a body, or none, which is 0; the one that is to be selected: the goal or the robot."""
+        """Note which body the person selected (0: none); returns the one to select: the goal or the robot."""
         if selected:
             self.holds_goal = selected == self.goal_body
         return selected or (self.goal_body if self.holds_goal else self.robot)
 
     def other(self) -> int:
-        """Of robot and goal the one that is not held, if there is a goal: what Enter selects."""
+        """The body that Enter selects: of robot and goal the one that is not held."""
         return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
     def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
-        """A key pushes the robot, or moves the goal if that is held, as a camera sees it; see `push`."""
+        """Push the robot, or move the goal if it is held; see `push`."""
         if not self.holds_goal:
             self.push(right_away_up, azimuth)
             return
@@ -166,31 +174,31 @@ class Viewer(abc.ABC):
         self.move_goal(self.goal + self.space.of_world(step))
 
     def push(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
-        """Push the robot in a direction that is seen from a camera that looks along `azimuth`, in degrees."""
+        """Push the robot in a direction relative to a camera that looks along `azimuth`, in degrees."""
         self._impulse += self._push * _seen_from(azimuth, right_away_up)
 
     def drag(self, wrenches: Array) -> None:
-        """Someone drags bodies with forces and torques (nbody, 6); a hand is only so strong."""
+        """Drag the robot with the sum of forces and torques (nbody, 6), up to the strongest drag."""
         wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), STRONGEST_DRAG * 9.81 * self._mass
         for part, most in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
             wrench[part] *= most / max(float(np.linalg.norm(wrench[part])), most)
         self.wrench = wrench
 
     def request_restart(self) -> None:
-        """Someone wants to see it from the start."""
+        """Start the run again."""
         self._restart = True
 
     def take_wrench(self, dt: float) -> Array:
-        """Force and torque (6,) of the person over the next `dt` seconds."""
+        """Mean force and torque (6,) of the person over the next `dt` seconds; pushes are used up."""
         push, self._impulse = np.append(self._impulse / dt, np.zeros(3)), np.zeros(3)
         return self.wrench + push
 
     def planned_position(self) -> Array:
-        """Where the plan is now, (3,)."""
+        """The planned place now, (3,)."""
         return self._on_floor([np.interp(self._time, self._times, column) for column in self._places.T])
 
     def draw_overlays(self, new: Callable[[], mujoco.MjvGeom]) -> None:
-        """Draw the plan, the trace and where the robot should be; `new` gives what to draw each part with."""
+        """Draw the plan, the trace and the planned place; `new` returns a new geom."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
         plan = [self._on_floor(self._places[knot]) for knot in knots]
         width = 0.002 * float(self.model.stat.extent)
@@ -204,7 +212,7 @@ class Viewer(abc.ABC):
         decorate(new(), *shape, self.planned_position(), PLANNED_RGBA)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
-        """Let a camera that a person can turn see what the scene's own `overview` sees, if it has one."""
+        """Aim a free camera as the scene's `overview` camera, if it has one."""
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
         if number >= 0:
@@ -220,7 +228,7 @@ class Viewer(abc.ABC):
         return self.space.in_world(place, height=self._floor + LIFT)
 
     def _wait(self, left: float) -> None:
-        """Until `left` seconds of the time shown have gone by."""
+        """Wait until `left` seconds of the time shown have passed."""
         left = max(left - self._ahead, -MOST_DELAY)
         before = clock.perf_counter()
         while True:
@@ -239,7 +247,7 @@ class Viewer(abc.ABC):
 
 
 def _seen_from(azimuth: float, right_away_up: tuple[float, float, float]) -> Array:
-    """A direction (3,) in the world, as a camera sees it that looks along `azimuth`, in degrees."""
+    """A direction (3,) in the world, of one relative to a camera that looks along `azimuth`, in degrees."""
     along, (right, away, up) = np.radians(azimuth), right_away_up
     x = right * np.sin(along) + away * np.cos(along)
     y = away * np.sin(along) - right * np.cos(along)

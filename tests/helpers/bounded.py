@@ -14,7 +14,7 @@ DT, N, M = 0.2, 3, 2
 
 
 def random_problem(seed: int, *, steps: int = 10, limit: float = 0.5, fixed: bool = True) -> ls.Problem:
-    """A stable linear system of three states and two controls, pushed by wishes that it cannot all meet."""
+    """A stable linear system of three states and two controls, with targets that it cannot all meet."""
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(N, N)), rng.normal(size=(N, M))
     a -= (np.linalg.eigvals(a).real.max() + 0.1) * np.eye(N)
@@ -40,7 +40,7 @@ def matrices(problem: ls.Problem) -> tuple[Array, Array]:
 
 
 def bounded(problem: ls.Problem) -> tuple[float, Array]:
-    """Least cost and controls by SciPy's bounded-variable least squares; of a soft start, the first state is free."""
+    """Least cost and controls by SciPy's bounded-variable least squares; with a soft start the first state is free."""
     A, B = matrices(problem)
     effort, wish, _ = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
     fixed = isinstance(problem.initial, ls.FixedState)

@@ -1,4 +1,4 @@
-"""A browser without a screen, driven through its own debugging protocol: what a page shows, and what keys do to it."""
+"""A headless browser, driven through its debugging protocol: what a page shows, and how it reacts to keys."""
 
 import base64
 import contextlib
@@ -26,11 +26,11 @@ class Page:
         self._connection, self._number = connection, 0
 
     def call(self, method: str, **parameters: Any) -> Any:
-        """One command of the protocol, and what came of it."""
+        """Send one command of the protocol; its result."""
         self._number += 1
         self._connection.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._connection.recv(timeout=60))
+            answer = json.loads(self._connection.recv(timeout=600))
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return answer["result"]
@@ -41,7 +41,7 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def press(self, key: str, code: int) -> None:
-        """Press and release a key, for long enough that a frame is drawn in between."""
+        """Press a key for long enough that a frame is drawn, and release it."""
         names = {"key": key, "code": key, "windowsVirtualKeyCode": code, "nativeVirtualKeyCode": code}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown", **names)
         time.sleep(0.3)
@@ -61,7 +61,7 @@ class Page:
 
     def pictures(self) -> Iterator[np.ndarray]:
         """What the page shows, once it draws a scene, and from then on each picture that differs."""
-        last, until = self.picture(), time.monotonic() + 90
+        last, until = self.picture(), time.monotonic() + 600
         while time.monotonic() < until:
             picture = self.picture()
             # Before the scene is there the page is dark; colours are what the scene has.
@@ -78,13 +78,13 @@ class Page:
 
 @contextlib.contextmanager
 def browser(url: str, profile: Path, *, size: tuple[int, int] = (800, 560)) -> Iterator[Page]:
-    """Opens `url`; the browser ends with the block."""
+    """Open `url`; the browser is closed at the end of the block."""
     assert CHROMIUM is not None
     window = f"--window-size={size[0]},{size[1]}"
     command = [CHROMIUM, *FLAGS, window, f"--user-data-dir={profile}", "--remote-debugging-port=0", url]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            told, until = profile / "DevToolsActivePort", time.monotonic() + 60
+            told, until = profile / "DevToolsActivePort", time.monotonic() + 600
             while not (told.exists() and told.read_text().count("\n")):
                 assert time.monotonic() < until, "the browser did not start"
                 assert process.poll() is None, "the browser ended"

@@ -1,4 +1,4 @@
-"""What several test files ask of solutions and of noise."""
+"""Comparisons of solutions and of noise that several test files use."""
 
 import dataclasses
 
@@ -8,13 +8,13 @@ import lqrsim as ls
 
 
 def fixed(problem: ls.Problem) -> ls.Problem:
-    """The same from exactly the wished start."""
+    """The problem with its wished start as a fixed start."""
     assert problem.start is not None
     return dataclasses.replace(problem, initial=ls.FixedState(problem.start))
 
 
 def same(one: ls.Solution, other: ls.Solution) -> bool:
-    """To the last bit."""
+    """Whether two are equal to the last bit."""
     pairs = [(one.policy.gain, other.policy.gain), (one.policy.offset, other.policy.offset)]
     pairs += [(one.trajectory.states, other.trajectory.states), (one.trajectory.controls, other.trajectory.controls)]
     return one.status is other.status and all(np.array_equal(a, b) for a, b in pairs)

@@ -1,4 +1,4 @@
-"""Kernels compiled on their own, without the cache, to hold them against plain Python."""
+"""Kernels compiled by themselves, without the cache, to compare them with plain Python."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ from lqrsim.codegen.compiled_module import Call, Entry
 from lqrsim.codegen.language import type_of
 from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
-from lqrsim.codegen.sources import Function, Scope, text_source
+from lqrsim.codegen.sources import Scope, ScopedFunction, text_source
 
 
 class Compiled:
-    """A function compiled for arguments like these; called with such ones."""
+    """A function compiled for arguments of these types."""
 
-    def __init__(self, function: Function, *arguments: Any) -> None:
+    def __init__(self, function: ScopedFunction, *arguments: Any) -> None:
         program = Program()
         types = tuple(map(type_of, arguments))
         self.returns = program.entry(function, types, "entry")
@@ -24,10 +24,10 @@ class Compiled:
 
 
 def compiled(text: str, name: str, *arguments: Any, **sizes: int) -> Compiled:
-    """A function of a text."""
+    """Compile a function of a source text."""
     return Compiled(Scope(text_source(text), sizes).function(name), *arguments)
 
 
 def run(text: str, name: str, *arguments: Any, **sizes: int) -> Any:
-    """What it returns for these."""
+    """Compile and call a function; its result."""
     return compiled(text, name, *arguments, **sizes)(*arguments)

@@ -1,4 +1,4 @@
-"""Short functions: what the kernels' language has, and what is not of it."""
+"""Short functions: what the kernels' language contains, and what it refuses."""
 
 import re
 
@@ -254,7 +254,7 @@ a + 1  ->  an expression that is not used
 ...  ->  an expression that is not used
 b: float  ->  a name without a value
 break  ->  `break` outside of a loop
-return a + nothing  ->  the name nothing, which nothing has
+return a + nothing  ->  the name nothing, which is not defined
 return nothing(a)  ->  a call of nothing
 print(a)  ->  a call of print
 return np.sin(a)  ->  `np.sin(a)`
@@ -282,9 +282,9 @@ log[0] = 1.0  ->  `log[0]` assigned to
 x[0] = x  ->  an array of 1 dimensions, want a number
 x[0] += x  ->  an array of 1 dimensions, want a number
 return law.middle  ->  .middle of a Limits
-return log[0].nothing  ->  .nothing of a row
+return log[0].nothing  ->  .nothing of a struct
 log[0].nothing = 1.0  ->  `log[0].nothing` assigned to
-return log.cost  ->  .cost of rows
+return log.cost  ->  .cost of a structured array
 return x.size  ->  .size of an array of 1 dimensions
 return a.real  ->  .real of a float
 return (a, a).low  ->  .low of a tuple
@@ -322,7 +322,7 @@ b = (1, 2) * 2  ->  a tuple, want a number
 return (1, 2) < (1, 3)  ->  a tuple, want a number
 return (1, 2) < 3  ->  a tuple, want a number
 return min((1, 2), 3)  ->  a tuple and an int, want numbers
-return log[0] + 1  ->  a row, want a number
+return log[0] + 1  ->  a struct, want a number
 b = not a  ->  a float as a condition
 b = i and 2  ->  an int as a value of `i and 2`
 b = a or 1.0  ->  a float as a value of `a or 1.0`
@@ -338,7 +338,7 @@ return x[0][1]  ->  1 indices of a float
 return x[()]  ->  `x[()]`
 return x[...]  ->  `...`
 return a[0]  ->  1 indices of a float
-return log[0, 1]  ->  2 indices of rows
+return log[0, 1]  ->  2 indices of a structured array
 return pair[0, 1]  ->  2 indices of a tuple of vectors
 return (a, a)[2]  ->  entry 2 of 2
 return (a, i)[i]  ->  an index that is not constant, of a tuple of several types
@@ -367,7 +367,7 @@ b = Limits(x)  ->  1 fields of Limits
 b = stack(i)  ->  `stack(i)`
 b = stack(2.0)  ->  `stack(2.0)`
 b = stack(-1)  ->  `stack(-1)`
-b = stack()  ->  `stack()`
+b = stack()  ->  0 arguments in `stack()`
 b = stack(2 ** 40)  ->  `stack(2 ** 40)`
 b = stack(2 ** 62, 2 ** 62)  ->  `stack(2 ** 62, 2 ** 62)`
 b = rows_at(i, i)  ->  a width that is not constant
@@ -674,14 +674,14 @@ from math import comb
 def f(a):
     return comb(a)
 
-## no Python: which is no Python
+## no Python: which is not valid Python
 def f(a:
     return a
 """
 
 
 def _blocks(text: str) -> dict[str, tuple[str, str]]:
-    """By their names what is said of each, and its lines."""
+    """Each block's message and lines, by its name."""
     parted = (one.partition("\n") for one in re.split("(?m)^## ", text)[1:])
     named = ((*head.split(": ", 1), body.rstrip()) for head, _, body in parted)
     return {name: (said, body) for name, said, body in named}

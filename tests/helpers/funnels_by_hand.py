@@ -1,4 +1,4 @@
-"""Funnels that nothing has certified, of a shape and levels by hand."""
+"""Funnels with a shape and levels chosen by hand; nothing has certified them."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ import lqrsim as ls
 def funnel_by_hand(
     solution: ls.Solution, shape: npt.ArrayLike, *, knots: Sequence[int] = (0,), levels: Sequence[float] = (1.0,)
 ) -> ls.Funnel:
-    """Of the first d states, with a shape (d, d) or one each knot (T+1, d, d)."""
+    """A funnel of the first d states, with one shape (d, d) or one per knot (T+1, d, d)."""
     shape, space = np.asarray(shape, dtype=float), solution.policy.state_coordinates
     tried = 1000 * (np.asarray(levels) > 0)  # enough to show any rate that is asked for
     return ls.Funnel(

@@ -1,4 +1,4 @@
-"""Linear systems with a plan, for the tests of tracking, estimation and tubes. Nothing of the solvers is used.
+"""Linear systems with a plan, for the tests of tracking, estimation and tubes. They use none of the solvers.
 
 One step of Runge and Kutta of linear dynamics is linear: A = 1 + hF + ... + (hF)^4 / 24. All entries are parameters,
 so that systems of one size compile once.
@@ -56,7 +56,7 @@ def linear(
     controls: npt.ArrayLike | None = None, steps: int = 12, limits: tuple[float, float] = (-np.inf, np.inf),
     position: Sequence[str] = (), costs: tuple[ls.Cost, ...] = (),
 ) -> Linear:  # fmt: skip
-    """The system with the plan of these controls (T, m), by default zeros."""
+    """A system with the plan of these controls (T, m), zeros by default."""
     rates, inputs, pushes = (np.atleast_2d(np.asarray(one, dtype=float)) for one in (rates, inputs, pushes))
     (n, m), k = inputs.shape, pushes.shape[1]
     numbers = {f"a{i}{j}": rates[i, j] for i in range(n) for j in range(n)}
@@ -88,7 +88,7 @@ def linear(
 
 
 def by_hand(plan: ls.Trajectory, policy: ls.AffinePolicy) -> ls.Solution:
-    """A solution that no solver made."""
+    """A solution made without a solver."""
     from lqrsim.results.solution_parts import Certificate
 
     return ls.Solution(
@@ -104,7 +104,7 @@ def by_hand(plan: ls.Trajectory, policy: ls.AffinePolicy) -> ls.Solution:
 
 @cache
 def _rate(n: int, m: int, k: int) -> Callable[[Any, Any, Any], list[Any]]:
-    """The dynamics of a size; one function each, so that it is traced once."""
+    """The dynamics of one size; cached, so that each is traced once."""
 
     def rate(x: Any, u: Any, p: Any) -> list[Any]:
         def entry(i: int) -> Any:
@@ -129,7 +129,7 @@ def law_of(
     unknowns: Sequence[ls.disturbances.Unknown] = (ls.disturbances.Unknown("d0", 0.5),),
     **options: Any,
 ) -> ls.OffsetFree:
-    """Output feedback for it, with noise; the rest is of Uncertainty, but for `sensors`."""
+    """Output feedback for the double integrator, with noise; the options are those of Uncertainty, and `sensors`."""
     sensors = options.pop("sensors", None)
     stated: dict[str, Any] = {"unknowns": unknowns, "start": 0.3, "measurement": 0.1, "control": 0.2}
     uncertainty = ls.Uncertainty(**(stated | options))

@@ -1,4 +1,4 @@
-"""Small MJCFs of all kinds of joints, actuators and integrators, with numbers that a test draws."""
+"""Small MJCFs with all kinds of joints, actuators and integrators, and random numbers."""
 
 from dataclasses import dataclass
 
@@ -62,7 +62,7 @@ KINDS = {"cart": cart, "arm": arm, "box": box, "wheel": wheel}
 
 
 def draw(kind: str, seed: int, integrator: str | None = None) -> Drawn:
-    """One of a kind, with any of MuJoCo's integrators."""
+    """A random MJCF of one kind, with any of MuJoCo's integrators."""
     rng = np.random.default_rng(seed)
     chosen = integrator or INTEGRATORS[int(rng.integers(len(INTEGRATORS)))]
     options = f'<option timestep="0.005" integrator="{chosen}"/><compiler autolimits="true"/>'

@@ -1,4 +1,4 @@
-"""An arm of three links in a level plane, with its MJCF: a robot of capsules without a position, for tests."""
+"""An arm of three links in a level plane, with its MJCF: a robot made of capsules, without a position of its own."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,13 +70,13 @@ class PlanarArm(ls.Robot):
 
     @staticmethod
     def scene(folder: Path, things: str = POSTS) -> ls.Scene:
-        """The arm among those things."""
+        """The arm among these obstacles."""
         (folder / "planar_arm.xml").write_text(PlanarArm.mjcf(things))
         return ls.load_scene(folder / "planar_arm.xml")
 
     @staticmethod
     def mjcf(things: str = POSTS) -> str:
-        """The arm among those things. Its links weigh next to nothing: what turns are the motors."""
+        """The arm among these obstacles, as MJCF. The links weigh next to nothing; the inertia is the motors'."""
         link = f'<geom name="link {{}}" type="capsule" fromto="0 0 0 {LENGTH} 0 0" size="{RADIUS}" mass="1e-6"/>'
         site, end = '<site name="end {}" pos="{} 0 0"/>', "</body>"
         bodies = ""

@@ -1,4 +1,4 @@
-"""A quadrotor that moves in a vertical plane, x-z or y-z, with its MJCF: a robot of one's own, for tests."""
+"""A quadrotor that moves in a vertical plane, x-z or y-z, with its MJCF: a user's own robot."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -51,7 +51,7 @@ class PlanarQuadrotor(ls.Robot):
 
 
 def mjcf(things: str = BLOCK, *, level: str = "x", y: float = 0.0, before: str = "", flags: str = "") -> str:
-    """The drone in a plane of z and the other axis, among those things; rolls from that axis towards z."""
+    """The drone in the plane of z and another axis, among these obstacles; it rolls from that axis towards z."""
     axis, normal = ("1 0 0", "0 -1 0") if level == "x" else ("0 1 0", "1 0 0")
     place, side = (f"0 {y} 0", "{} 0 0") if level == "x" else (f"{y} 0 0", "0 {} 0")
     return f"""
@@ -85,7 +85,7 @@ def mjcf(things: str = BLOCK, *, level: str = "x", y: float = 0.0, before: str =
 def problem(
     robot: PlanarQuadrotor, world: ls.World, *, start=(-1.63, 0.2), goal=(2.11, 0.3), steps: int = 150
 ) -> ls.Problem:
-    """Over or under or before what is in the way, as goal and start have it."""
+    """A flight past the obstacles: over, under or up to them, depending on start and goal."""
     hover = MASS * GRAVITY / 2
     return ls.Problem(
         dynamics=robot.dynamics, dt=0.02, steps=steps, initial=ls.FixedState((*start, 0, 0, 0, 0)),

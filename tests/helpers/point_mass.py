@@ -1,4 +1,4 @@
-"""A point mass in the plane that must keep to constraints, and what holds its plans against SciPy and KKT conditions.
+"""A point mass in the plane with constraints; its plans are checked against SciPy and the KKT conditions.
 
 Its Runge-Kutta step is exact: positions and speeds are linear in the controls. Nothing of the solvers is used.
 """
@@ -22,7 +22,7 @@ def mass(x, u, p):
 
 
 class Effort(ls.Constraint):
-    """|u| <= most, and no more power (u'v) than `power`; what a user may write."""
+    """|u| <= most and power u'v <= `power`, written as a user may write it."""
 
     def __init__(self, most: float, power: float = 1e3) -> None:
         self.most, self.power = most, power
@@ -48,7 +48,7 @@ def slope(x, u, t, row, data, gradient):
 
 
 def balls(*places: tuple[float, float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> ls.World:
-    """At x, y, with a radius; all move with that velocity."""
+    """Balls at x, y with a radius, all with this velocity."""
     return ls.World(
         [ls.Obstacle(f"ball {i}", "sphere", np.array([x, y, 0.0]), np.eye(3), np.array([radius, 0, 0]),
                      velocity=np.array([*velocity, 0.0]))
@@ -64,7 +64,7 @@ def problem(
     start: tuple[float, ...] = (-2, 0, 0, 0), goal: tuple[float, ...] = (2, 0, 0, 0), limit: float = 20.0,
     others: tuple[ls.Constraint, ...] = (),
 ) -> ls.Problem:  # fmt: skip
-    """Past the balls. Without a weight of theirs, nothing but the constraint knows of them."""
+    """A way past the balls. Without an obstacle cost, only the constraint keeps it away from them."""
     dynamics = ls.Dynamics(
         mass, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s^2", "ay": "m/s^2"},
         position=("x", "y"),
@@ -80,7 +80,7 @@ def problem(
 
 
 class Oracle:
-    """The same problem in what is free: of a soft start the first state, and the controls."""
+    """The same problem as a function of its unknowns: the controls, and with a soft start the first state."""
 
     def __init__(self, problem: ls.Problem) -> None:
         steps, self.soft = problem.steps, not isinstance(problem.initial, ls.FixedState)
@@ -118,7 +118,7 @@ class Oracle:
 
     @staticmethod
     def distances(states: Array, world: ls.World, times: Array | float = 0.0) -> Array:
-        """To each ball, from its centre and size, at times (T,) in s."""
+        """Distances to each ball, from its centre and size, at times (T,) in s."""
         places = np.array([ball.position[:2] for ball in world.obstacles]).reshape(-1, 2)
         velocities = np.array([ball.velocity[:2] for ball in world.obstacles]).reshape(-1, 2)
         centres = places + np.reshape(times, (-1, 1, 1)) * velocities
@@ -126,7 +126,7 @@ class Oracle:
         return np.linalg.norm(states[:, None, :2] - centres, axis=2) - sizes
 
     def spare(self, z: Array) -> list[Array]:
-        """Of each constraint what is not to be negative, (T or T+1, rows)."""
+        """Each constraint's values, which must not be negative, (T or T+1, rows)."""
         states, controls = self.unpack(z)
         values: list[Array] = []
         for one in self.problem.constraints:
@@ -136,11 +136,11 @@ class Oracle:
                 square = one.most**2 - (controls**2).sum(axis=1)
                 values.append(np.stack([square, one.power - (controls * states[:-1, 2:]).sum(axis=1)], axis=1))
         if values and not self.soft:
-            values[0] = values[0][1:]  # nothing can be done about a start that is given
+            values[0] = values[0][1:]  # a fixed start has no gradient
         return values
 
     def least(self, z: Array) -> float:
-        """What SLSQP finds from there."""
+        """The optimum that SLSQP finds from z."""
         bounds = [(None, None)] * self.free + [(-self.limit, self.limit)] * (len(z) - self.free)
         kept = {"type": "ineq", "fun": lambda z: np.concatenate([np.zeros(0), *(one.ravel() for one in self.spare(z))])}
         options = {"maxiter": 300, "ftol": 1e-10}
@@ -152,7 +152,7 @@ class Oracle:
 
 
 def check(solution: ls.Solution, problem: ls.Problem, *, cost: float = 1e-3, spare: float = 1e-5) -> None:
-    """It keeps the constraints, obeys the conditions of first order, and SLSQP finds no more than 1e-3 from there."""
+    """Assert that a plan keeps the constraints and is first-order optimal, and that SLSQP saves `cost` at most."""
     oracle = Oracle(problem)
     z = oracle.pack(solution.trajectory)
     assert solution.status is Status.CONVERGED, solution.summary()
@@ -167,7 +167,7 @@ def check(solution: ls.Solution, problem: ls.Problem, *, cost: float = 1e-3, spa
         first = len(press) - len(one) if k == 0 else 0
         acts = press[first : first + len(one)]
         assert np.count_nonzero(press) == np.count_nonzero(acts)  # none where there is no constraint
-        assert one[acts > 0].max(initial=0.0) < 3 * spare  # only what is touched presses
+        assert one[acts > 0].max(initial=0.0) < 3 * spare  # only active constraints have multipliers
         slopes = oracle.differences(lambda z, k=k: oracle.spare(z)[k].ravel(), z)
         pull = pull - slopes @ acts.ravel()
         scale = max(scale, np.abs(slopes @ acts.ravel()).max())

@@ -1,4 +1,4 @@
-"""Random programs in the kernels' subset: `program` writes one, given what chooses.
+"""Random programs in the kernels' subset; `program` writes one from a function that chooses.
 
 They end, and do nothing that is undefined: indices are within their arrays, ints stay small, no divisor is zero, and
 each name has a value when it is read.
@@ -20,7 +20,7 @@ SIZES = {"N": COLUMNS, "M": ROWS}  # what declarations.py declares, and programs
 FIELDS = ("cost", "gap", "method")  # of a row
 SMOOTH = ("sin({})", "cos({})", "tanh({})", "atan({})", "exp(min({}, 3.0))", "sqrt(1.0 + abs({}))",
           "log(0.5 + fabs({}))", "cbrt(2.0 + abs({}))", "expm1(min({}, 2.0))", "log1p(abs({}))")  # fmt: skip
-MOST = 200  # of an int; larger ones are taken down
+MOST = 200  # bound on ints; larger ones are reduced
 
 Choose = Callable[[int], int]  # one of so many
 
@@ -75,7 +75,7 @@ class Writer:
         return self.one(self.vectors)
 
     def entry(self) -> str:
-        """Where a number is stored: of an array, or of a row."""
+        """A place that a number can be stored in: an entry of an array or of a row."""
         kind = self._choose(5)
         if kind == 0 and self.rows:
             return f"{self.rows}[{self.index(ROWS)}].{self.one(FIELDS)}"
@@ -86,7 +86,7 @@ class Writer:
         return f"{self.vector()}[{self.index(COLUMNS)}]"
 
     def whole(self, depth: int) -> tuple[str, int]:
-        """An int, and a bound of its size."""
+        """An int expression and a bound on its size."""
         if depth == 0 or not self.often(4):
             if self.wholes and self.often():
                 return self.one(self.wholes), MOST
@@ -115,7 +115,7 @@ class Writer:
         return text if most <= MOST else self.one([f"{text} % {MOST}", f"max(min({text}, {MOST}), -{MOST})"])
 
     def real(self, depth: int) -> str:
-        """A float; or an int, where only its type is another."""
+        """A float expression, or an int where only the type differs."""
         if depth == 0 or not self.often(4):
             kind = self._choose(6)
             if kind == 0:
@@ -174,7 +174,7 @@ class Writer:
         self.one(kinds)(depth)
 
     def bounded(self, depth: int) -> str:
-        """A float that stays small, in loops too."""
+        """A float expression that stays small, in loops too."""
         text = self.real(depth)
         return f"max(min({text}, 8.0), -8.0)" if self.loops or self.often() else text
 
@@ -205,7 +205,7 @@ class Writer:
         self.line(f"{place} {operator}= {number}")
 
     def several(self, depth: int) -> None:
-        """A swap, several names at once, a chain, an array by another name."""
+        """An assignment to several names: a swap, a tuple, a chain, or an alias of an array."""
         reals, kind = self.assigned["real"], self._choose(4)
         if kind == 0 and len(reals) > 1:
             self.line(f"{reals[0]}, {reals[1]} = {self.one(((reals[1], reals[0]), (reals[0], self.bounded(2))))[0]}, "
@@ -223,7 +223,7 @@ class Writer:
             self.line("pass")
 
     def branch(self, depth: int) -> None:
-        if not self.often(6):  # what is not taken need not mean anything
+        if not self.often(6):  # a branch that is not taken may be anything
             self.line(f"if N < {self._choose(3)}:")
             self.indent += 1
             self.line("nowhere(nothing)")
@@ -358,7 +358,7 @@ programs = st.binary(min_size=1500, max_size=5000).map(_of_choices)
 
 
 def arguments(seed: int) -> list[Any]:
-    """What a program is called with. Most floats are multiples of 1/8, whose sums and products are exact."""
+    """Arguments for a program. Most floats are multiples of 1/8, whose sums and products are exact."""
     rng = np.random.default_rng(seed)
 
     def some(*shape: int) -> Array:
@@ -373,12 +373,12 @@ def arguments(seed: int) -> list[Any]:
 
 
 def for_python(given: list[Any]) -> list[Any]:
-    """The same, with rows whose fields Python has by name."""
+    """The same arguments with rows whose fields have names in Python."""
     return [*given[:-1], given[-1].view(np.recarray)]
 
 
 def on_tracked(given: list[Any]) -> list[Any]:
-    """The same, of numbers that know their error."""
+    """The same arguments with numbers that track their error."""
 
     def objects(array: Array) -> Any:
         found = np.empty(array.shape, dtype=object)
@@ -393,7 +393,7 @@ def on_tracked(given: list[Any]) -> list[Any]:
 
 
 def numbers_in(given: Any) -> list[Any]:
-    """All of them, one after the other."""
+    """All numbers in these values, in order."""
     if given is None:
         return []
     if isinstance(given, SimpleNamespace):

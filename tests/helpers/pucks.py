@@ -1,4 +1,4 @@
-"""A puck of 1 kg on ice, held to a place by a law by hand: where its runs end is a matrix times where they begin.
+"""A puck of 1 kg on ice, held in place by a linear law: where its runs end is a matrix times where they begin.
 
 RK4 is exact under a constant force, so that of a control period is exactly the double integrator's.
 """
@@ -60,7 +60,7 @@ class Puck(ls.Robot):
 
 
 def plant(folder: Path, *, wall: float | None = None) -> ls.Plant:
-    """With a wall whose face is at x = `wall`, or with nothing in the way."""
+    """A plant with a wall at x = `wall`, or without one."""
     geom = "" if wall is None else f'<geom name="wall" type="box" size="0.5 9 1" pos="{wall + 0.5} 0 0"/>'
     path = folder / "ice.xml"
     path.write_text(MJCF.format(wall=geom), encoding="utf-8")
@@ -68,7 +68,7 @@ def plant(folder: Path, *, wall: float | None = None) -> ls.Plant:
 
 
 def solution() -> ls.Solution:
-    """To stay at the origin; the goal is there, and the cost-to-go is |x|^2 / 2."""
+    """A plan that stays at the origin, its goal; the cost-to-go is |x|^2 / 2."""
     space, controls = Puck().dynamics.state_coordinates, Puck().dynamics.control_coordinates
     gain = -np.hstack([STIFFNESS * np.eye(2), DAMPING * np.eye(2)])
     plan = ls.Trajectory(np.zeros((STEPS + 1, 4)), np.zeros((STEPS, 2)), DT)
@@ -81,7 +81,7 @@ def solution() -> ls.Solution:
 
 
 def left(knot: int) -> Array:
-    """(4, 4): from the states at a knot to those at the end."""
+    """The matrix (4, 4) from the states at a knot to those at the end."""
     push = np.vstack([DT**2 / 2 * np.eye(2), DT * np.eye(2)])
     drift = np.block([[np.eye(2), DT * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]])
     gain = -np.hstack([STIFFNESS * np.eye(2), DAMPING * np.eye(2)])

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 EPSILON = 2.0**-52
-ULPS = 16  # of a function of the C library's, or NumPy's: some are off by four
+ULPS = 16  # of functions of the C library or NumPy; some are off by four
 
 
 class Unsure(Exception):
-    """What comes next depends on rounding, or is too large for the bounds to say anything."""
+    """The next step depends on rounding, or numbers are too large for useful bounds."""
 
 
 def _few_bits(number: float, size: float) -> bool:
@@ -25,7 +25,7 @@ def _few_bits(number: float, size: float) -> bool:
 
 
 class Tracked:
-    """A float64, a bound of its error, and the sum of the sizes of the terms that it is made of."""
+    """A float64, a bound on its error, and the sum of the sizes of its terms."""
 
     __slots__ = ("error", "size", "value")
 
@@ -123,7 +123,7 @@ def divide(a: Any, b: Any) -> Tracked:
 
 
 def power(base: Any, exponent: Any) -> Any:
-    """A whole exponent is a product for compiled code."""
+    """Power; compiled code multiplies where the exponent is whole."""
     if isinstance(exponent, int):
         if isinstance(base, int) and exponent >= 0:
             return base**exponent
@@ -135,7 +135,7 @@ def power(base: Any, exponent: Any) -> Any:
 
 
 def _smooth(function: Callable[[float], float]) -> Callable[[Any], Tracked]:
-    """The function of a number; its error is what it differs by between the bounds of that."""
+    """A function of a number; its error is its change between the number's bounds."""
 
     def run(number: Any) -> Tracked:
         x = tracked(number)
@@ -189,7 +189,7 @@ class _Explicit(ast.NodeTransformer):
 
 
 def functions_on_tracked(text: str, names: Mapping[str, Any]) -> dict[str, Any]:
-    """What a program defines, for numbers like these: arrays are of objects.
+    """A program's functions for tracked numbers; arrays hold objects.
 
     Args:
       names: what else it uses.

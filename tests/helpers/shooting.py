@@ -1,4 +1,4 @@
-"""A problem as a function of its controls alone, in plain NumPy, and what SciPy's SLSQP makes of it.
+"""A problem as a function of its controls alone, in plain NumPy, solved by SciPy's SLSQP.
 
 Nothing of the package's solvers is used; formulas are evaluated by `oracle.kkt`, derivatives are complex steps.
 """
@@ -20,7 +20,7 @@ TINY = 1e-30
 
 @dataclass(frozen=True)
 class Conditions:
-    """How far a solution is from the conditions of first order; each is relative but the violation, and 0 at best.
+    """Residuals of the first-order conditions; all but the violation are relative, and 0 is best.
 
     Attributes:
       slope: what is left of the slope of the Lagrangian in controls that are inside their limits, and in a soft start.
@@ -38,7 +38,7 @@ class Conditions:
 
 
 class Shooting:
-    """The cost and the constraints of a problem at z: of a soft start the first state, and the controls."""
+    """The cost and the constraints of a problem at z: the controls, and with a soft start the first state."""
 
     def __init__(self, problem: ls.Problem) -> None:
         dynamics = problem.dynamics
@@ -71,7 +71,7 @@ class Shooting:
         return self.parts(z).sum(axis=-1)
 
     def parts(self, z: Any) -> Any:
-        """What each term of the cost comes to, (..., k)."""
+        """Each term of the cost, (..., k)."""
         problem, points = self.problem, self.points(z)
         parts = [part.sum(axis=-1) for part in self._of(problem.stage_cost, points[..., :-1, :])]
         parts += self._of(problem.final_cost, points[..., -1, :])
@@ -96,7 +96,7 @@ class Shooting:
         return found
 
     def rows(self, z: Any, equality: bool) -> Any:
-        """All equalities (..., k), or all inequalities, where they act."""
+        """All equalities or all inequalities (..., k), at the steps where they apply."""
         points = self.points(z)
         chosen = [one.function(points)[..., one.acts] for one in self.kept if one.equality == equality]
         return np.concatenate([np.zeros((*z.shape[:-1], 0)), *chosen], axis=-1)
@@ -106,7 +106,7 @@ class Shooting:
         return np.moveaxis(function(z + 1j * TINY * np.eye(len(z))).imag, 0, -1) / TINY
 
     def conditions(self, solution: ls.Solution) -> Conditions:
-        """The conditions of first order of a solution, with its own multipliers."""
+        """Residuals of a solution's first-order conditions with its own multipliers."""
         z = self.pack(solution.trajectory)
         left = self.slope(self.cost, z)
         size = np.abs(self.slope(self.parts, z)).sum(axis=0)
@@ -134,7 +134,7 @@ class Shooting:
         )  # fmt: skip
 
     def least(self, z: Array, *, price: float | None = None, cost: float = 1.0) -> tuple[Array, float]:
-        """What SLSQP finds from there, and its value: the least cost, or with a price of missing a unit.
+        """The optimum that SLSQP finds from z and its value: the cost, with `price` also that of missed constraints.
 
         With a price there are slack variables; `cost` weighs the cost beside it.
         """

@@ -1,4 +1,4 @@
-"""Files of lqrsim changed as another program could, with the hash that belongs to them or the old one."""
+"""Files of lqrsim changed as another program could change them, with a matching hash or the old one."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
-    """The hash in a file, as docs/file_format.md describes it, and not as the package computes it."""
+    """A file's content hash, computed as docs/file_format.md describes it, not by the package."""
     text = json.dumps({k: v for k, v in meta.items() if k != "sha256"}, sort_keys=True, separators=(",", ":"))
     found = hashlib.sha256(text.encode())
     for name, array in sorted(arrays.items()):
@@ -24,7 +24,7 @@ def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
-    """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
+    """Change a file as another program could: with a matching hash, or the old one.
 
     An array replaces one, None takes one out, and a function changes it; anything else is metadata, by its path.
     """

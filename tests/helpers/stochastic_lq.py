@@ -40,7 +40,7 @@ def draw(rng: np.random.Generator, *, multiplicative: float = 0.1, additive: flo
 
 
 def linear(x: Any, u: Any, p: Any) -> list[Any]:
-    """The rate, all of whose numbers are parameters, so that one compiled core serves all problems."""
+    """The rate with all numbers as parameters, so that one compiled core serves all problems."""
     z = [*x, *u, 1]
     return [sum(getattr(p, f"f{i}{j}") * z[j] for j in range(len(z))) for i in range(STATES)]
 

@@ -12,7 +12,7 @@ from lqrsim.robots.quadrotor import Quadrotor
 
 
 def track(robot: Robot, start: npt.ArrayLike, controls: npt.ArrayLike, dt: float, *, feedback: bool = True) -> Solution:
-    """The plan of some controls from a start, and a time-varying LQR that keeps to it (or its controls alone)."""
+    """The plan of given controls from a start, with a time-varying LQR about it, or without feedback."""
     dynamics, controls = robot.dynamics, np.asarray(controls, dtype=float)
     steps, m = controls.shape
     states = [np.asarray(start, dtype=float)]
@@ -68,7 +68,7 @@ def weave(steps: int = 150) -> Solution:
 
 
 def hover(steps: int = 60) -> Solution:
-    """Two seconds of rocking in the middle of the cage."""
+    """A hover in the middle of the cage that rocks for two seconds."""
     robot, time = Quadrotor(), np.arange(steps) / 30
     rock = 0.02 * np.sin(2 * np.pi * time)
     controls = robot.hover_force + np.stack([rock, -rock / 2, -rock, rock / 2], axis=1)

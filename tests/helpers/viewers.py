@@ -1,4 +1,4 @@
-"""A viewer that no one looks at, and `lqrsim view` in a process of its own."""
+"""A viewer without a window, and `lqrsim view` in a process of its own."""
 
 import contextlib
 import itertools
@@ -18,7 +18,7 @@ from lqrsim.view.viewer_base import Viewer
 
 
 class Recorder(Viewer):
-    """A viewer that no one looks at; it keeps what it showed, and closes after so many frames."""
+    """A viewer without a window: it records what it shows, and closes after a number of frames."""
 
     def __init__(self, frames: int, **options: object) -> None:
         super().__init__(speed=100.0, **options)  # pyright: ignore[reportArgumentType] of `arguments_for_plant`
@@ -40,13 +40,13 @@ class Recorder(Viewer):
 
 @contextlib.contextmanager
 def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`lqrsim view` in a process of its own, for three minutes at most, and as it ends with Ctrl-C.
+    """`lqrsim view` in a process of its own, for 20 minutes at most; Ctrl-C ends it.
 
     Args:
       before: what that process does first.
     """
     code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "200"]
+    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "1200"]
     # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
     environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
     environment["PYTHONFAULTHANDLER"] = "1"
@@ -57,14 +57,14 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
         finally:
             process.send_signal(signal.SIGINT)
             try:
-                process.communicate(timeout=60)  # reads on, for a process that cannot write cannot end
+                process.communicate(timeout=600)  # keeps reading: a process with a full pipe cannot end
             except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGABRT)  # where it hangs is then in what it wrote
+                process.send_signal(signal.SIGABRT)  # its traceback then says where it hangs
                 raise AssertionError(f"it did not end with Ctrl-C:\n{process.communicate()[0]}") from None
 
 
 def said(process: subprocess.Popen[str], text: str) -> str:
-    """What the process has written, once it has written that."""
+    """The output of the process up to this text; waits for it."""
     assert process.stdout is not None
     found = ""
     for line in process.stdout:
@@ -75,7 +75,7 @@ def said(process: subprocess.Popen[str], text: str) -> str:
 
 
 def said_after(process: subprocess.Popen[str], text: str, act: Callable[[int], None]) -> str:
-    """What the process has written once it has written that: `act(i)` is done again every few seconds until it has.
+    """The output of the process up to this text; `act(i)` is repeated every few seconds until it comes.
 
     A browser that has just begun on a busy machine loses keys.
     """

@@ -1,4 +1,4 @@
-"""Whether a campaign that is killed again and again comes to the same bits: `lqrsim stress`, SIGKILL, the same command.
+"""Whether a campaign that is killed again and again gives the same bits: `lqrsim stress`, SIGKILL, the same command.
 
     python tests/tools/benchmark_campaign.py            # 20 kills
     python tests/tools/benchmark_campaign.py --quick    # 3

@@ -1,4 +1,4 @@
-"""Whether what solutions claim is so, on whole problems drawn at random, and on one person's own robot.
+"""Check the claims of solutions, on whole problems drawn at random and on a user's own robot.
 
     python tests/tools/benchmark_claims.py                         # 10,000 problems, some 6 minutes on two cores
     python tests/tools/benchmark_claims.py --sections planar       # some of it
@@ -64,7 +64,7 @@ def main(config: Config) -> Result:
 
 
 def look(kind: str, number: int, seed: int) -> tuple[list[str], list[str]]:
-    """The statuses of a draw's solutions, and what they claim that is not so."""
+    """The statuses of a draw's solutions, and their false claims."""
     drawn = draw(kind, number, seed=seed)
     solutions = solve(drawn)
     false = [

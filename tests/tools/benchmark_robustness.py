@@ -1,4 +1,4 @@
-"""How lqrsim takes hostile input: calls with what nobody should pass, and files that are damaged or made up.
+"""How lqrsim handles hostile input: calls with bad arguments, and damaged or forged files.
 
     python tests/tools/benchmark_robustness.py                    # everything, some minutes
     python tests/tools/benchmark_robustness.py --sections files   # some of it

@@ -1,12 +1,19 @@
-"""What goes wrong in a run: one class a disturbance, in physical units, drawn for each trial from its own generator.
+"""Disturbances of a run: one class each, in physical units, drawn for each trial from its own generator.
 
-`base.py` says what a disturbance is, and how to add one; `KINDS` has all classes by name.
+`base.py` explains how to add one; `KINDS` has all classes by name.
 """
 
 import inspect
 
-from lqrsim.simulation.disturbances.actuation import ActuatorLoss, ControlDelay, MotorLag, Saturation
+from lqrsim.simulation.disturbances.actuation import ActuatorLoss, MotorLag, Saturation
 from lqrsim.simulation.disturbances.base import Disturbance, Effect
+from lqrsim.simulation.disturbances.links import (
+    CommandDropouts,
+    ControlDelay,
+    GilbertElliott,
+    MeasurementDropouts,
+    MeasurementLatency,
+)
 from lqrsim.simulation.disturbances.mismatch import (
     AxleMismatch,
     FrictionMismatch,
@@ -15,16 +22,18 @@ from lqrsim.simulation.disturbances.mismatch import (
     ThrustMismatch,
     WheelRadiusMismatch,
 )
-from lqrsim.simulation.disturbances.noise import ControlNoise, ForceNoise, MeasurementNoise, Push, TorqueNoise
-from lqrsim.simulation.disturbances.presets import PRESETS, preset
-from lqrsim.simulation.disturbances.sensing import (
-    CommandDropouts,
-    GilbertElliott,
+from lqrsim.simulation.disturbances.noise import (
+    ControlNoise,
+    DisplacedObstacles,
+    ForceNoise,
+    InitialStateError,
     MeasurementBias,
-    MeasurementDropouts,
-    MeasurementLatency,
+    MeasurementNoise,
+    Push,
+    TorqueNoise,
+    as_disturbances,
 )
-from lqrsim.simulation.disturbances.surroundings import DisplacedObstacles, InitialStateError
+from lqrsim.simulation.disturbances.presets import PRESETS, preset
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
 
 KINDS: dict[str, type[Disturbance]] = {
@@ -63,5 +72,6 @@ __all__ = [
     "ThrustMismatch",
     "TorqueNoise",
     "WheelRadiusMismatch",
+    "as_disturbances",
     "preset",
 ]

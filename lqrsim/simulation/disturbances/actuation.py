@@ -1,4 +1,4 @@
-"""What is wrong with the actuators: late, slow, weak, or lost. White noise on them is in `noise.py`."""
+"""Actuators that lag, have narrower limits, or fail. Noise on controls is in `noise.py`, delays are in `links.py`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_name, check_number, excerpt
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
@@ -21,59 +21,17 @@ from lqrsim.simulation.disturbances.base import (
     times,
     with_units,
 )
-from lqrsim.simulation.disturbances.sensing import counted
 from lqrsim.simulation.plant import Plant
 
 _FIXED = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 
 
 @dataclass(frozen=True)
-class ControlDelay(Disturbance):
-    """Commands arrive late; until the first does, the plan's controls are applied.
-
-    Args:
-      periods: how many control periods late.
-    """
-
-    periods: int
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "periods", check_count("ControlDelay: periods", self.periods, at_least=0))
-
-    def describe(self, plant: Plant) -> str:
-        return f"commands late by {counted(self.periods)}"
-
-    def scaled(self, strength: float) -> "ControlDelay":
-        """The same with `strength` times the periods, rounded to whole ones.
-
-        Args:
-          strength: factor, 0 or more.
-
-        Returns:
-          A ControlDelay.
-        """
-        return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        under_way: list[Array] = []
-
-        def actuate(step: int, controls: Array) -> Array:
-            under_way.append(controls.copy())
-            if len(under_way) > self.periods:
-                return under_way.pop(0)
-            return np.tile(plan.controls[step], (len(controls), 1))
-
-        return Effect(actuate=actuate)
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(delay=self.periods)
-
-
-@dataclass(frozen=True)
 class MotorLag(Disturbance):
-    """Actuators follow their commands, within the limits, with a first-order lag, from the plan's first control on.
+    """Actuators follow their commands, within the limits, with a first-order lag. They begin at the plan's first
+    control.
 
-    What is applied in a control period is the exact mean over it.
+    The control that is applied in a control period is the exact mean over it.
 
     Args:
       time_constant: in s.
@@ -95,8 +53,9 @@ class MotorLag(Disturbance):
         if self.time_constant == 0:
             return Effect()
         step_in_constants = plan.dt / self.time_constant
-        left = np.exp(-step_in_constants)  # of the distance to the command, at the end of the period
-        mean = -np.expm1(-step_in_constants) / step_in_constants  # and in the mean over it
+        # Share of the distance to the command that is left at the end of the period, and in the mean over it.
+        left = np.exp(-step_in_constants)
+        mean = -np.expm1(-step_in_constants) / step_in_constants
         space, reached = plant.robot.dynamics.control_coordinates, np.tile(plan.controls[0], (len(generators), 1))
 
         def actuate(step: int, controls: Array) -> Array:
@@ -113,13 +72,13 @@ class MotorLag(Disturbance):
 
 @dataclass(frozen=True)
 class Saturation(Disturbance):
-    """Limits of the controls that are narrower than the robot's own.
+    """Control limits that are narrower than the robot's own.
 
     Args:
       lowest: in the control's unit, within the robot's limits: a number, or one per control; None keeps the robot's.
       highest: likewise.
-      share: instead of them, share of the robot's own limits that is left, 0 to 1.
-      strength: how far the limits go from the robot's own (0) to these (1), and beyond, until they meet.
+      share: instead of these, the share of the robot's own limits that is left, 0 to 1.
+      strength: interpolates from the robot's own limits (0) to these (1), and beyond, until they meet.
     """
 
     lowest: Numbers | None = None
@@ -131,7 +90,7 @@ class Saturation(Disturbance):
         given = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
         if bool(given) == (self.share is not None):
             got = "both" if given else "neither"
-            raise InputError(f"Saturation: share: got {got} it and limits, want lowest, highest or both, or a share")
+            raise InputError(f"Saturation: share: got {got} share and limits, want lowest, highest or both, or a share")
         for name in given:
             object.__setattr__(self, name, check_numbers(self, name, getattr(self, name)))
         if self.share is not None:
@@ -154,10 +113,10 @@ class Saturation(Disturbance):
         return replace(self, strength=times(self, self.strength, strength))
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
-        """Lowest and highest controls.
+        """The narrowed limits.
 
         Args:
-          plant: whose robot has the wider limits.
+          plant: with the robot's own limits.
 
         Returns:
           Two arrays (m,).
@@ -170,7 +129,7 @@ class Saturation(Disturbance):
         if self.share is not None:
             if not np.isfinite(own).all():
                 raise InputError(f"Saturation: share: got robot {plant.robot.name} without limits, want one with them")
-            # Of a range that does not contain zero, only the far side comes nearer.
+            # If a range does not contain zero, only its far side moves.
             wanted = np.array([np.maximum(own[0], self.share * own[0]), np.minimum(own[1], self.share * own[1])])
         else:
             sides = zip(("lowest", "highest"), (self.lowest, self.highest), own, strict=True)
@@ -178,15 +137,15 @@ class Saturation(Disturbance):
         if (wanted != np.clip(wanted, *own)).any() or (wanted[0] > wanted[1]).any():
             i = int(np.argmax((wanted != np.clip(wanted, *own)).any(axis=0) | (wanted[0] > wanted[1])))
             raise InputError(
-                f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want the first not"
-                f" above the second, within {plant.robot.name}'s {own[0, i]:g} to {own[1, i]:g}"
+                f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want a range within that"
+                f" of {plant.robot.name}, {own[0, i]:g} to {own[1, i]:g}"
             )
         moved = wanted != own
         if self.strength != 1:
             if not np.isfinite(own[moved]).all():
                 raise InputError(
                     f"Saturation: strength: got {self.strength:g} for robot {plant.robot.name}, which has no limits of"
-                    " its own to go from, want 1"
+                    " its own to interpolate from, want 1"
                 )
             wanted[moved] = own[moved] + self.strength * (wanted[moved] - own[moved])
         low, high = wanted
@@ -205,17 +164,17 @@ class Saturation(Disturbance):
         space = plant.robot.dynamics.control_coordinates
         if np.array_equal(self.limits(plant), (space.low, space.high)):
             return Uncertainty()
-        return left_out(self, plant, "a law keeps the robot's own limits, and narrower ones are not linear")
+        return left_out(self, plant, "limits are not linear, and a law uses the robot's own")
 
 
 @dataclass(frozen=True)
 class ActuatorLoss(Disturbance):
-    """An actuator fails for good: what it exerts in MuJoCo goes to a share. A wheel that lost its drive turns freely.
+    """An actuator fails for good: its force in MuJoCo drops to a share. A wheel that loses its drive turns freely.
 
     Args:
       actuator: one of the robot's `actuators`; None draws one for each trial.
-      at: seconds after the start; lost from the first control period on that begins then or later.
-      remaining: share of its force that is left, 0 to 1.
+      at: seconds after the start; the loss begins with the next control period.
+      remaining: share of the force that is left, 0 to 1.
     """
 
     actuator: str | None = None
@@ -234,7 +193,7 @@ class ActuatorLoss(Disturbance):
         return f"{which} down to {100 * self.remaining:g} % from {self.at:g} s on"
 
     def scaled(self, strength: float) -> "ActuatorLoss":
-        """The same with `strength` times the loss, at most all of it.
+        """The same with `strength` times the loss, at most a complete loss.
 
         Args:
           strength: factor, 0 or more.
@@ -252,7 +211,7 @@ class ActuatorLoss(Disturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
-        period = int(np.ceil(self.at / plan.dt - 1e-9))  # a time that is a knot up to rounding is that knot
+        period = int(np.ceil(self.at / plan.dt - 1e-9))  # a time within rounding of a knot counts as that knot
         if period >= plan.steps:
             raise InputError(
                 f"ActuatorLoss: at: got {self.at:g} s, want a time before the last control period of the plan, which"
@@ -277,14 +236,14 @@ class ActuatorLoss(Disturbance):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         if self.remaining == 1:
             return Uncertainty()
-        return left_out(self, plant, "it is no small deviation, and comes once")
+        return left_out(self, plant, "it is not a small deviation, and comes once")
 
 
 def check_gains(disturbance: Disturbance, plant: Plant) -> None:
-    """Raise InputError unless what the robot's actuators exert is proportional to their gains and biases."""
+    """Raise InputError unless the forces of the robot's actuators are proportional to their gains and biases."""
     for name, number in zip(plant.robot.actuators, plant.ctrl, strict=True):
         if plant.model.actuator_gaintype[number] not in _FIXED or plant.model.actuator_biastype[number] not in (0, 1):
             raise InputError(
-                f"{type(disturbance).__name__}: got robot {plant.robot.name} with actuator {name!r} of a kind whose"
-                " gain is no plain number, want fixed or affine gains and biases"
+                f"{type(disturbance).__name__}: got robot {plant.robot.name}, whose actuator {name!r} has a gain or"
+                " bias that is neither fixed nor affine, want fixed or affine ones"
             )

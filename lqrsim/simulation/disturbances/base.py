@@ -1,9 +1,9 @@
-"""What a disturbance is: what it does in a run, and what all of them share.
+"""The base classes of disturbances.
 
-To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
-calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
-on where the robot is) or remember the past (a delay). `scaled` says what a multiple of it is, for sweeps; `check`
-refuses a plant that cannot have it; `uncertainty` says what filters, tracking laws and tubes are to make of it.
+To add one, subclass `Disturbance` and implement `start`. It is called once per run, and returns an `Effect`: functions
+that the closed loop calls in every control period for all trials at once. They may use the state (wind that depends on
+the position) or remember the past (a delay). `scaled` returns a stronger or weaker one, for sweeps; `check` refuses a
+plant that cannot have it; `uncertainty` describes it to filters, tracking laws and tubes.
 """
 
 import abc
@@ -28,21 +28,22 @@ Numbers = float | Sequence[float]
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """What a disturbance does in one run of K trials; None does nothing. Steps are numbers of control periods.
+    """The effect of a disturbance on one run of K trials; None has no effect. A step is the number of a control period.
 
-    What is called with all trials gives each the numbers that it gets alone, to the last bit: no sums over trials.
+    Each function must give a trial the same numbers, to the last bit, whatever trials run beside it: no sums over
+    trials.
 
     Attributes:
-      initial_states: (states (K, n) at which the plan begins) -> the states at which the trials do, (K, n).
+      initial_states: (first states of the plan (K, n)) -> first states of the trials, (K, n).
       alter: called once, before the first step, with the simulations; gives each trial its own values of fields of
         the model with `simulations.expand(field)`, whose first axis is the trial.
-      measure: (step, states (K, n)) -> the states that the policy is shown, (K, n); step runs to T inclusive.
-      actuate: (step, controls (K, m)) -> the controls on their way to the actuators, (K, m), which then saturate.
+      measure: (step, states (K, n)) -> measured states, (K, n); step runs to T inclusive.
+      actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
-      kick: (step, true states (K, n), controls (K, m) as the actuators get them) -> by how much the states jump at the
-        end of the control period, (K, n).
-      displaced: (K, obstacles, 3), by how much each of the plant's obstacles is away from where the scene has it, in m.
+      kick: (step, true states (K, n), saturated controls (K, m)) -> jump of the states at the end of the control
+        period, (K, n).
+      displaced: (K, obstacles, 3), displacement of each of the plant's obstacles from its place in the scene, in m.
     """
 
     initial_states: Callable[[Array], Array] | None = None
@@ -56,7 +57,7 @@ class Effect:
 
     def __post_init__(self) -> None:
         for name in ("initial_states", "alter"):
-            check_function(f"Effect: {name}", getattr(self, name), "a function of one thing, or None", arguments=1)
+            check_function(f"Effect: {name}", getattr(self, name), "a function of one argument, or None", arguments=1)
         for name in ("measure", "actuate", "force", "torque"):
             wanted = "a function of the step and an array, or None"
             check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
@@ -71,7 +72,7 @@ class Disturbance(abc.ABC):
     """Base class of all disturbances."""
 
     def describe(self, plant: Plant) -> str:
-        """The disturbance in words and units, for the record. By default, how the object is made.
+        """Describe the disturbance in words and units, for records. By default its repr.
 
         Args:
           plant: what is run.
@@ -91,7 +92,7 @@ class Disturbance(abc.ABC):
           A Disturbance.
 
         Raises:
-          InputError: nothing says what this is, or that much of it means nothing.
+          InputError: the class does not implement it, or the strength is out of range.
         """
         raise InputError(
             f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
@@ -108,7 +109,7 @@ class Disturbance(abc.ABC):
         """
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The disturbance in numbers, for `uncertainty_of`. By default it is left out, and the result says so.
+        """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with the reason.
 
         Args:
           plant: what is run.
@@ -120,7 +121,7 @@ class Disturbance(abc.ABC):
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        """Begin a run with one trial per generator. A trial's random numbers must come from its own generator.
+        """Start a run with one trial per generator. A trial's random numbers must come from its own generator.
 
         Args:
           plant: what is run.
@@ -137,15 +138,15 @@ class Disturbance(abc.ABC):
 
 @dataclass(frozen=True)
 class GaussianDisturbance(Disturbance):
-    """Base class of what is drawn from normal distributions of mean zero.
+    """Base class of disturbances that are drawn from normal distributions of mean zero.
 
     Args:
-      std: one number, or one for each of what it is drawn for.
+      std: standard deviation; one number, or one per component.
     """
 
     std: Numbers
 
-    along: ClassVar[str] = ""  # what it is drawn for, where that is the same for every plant
+    along: ClassVar[str] = ""  # the components, if they are the same for every plant
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "std", check_numbers(self, "std", self.std, at_least=0.0))
@@ -153,17 +154,17 @@ class GaussianDisturbance(Disturbance):
             fit(self, self.std, self.along)
 
     def scaled(self, strength: float) -> Self:
-        """The standard deviation so many times as large."""
+        """The same with `strength` times the standard deviation."""
         return replace(self, std=times(self, self.std, strength))
 
 
 def left_out(disturbance: Disturbance, plant: Plant, why: str) -> Uncertainty:
-    """Of a disturbance that no linear model has: nothing but its words, and why."""
+    """The Uncertainty of a disturbance that linear models cannot have: its description and the reason."""
     return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",))
 
 
 def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
-    """Those that are more than zero; what the robot's dynamics do not have is left out by name."""
+    """The unknowns that are not zero; those that the robot's dynamics do not have are left out by name."""
     known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
     kept = list[Unknown]()
     for one in wanted:
@@ -179,44 +180,46 @@ def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown
 
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
     """Standard normal numbers (K, steps, size), each trial's from its own generator."""
-    numbers = np.empty((steps, len(generators), size))  # in memory as they are read: all trials of a step together
+    numbers = np.empty((steps, len(generators), size))  # in memory all trials of a step together, as they are read
     for trial, generator in enumerate(generators):
         numbers[:, trial] = generator.standard_normal((steps, size))
     return numbers.transpose(1, 0, 2)
 
 
 def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
-    """Numbers (K, steps, size) that are uniform between 0 and 1, each trial's from its own generator."""
+    """Uniform numbers (K, steps, size) in [0, 1), each trial's from its own generator."""
     return np.stack([generator.random((steps, size)) for generator in generators])
 
 
 def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
-    """A field as it is kept: a number, or a tuple of them. Raises InputError for what is too small or not finite."""
+    """A field as a number or a tuple. Raises InputError for no numbers, and for small or infinite ones."""
     field = f"{type(disturbance).__name__}: {name}"
     if real(field, numbers).ndim == 0:
         return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
     values = check_array(field, numbers, (None,))
+    if not len(values):
+        raise InputError(f"{field}: got no numbers, want at least one")
     if (values < at_least).any():
         raise InputError(f"{field}: got {values.min():g}, want numbers >= {at_least:g}")
     return tuple(values.tolist())
 
 
 def check_strength(disturbance: Disturbance, strength: float) -> float:
-    """What `scaled` is given. Raises InputError for a negative one."""
+    """The argument of `scaled` as a number. Raises InputError if it is negative."""
     return check_number(f"{type(disturbance).__name__}: strength", strength, at_least=0.0)
 
 
 def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
-    """A number or a tuple of them, so many times as large. Raises InputError for a negative strength."""
+    """A number or a tuple of numbers times the strength. Raises InputError if that is negative or too large."""
     with np.errstate(over="ignore"):
         product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
     if not np.isfinite(product).all():
-        raise InputError(f"{type(disturbance).__name__}: strength: got {strength:g}, want less: it leaves all numbers")
+        raise InputError(f"{type(disturbance).__name__}: strength: got {strength:g}, want less: the result overflows")
     return float(product) if product.ndim == 0 else tuple(product.tolist())
 
 
 def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], field: str = "std") -> Array:
-    """A field as one number for each of `names`. Raises InputError if it has another number of them."""
+    """A field as one number for each of `names`. Raises InputError unless it has one or as many numbers."""
     values = np.asarray(numbers, dtype=np.float64)
     if values.ndim and len(values) != len(names):
         raise InputError(
@@ -227,7 +230,7 @@ def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], 
 
 
 def with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates) -> str:
-    """The numbers with their units, each unit once where its numbers are the same: `0.01 m, 0.02 rad`."""
+    """The numbers grouped by unit, each group as one number if all are the same: `0.01 m, 0.02 rad`."""
     values = fit(disturbance, std, coordinates.names)
     of_unit = {
         unit: [v for v, u in zip(values, coordinates.units, strict=True) if u == unit] for unit in coordinates.units
@@ -236,7 +239,8 @@ def with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates)
 
 
 def words(numbers: Numbers) -> str:
-    """Numbers as they are written: 0.1, or (0.1, 0.2)."""
+    """Numbers as text: 0.1, or (0.1, 0.2)."""
+
     values = np.atleast_1d(numbers)
     text = ", ".join(f"{value:g}" for value in values)
     return text if np.ndim(numbers) == 0 else f"({text})"

@@ -1,8 +1,8 @@
-"""Robots that are not quite the model that the policy was made for.
+"""Robots that differ from the model for which the policy was designed.
 
-Each of these multiplies something in a trial's own MuJoCo model by a factor: 1 plus a normal number that is cut at
-three standard deviations, drawn for each trial; or a fixed factor. To filters and tubes a fixed factor is unknown as
-well: of mean 1, and of a standard deviation that is its distance from 1.
+Each class multiplies a parameter in the MuJoCo model of each trial by a factor: 1 plus a normal number, truncated at
+three standard deviations and drawn for each trial; or a fixed factor. For filters and tubes a fixed factor is unknown,
+too, with mean 1 and its distance from 1 as standard deviation.
 """
 
 import abc
@@ -33,18 +33,18 @@ from lqrsim.simulation.disturbances.base import (
 )
 from lqrsim.simulation.plant import Plant
 
-CUT = 3.0  # standard deviations
-# Of a standard normal number that is cut there.
+CUT = 3.0  # standard deviations at which normal numbers are truncated
+# The standard deviation of a truncated standard normal number.
 CUT_STD = math.sqrt(1 - 2 * CUT * math.exp(-(CUT**2) / 2) / math.sqrt(2 * math.pi) / math.erf(CUT / math.sqrt(2)))
 
 
 @dataclass(frozen=True)
 class Mismatch(Disturbance):
-    """What all of them share.
+    """Base class of mismatches.
 
     Args:
-      std: relative standard deviation of the factor about 1, below 1/3, so that what is left is positive.
-      factor: instead of it, the factor itself, > 0; one number, or one for each of `parts`.
+      std: relative standard deviation of the factor about 1, below 1/3, so that the factor is positive.
+      factor: instead, the factor itself, > 0; one number, or one for each of `parts`.
     """
 
     std: float | None = None
@@ -56,7 +56,7 @@ class Mismatch(Disturbance):
         name = type(self).__name__
         if (self.std is None) == (self.factor is None):
             got = "neither of" if self.std is None else "both"
-            raise InputError(f"{name}: got {got} std and factor, want one of them")
+            raise InputError(f"{name}: got {got} std and factor, want one of the two")
         if self.std is not None:
             object.__setattr__(self, "std", check_number(f"{name}: std", self.std, at_least=0.0, below=1 / CUT))
         if self.factor is not None:
@@ -65,13 +65,13 @@ class Mismatch(Disturbance):
                 raise InputError(f"{name}: factor: got {np.min(factor):g}, want numbers > 0")
             object.__setattr__(self, "factor", factor)
 
-    @abc.abstractmethod
     def parts(self, plant: Plant) -> Sequence[str]:
-        """What has a factor of its own."""
+        """The parts that have a factor each."""
+        return (self.what,)
 
     @abc.abstractmethod
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        """Change the models of the simulations by factors (K, parts)."""
+        """Multiply the parameters of the simulations by factors (K, parts)."""
 
     def describe(self, plant: Plant) -> str:
         if self.factor is not None:
@@ -79,7 +79,7 @@ class Mismatch(Disturbance):
         return f"{self.what} off by {100 * (self.std or 0.0):.3g} % (std, cut at {CUT:g} std)"
 
     def scaled(self, strength: float) -> "Mismatch":
-        """The standard deviation so many times as large; of a fixed factor, the power."""
+        """The same with `strength` times the standard deviation, or with that power of a fixed factor."""
         strength = check_strength(self, strength)
         if self.factor is None:
             return replace(self, std=strength * (self.std or 0.0))
@@ -87,7 +87,7 @@ class Mismatch(Disturbance):
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
     def spread(self, plant: Plant) -> Array:
-        """Standard deviation of each part's factor about 1, (parts,); of a fixed factor, how far it is from 1."""
+        """Standard deviation of each part's factor, (parts,); the distance of a fixed factor from 1."""
         parts = self.parts(plant)
         if self.factor is None:
             return np.full(len(parts), CUT_STD * (self.std or 0.0))
@@ -104,15 +104,12 @@ class Mismatch(Disturbance):
 
 
 class MassMismatch(Mismatch):
-    """Another mass, as of a load at the centre of mass of each of the robot's bodies; the inertia stays.
+    """Another mass, as by a load at the centre of mass of each of the robot's bodies; the inertia does not change.
 
-    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
     what = "mass"
-
-    def parts(self, plant: Plant) -> Sequence[str]:
-        return ("mass",)
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         simulations.expand("body_mass")[:, bodies(plant)] *= factors
@@ -122,15 +119,12 @@ class MassMismatch(Mismatch):
 
 
 class InertiaMismatch(Mismatch):
-    """Another inertia of the robot's bodies about their centres of mass, by one factor about all axes; the mass stays.
+    """Another inertia of the robot's bodies about their centres of mass, the same factor for all axes.
 
-    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    The mass does not change. Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
     what = "inertia"
-
-    def parts(self, plant: Plant) -> Sequence[str]:
-        return ("inertia",)
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         simulations.expand("body_inertia")[:, bodies(plant)] *= factors[:, :, None]
@@ -138,13 +132,13 @@ class InertiaMismatch(Mismatch):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         if not self.spread(plant).any():
             return Uncertainty()
-        return left_out(self, plant, "it changes what controls do, and not where an undisturbed run goes")
+        return left_out(self, plant, "it changes the effect of controls, but not an undisturbed run")
 
 
 class ThrustMismatch(Mismatch):
-    """Actuators that exert more or less than they are told, each its own: what is along their gain, for forces only.
+    """Actuators that exert more or less force than commanded: their gains change. Not for servos.
 
-    Drawn for each trial and actuator from a normal distribution that is cut at three std, or fixed factors.
+    Drawn for each trial and actuator from a truncated normal distribution, or fixed factors.
     """
 
     what = "thrust"
@@ -168,31 +162,31 @@ class ThrustMismatch(Mismatch):
 
 
 class WheelMismatch(Mismatch):
-    """What the mismatches of wheels share: they need a robot that has some."""
+    """Base class of the mismatches of wheels, which need a robot with wheels."""
 
     def check(self, plant: Plant) -> None:
         if not plant.robot.wheels:
             raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which has no wheels, want one that names their"
-                " treads in `wheels`"
+                f"{type(self).__name__}: got robot {plant.robot.name}, which has no wheels, want one with the geoms of"
+                " its wheels in `wheels`"
             )
-
-    def parts(self, plant: Plant) -> Sequence[str]:
-        return plant.robot.wheels
 
 
 class WheelRadiusMismatch(WheelMismatch):
-    """Wheels that are larger or smaller, each its own; the robot stands level all the same.
+    """Wheels that are larger or smaller, independently of each other; the robot stays level.
 
-    Drawn for each trial and wheel from a normal distribution that is cut at three std, or fixed factors.
+    Drawn for each trial and wheel from a truncated normal distribution, or fixed factors.
     """
 
     what = "wheel radius"
 
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return plant.robot.wheels
+
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         wheels, hubs = treads(plant)
         simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
-        # An axle that is higher by as much as the wheel is larger keeps the tread on the floor, and the casters off it.
+        # Raise the axle by the difference of the radii, so that the wheel touches the floor and the casters do not.
         raised = plant.model.geom_size[wheels, 0] * (factors - 1)
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * upward(plant, hubs)
 
@@ -203,13 +197,10 @@ class WheelRadiusMismatch(WheelMismatch):
 class AxleMismatch(WheelMismatch):
     """Wheels that are further apart, or closer together.
 
-    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
     what = "axle length"
-
-    def parts(self, plant: Plant) -> Sequence[str]:
-        return ("axle",)
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         _, hubs = treads(plant)
@@ -223,13 +214,10 @@ class AxleMismatch(WheelMismatch):
 class FrictionMismatch(WheelMismatch):
     """Another sliding friction between the wheels and the floor, the same for all wheels.
 
-    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
     what = "friction of the wheels"
-
-    def parts(self, plant: Plant) -> Sequence[str]:
-        return ("friction",)
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         wheels, _ = treads(plant)
@@ -238,17 +226,17 @@ class FrictionMismatch(WheelMismatch):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         if not self.spread(plant).any():
             return Uncertainty()
-        return left_out(self, plant, "the dynamics that plans are made with have no friction")
+        return left_out(self, plant, "the dynamics of plans have no friction")
 
 
 def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertainty:
-    """Of what multiplies a parameter of the dynamics."""
+    """The unknown of a mismatch that multiplies a parameter of the dynamics."""
     nominal = abs(plant.robot.dynamics.disturbed.parameters.get(name, 1.0))
     return unknowns_of(mismatch, plant, [Unknown(name, nominal * float(mismatch.spread(plant)[0]))])
 
 
 def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | None]) -> Uncertainty:
-    """Of what multiplies the effects of actuators, one a part."""
+    """The unknowns of a mismatch that multiplies the effects of actuators, one per part."""
     controls, wanted, lost = controls_of(plant), list[Unknown](), list[str]()
     for part, actuator, std in zip(mismatch.parts(plant), actuators, mismatch.spread(plant), strict=True):
         if actuator in controls:
@@ -258,11 +246,11 @@ def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | No
     known = unknowns_of(mismatch, plant, wanted)
     if not lost:
         return known
-    return replace(known, left_out=left_out(mismatch, plant, f"no control is that of {', '.join(lost)} alone").left_out)
+    return replace(known, left_out=left_out(mismatch, plant, f"no control drives {', '.join(lost)} alone").left_out)
 
 
 def controls_of(plant: Plant) -> dict[str | None, str]:
-    """Actuator -> the control that it is proportional to, where it is the only one that follows it."""
+    """Actuator -> the control that it is proportional to, if no other actuator depends on that control."""
     names = plant.robot.dynamics.control_coordinates.names
     each = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
     none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in each)
@@ -279,7 +267,7 @@ def controls_of(plant: Plant) -> dict[str | None, str]:
 
 
 def driven_by(plant: Plant, body: int) -> str | None:
-    """The one of the robot's actuators that turns a body's joint; None if there is none, or several."""
+    """The actuator that drives the joint of a body; None if there is none, or several."""
     model = plant.model
     found = [
         name
@@ -291,15 +279,15 @@ def driven_by(plant: Plant, body: int) -> str | None:
 
 
 def cut_normal(generator: np.random.Generator) -> float:
-    """A number of the standard normal distribution that is cut there, made of a single uniform one."""
-    from scipy.special import ndtr, ndtri  # a fifth of a second, which only who draws has to wait
+    """A truncated standard normal number, from a single uniform one."""
+    from scipy.special import ndtr, ndtri  # takes a fifth of a second to import
 
     low, high = ndtr((-CUT, CUT))
     return float(ndtri(low + (high - low) * generator.random()))
 
 
 def bodies(plant: Plant) -> npt.NDArray[np.intp]:
-    """Ids of the robot's bodies: its own and those that hang on it."""
+    """Ids of the robot's bodies: its main body and those attached to it."""
     found = {plant.body}
     for body in range(plant.body + 1, plant.model.nbody):  # parents come before their children
         if plant.model.body_parentid[body] in found:
@@ -308,13 +296,14 @@ def bodies(plant: Plant) -> npt.NDArray[np.intp]:
 
 
 def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Ids of the wheels' geoms, and of the bodies that they are on."""
+    """Ids of the wheels' geoms, and of their bodies."""
     geoms = np.array([plant.model.geom(name).id for name in plant.robot.wheels], dtype=np.intp)
     return geoms, plant.model.geom_bodyid[geoms].astype(np.intp)
 
 
 def upward(plant: Plant, children: npt.NDArray[np.intp]) -> Array:
-    """The world's upward direction in the axes of each body's parent, (bodies, 3), as the model is drawn."""
+    """The world's upward direction in the axes of each body's parent, (bodies, 3), in the model's initial pose."""
+
     drawn = mujoco.MjData(plant.model)
     mujoco.mj_kinematics(plant.model, drawn)
     return drawn.xmat[plant.model.body_parentid[children]].reshape(-1, 3, 3)[:, 2]

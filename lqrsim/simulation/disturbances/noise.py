@@ -1,18 +1,21 @@
-"""White noise on controls, measurements, forces and torques; and pushes."""
+"""Gaussian disturbances: noise on controls, measurements, forces and states, wrong starts and obstacles; and pushes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from lqrsim.control.uncertainty import Uncertainty, Unknown
-from lqrsim.errors import InputError, check_array, check_number
+from lqrsim.errors import Array, InputError, check_array, check_items, check_number
+from lqrsim.problem.noise import Noise
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
     GaussianDisturbance,
-    Numbers,
+    check_strength,
     fit,
     left_out,
     normal,
@@ -24,89 +27,235 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-class ControlNoise(GaussianDisturbance):
+class StateError(GaussianDisturbance):
+    """Base class of Gaussian errors of the states."""
+
+    what: ClassVar[str]
+
+    def coordinates(self, plant: Plant) -> Coordinates:
+        """What the error is added to."""
+        return plant.robot.dynamics.state_coordinates
+
+    def describe(self, plant: Plant) -> str:
+        return f"{self.what}, std {with_units(self, self.std, self.coordinates(plant))}"
+
+    def deviations(self, plant: Plant) -> Array:
+        """One standard deviation for each coordinate."""
+        return fit(self, self.std, self.coordinates(plant).names)
+
+    def std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
+        """The standard deviations as an Uncertainty has them: 0 for none."""
+        std = self.deviations(plant)
+        return tuple(std.tolist()) if std.any() else 0.0
+
+
+class ControlNoise(StateError):
     """White noise on each control, redrawn each control period.
 
     Args:
-      std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, or one a control.
+      std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, or one per control.
     """
 
-    def describe(self, plant: Plant) -> str:
-        return f"control noise, std {with_units(self, self.std, plant.robot.dynamics.control_coordinates)}"
+    what = "control noise"
+
+    def coordinates(self, plant: Plant) -> Coordinates:
+        return plant.robot.dynamics.control_coordinates
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
+        std = self.deviations(plant)
         noise = std * normal(generators, plan.steps, len(std))
         return Effect(actuate=lambda step, controls: controls + noise[:, step])
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        std = fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
-        return Uncertainty(control=tuple(std.tolist()) if std.any() else 0.0)
+        return Uncertainty(control=self.std_for_filters(plant))
 
 
-class MeasurementNoise(GaussianDisturbance):
-    """White noise on each state that the policy is shown.
+class MeasurementNoise(StateError):
+    """White noise on each measured state.
 
     Args:
-      std: standard deviation in the state's unit; one number, or one a state.
+      std: standard deviation in the state's unit; one number, or one per state.
     """
 
-    def describe(self, plant: Plant) -> str:
-        return f"measurement noise, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
+    what = "measurement noise"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
+        std = self.deviations(plant)
         noise = std * normal(generators, plan.steps + 1, len(std))
         return Effect(measure=lambda step, states: states + noise[:, step])
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
-        return Uncertainty(measurement=tuple(std.tolist()) if std.any() else 0.0)
+        return Uncertainty(measurement=self.std_for_filters(plant))
 
 
-class ForceNoise(GaussianDisturbance):
+class MeasurementBias(StateError):
+    """A constant error of each measured state, drawn for each trial from a normal distribution.
+
+    Args:
+      std: standard deviation in the state's unit; one number, or one per state.
+    """
+
+    what = "measurement bias"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        std = self.deviations(plant)
+        bias = std * normal(generators, 1, len(std))[:, 0]
+        return Effect(measure=lambda step, states: states + bias)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if not np.any(self.std):
+            return Uncertainty()
+        return left_out(self, plant, "measurements cannot distinguish it from the state")
+
+
+class InitialStateError(StateError):
+    """The robot does not begin in the first state of the plan.
+
+    Args:
+      std: standard deviation in the state's unit; one number, or one per state.
+    """
+
+    what = "initial state off"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        std = self.deviations(plant)
+        error = std * normal(generators, 1, len(std))[:, 0]
+        return Effect(initial_states=lambda states: states + error)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(start=self.std_for_filters(plant))
+
+
+class WrenchNoise(GaussianDisturbance):
+    """Base class of random forces and torques, redrawn each control period and held over it."""
+
+    along = "xyz"
+    kind: ClassVar[Literal["force", "torque"]]
+    unit: ClassVar[str]
+
+    def describe(self, plant: Plant) -> str:
+        return f"{self.kind} noise, std {words(self.std)} {self.unit}"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        vectors = fit(self, self.std, self.along) * normal(generators, plan.steps, 3)
+
+        def push(step: int, states: Array) -> Array:
+            return vectors[:, step]
+
+        return Effect(force=push) if self.kind == "force" else Effect(torque=push)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        axes = zip(self.along, fit(self, self.std, self.along).tolist(), strict=True)
+        return unknowns_of(self, plant, [Unknown(f"{self.kind}_{axis}", std, time_constant=0.0) for axis, std in axes])
+
+
+class ForceNoise(WrenchNoise):
     """A random force at the robot's centre of mass, redrawn each control period and held over it.
 
     Args:
       std: standard deviation in N; one number, or three along the world's axes.
     """
 
-    along = "xyz"
-
-    def describe(self, plant: Plant) -> str:
-        return f"force noise, std {words(self.std)} N"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        forces = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
-        return Effect(force=lambda step, states: forces[:, step])
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return unknowns_of(self, plant, drawn_anew("force", self.std))
+    kind, unit = "force", "N"
 
 
-class TorqueNoise(GaussianDisturbance):
+class TorqueNoise(WrenchNoise):
     """A random torque on the robot, redrawn each control period and held over it.
 
     Args:
       std: standard deviation in N m; one number, or three about the world's axes.
     """
 
+    kind, unit = "torque", "N m"
+
+
+class DisplacedObstacles(GaussianDisturbance):
+    """Obstacles are displaced from where the plan has them. Planes stay, and heights for a robot seen from above.
+
+    Args:
+      std: standard deviation in m; one number, or three along the world's axes.
+    """
+
     along = "xyz"
 
     def describe(self, plant: Plant) -> str:
-        return f"torque noise, std {words(self.std)} N m"
+        return f"obstacles displaced, std {words(self.std)} m"
+
+    def check(self, plant: Plant) -> None:
+        if not any(obstacle.kind != "plane" for obstacle in plant.world.obstacles):
+            raise InputError(
+                f"DisplacedObstacles: got scene {plant.scene.name}, where robot {plant.robot.name} has no obstacles but"
+                " planes, want one with other obstacles"
+            )
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        torques = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
-        return Effect(torque=lambda step, states: torques[:, step])
+        self.check(plant)
+        displaced = fit(self, self.std, self.along) * normal(generators, len(plant.world), 3)
+        displaced[:, [obstacle.kind == "plane" for obstacle in plant.world.obstacles]] = 0.0
+        if plant.robot.dynamics.state_coordinates.from_above:
+            displaced[..., 2] = 0.0
+        return Effect(displaced=displaced)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return unknowns_of(self, plant, drawn_anew("torque", self.std))
+        """One standard deviation for all axes: the root mean square of those that matter.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `obstacles`.
+        """
+        axes = 2 if plant.robot.dynamics.state_coordinates.from_above else 3
+        return Uncertainty(obstacles=float(np.sqrt(np.mean(fit(self, self.std, self.along)[:axes] ** 2))))
+
+
+@dataclass(frozen=True)
+class StateNoise(Disturbance):
+    """The noise of a problem, `lqrsim.Noise`: the state jumps by M(x, u) w at the end of each control period.
+
+    w is drawn anew each time; x is the state at the beginning of the period, u what the actuators got.
+
+    Args:
+      noise: with the matrix M.
+    """
+
+    noise: Noise
+
+    def describe(self, plant: Plant) -> str:
+        return f"noise on the states, {self.noise!r}"
+
+    def scaled(self, strength: float) -> "StateNoise":
+        return StateNoise(self.noise.scaled(check_strength(self, strength)))
+
+    def check(self, plant: Plant) -> None:
+        self.noise.bind(plant.robot.dynamics)
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        draws = normal(generators, plan.steps, self.noise.size)
+
+        def kick(step: int, states: Array, controls: Array) -> Array:
+            matrices = self.noise.matrices(plant.robot.dynamics, states, controls)
+            return sum(  # in an order that does not depend on the number of trials
+                (matrices[:, :, k] * draws[:, step, k, None] for k in range(1, self.noise.size)),
+                start=matrices[:, :, 0] * draws[:, step, 0, None],
+            )
+
+        return Effect(kick=kick)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return left_out(self, plant, "filters and tubes have no noise that acts on the states directly")
+
+
+def as_disturbances(given: object, wanted: str) -> tuple[Disturbance, ...]:
+    """Disturbances, with each `Noise` among them as StateNoise. Raises InputError for anything else."""
+    items = check_items("disturbances", given, (Disturbance, Noise), wanted)
+    return tuple(StateNoise(one) if isinstance(one, Noise) else one for one in items)
 
 
 @dataclass(frozen=True)
 class Push(Disturbance):
-    """One push at the robot's centre of mass, spread over the control period in which it comes.
+    """A single push at the robot's centre of mass, spread over the control period in which it comes.
 
     Args:
       impulse: in N s along the world's axes, (3,).
@@ -135,12 +284,4 @@ class Push(Disturbance):
         return Effect(force=lambda step, states: np.broadcast_to(forces[step], (len(states), 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "it comes once, and no noise does") if any(self.impulse) else Uncertainty()
-
-
-def drawn_anew(what: str, std: Numbers) -> list[Unknown]:
-    """White noise along the world's axes, of which std is one number or three."""
-    return [
-        Unknown(f"{what}_{axis}", float(one), time_constant=0.0)
-        for axis, one in zip("xyz", np.broadcast_to(np.asarray(std, dtype=np.float64), 3), strict=True)
-    ]
+        return left_out(self, plant, "it comes once, and noise does not") if any(self.impulse) else Uncertainty()

@@ -1,10 +1,11 @@
-"""Named sets of disturbances, from calm to severe, of those that a plant can have."""
+"""Presets: named sets of disturbances, from calm to severe, as far as a plant can have them."""
 
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name
 from lqrsim.simulation.disturbances.actuation import MotorLag
 from lqrsim.simulation.disturbances.base import Disturbance
+from lqrsim.simulation.disturbances.links import CommandDropouts, MeasurementDropouts
 from lqrsim.simulation.disturbances.mismatch import (
     AxleMismatch,
     FrictionMismatch,
@@ -13,37 +14,41 @@ from lqrsim.simulation.disturbances.mismatch import (
     ThrustMismatch,
     WheelRadiusMismatch,
 )
-from lqrsim.simulation.disturbances.noise import ControlNoise, ForceNoise, MeasurementNoise
-from lqrsim.simulation.disturbances.sensing import CommandDropouts, MeasurementDropouts
-from lqrsim.simulation.disturbances.surroundings import DisplacedObstacles, InitialStateError
+from lqrsim.simulation.disturbances.noise import (
+    ControlNoise,
+    DisplacedObstacles,
+    ForceNoise,
+    InitialStateError,
+    MeasurementNoise,
+)
 from lqrsim.simulation.disturbances.wind import Dryden
 from lqrsim.simulation.plant import Plant
 
-# Strengths, of which light is 1: as MIL-F-8785C has light, moderate and severe turbulence, 15, 30 and 45 knots.
+# Strengths relative to light; as in MIL-F-8785C, with 15, 30 and 45 knots for light, moderate and severe turbulence.
 PRESETS = {"calm": 0.5, "light": 1.0, "moderate": 2.0, "strong": 2.5, "severe": 3.0}
 
-# What a state of each unit is measured to: RotorPy's 5e-4 m, 5e-3 m/s, 5e-4 rad, 5e-4 rad/s per root of Hz, at 100 Hz.
+# Measurement noise by unit: RotorPy's 5e-4 m, 5e-3 m/s, 5e-4 rad, 5e-4 rad/s per square root of Hz, at 100 Hz.
 MEASURED = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
-# How far off a run begins: our choice, of the order of a careful placement by hand.
+# Error of the start by unit: our choice, the order of a careful placement by hand.
 PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 
 
 def preset(name: str, plant: Plant) -> list[Disturbance]:
-    """The set of that name: `PRESETS` has them. All of them can be twice as strong.
+    """Return a preset: disturbances that the plant can have, in a named strength. Each can be scaled by 2.
 
-    Not in it is what no strength can be given to without knowing the robot or the plan: latency and delay, which come
-    in whole control periods, while motion capture's 6 to 7 ms are less than half of one; a push, of which it matters
-    when it comes and from where; and the loss of an actuator, which a quadrotor does not survive.
+    Left out are disturbances whose strength depends on the robot or the plan: latency and delay, which come in whole
+    control periods, while the 6 to 7 ms of motion capture are less than half of one; pushes, whose time and direction
+    matter; and the loss of an actuator, which a quadrotor does not survive.
 
     Args:
       name: calm, light, moderate, strong or severe.
-      plant: which decides what disturbances it can have.
+      plant: that the disturbances act on.
 
     Returns:
       The disturbances, in the order in which they act.
 
     Raises:
-      InputError: there is none of that name.
+      InputError: there is no such preset.
     """
     check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     strength = PRESETS[check_name("preset", name, PRESETS)]
@@ -51,18 +56,18 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
 
 
 def _light(plant: Plant) -> list[Disturbance]:
-    """All, at strength 1, in the order in which they happen."""
+    """All disturbances at strength 1, in the order in which they act."""
     space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
     ranges = np.subtract(controls.high, controls.low)
     weight = float(plant.model.body_subtreemass[plant.body] * np.linalg.norm(plant.model.opt.gravity))
     return [
         InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
-        DisplacedObstacles(0.01),  # our choice: as a map is drawn
+        DisplacedObstacles(0.01),  # our choice: the accuracy of a map
         MassMismatch(0.02),  # our choice: a battery, a camera
         InertiaMismatch(0.1 / 3),  # +-10 % in all, SkyJEPA's data card
         ThrustMismatch(0.12 / 3),  # +-12 % in all, SkyJEPA's data card
         WheelRadiusMismatch(0.005),  # our choice: 0.2 mm of a wheel of the Create
-        AxleMismatch(0.01),  # our choice: where a tread touches the floor is not known better
+        AxleMismatch(0.01),  # our choice: accuracy of the contact points of the wheels
         FrictionMismatch(0.05),  # our choice: severe is +-45 % in all
         MeasurementNoise([MEASURED.get(unit, 0.0) for unit in space.units]),
         MeasurementDropouts(0.01),  # our choice

@@ -1,4 +1,4 @@
-"""Wind: constant, in gusts, or Dryden's turbulence. It acts through the robot's linear drag: F = drag * wind."""
+"""Constant wind, gusts, and Dryden turbulence. They act through the robot's linear drag: F = drag * wind."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,17 +24,17 @@ from lqrsim.simulation.plant import Plant
 FOOT = 0.3048  # m
 KNOT = 1852 / 3600  # m/s
 SEVERITIES = {"light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KNOT}  # m/s at 20 ft, MIL-F-8785C
-ROUGHNESS = 0.15  # ft, of the ground in MIL-F-8785C's mean wind near landing
+ROUGHNESS = 0.15  # ft, roughness length of the ground in MIL-F-8785C's mean wind near landing
 
 
 class Wind(Disturbance):
-    """What all winds share: they need a robot that the air drags along."""
+    """Base class of winds, which need a robot with drag."""
 
     def check(self, plant: Plant) -> None:
         if not plant.robot.drag > 0:
             raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag that wind could act through,"
-                " want one with a `drag` in N s/m"
+                f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag for wind to act through, want"
+                " one with a `drag` in N s/m"
             )
 
     def blow(self, plant: Plant, wind: Array) -> Effect:
@@ -67,7 +67,7 @@ class MeanWind(Wind):
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """A constant of mean zero whose standard deviation is this wind, as if it could also blow the other way.
+        """An unknown constant of mean zero whose standard deviation is this wind, as if the direction were unknown.
 
         Args:
           plant: as in `uncertainty_of`.
@@ -115,9 +115,9 @@ class Gusts(Wind):
 
 @dataclass(frozen=True)
 class Dryden(Wind):
-    """Dryden's turbulence near the ground, without its mean wind (MIL-F-8785C, below 1000 ft).
+    """Dryden turbulence near the ground, without its mean wind (MIL-F-8785C, below 1000 ft).
 
-    The robot is taken to be slow against the wind: the turbulence drifts by with the mean wind at its altitude.
+    The robot is assumed to be slow relative to the wind: the turbulence passes with the mean wind at its altitude.
 
     Args:
       wind: mean wind at 20 ft in m/s, or "light", "moderate" or "severe": 15, 30 or 45 knots.
@@ -140,7 +140,7 @@ class Dryden(Wind):
 
     @property
     def wind_at_20_ft(self) -> float:
-        """In m/s."""
+        """Mean wind at 20 ft in m/s."""
         return SEVERITIES[self.wind] if isinstance(self.wind, str) else self.wind
 
     @property
@@ -150,14 +150,14 @@ class Dryden(Wind):
 
     @property
     def std(self) -> tuple[float, float, float]:
-        """Of the turbulence along the mean wind, across it and upward, in m/s."""
+        """Standard deviations along the mean wind, across it and upward, in m/s."""
         upward = 0.1 * self.wind_at_20_ft
         level = upward / (0.177 + 0.000823 * self._feet) ** 0.4
         return level, level, upward
 
     @property
     def lengths(self) -> tuple[float, float, float]:
-        """Scales of the turbulence along the mean wind, across it and upward, in m."""
+        """Length scales along the mean wind, across it and upward, in m."""
         level = self._feet / (0.177 + 0.000823 * self._feet) ** 1.2
         return level * FOOT, level * FOOT, self._feet * FOOT
 
@@ -187,7 +187,7 @@ class Dryden(Wind):
             return Uncertainty()
         constants = np.array(self.lengths) / self.airspeed
         cosine, sine = np.cos(self.direction), np.sin(self.direction)
-        # The cosine of a right angle is no zero, but a rounding error.
+        # The cosine of a right angle is a rounding error instead of zero.
         along, across = (
             {name: float(share) for name, share in zip(("wind_x", "wind_y"), shares, strict=True) if abs(share) > 1e-12}
             for shares in ((cosine, sine), (-sine, cosine))
@@ -198,7 +198,7 @@ class Dryden(Wind):
 
 
 def first_order(noise: Array, step: float) -> Array:
-    """White noise (K, T, d) through 1 / (1 + s), a step being so many time constants; stationary, of variance 1."""
+    """White noise (K, T, d) through 1 / (1 + s), stationary with variance 1; `step` is in time constants."""
     values, keep = np.empty_like(noise), np.exp(-step)
     fresh = np.sqrt(-np.expm1(-2 * step))
     values[:, 0] = noise[:, 0]
@@ -208,13 +208,14 @@ def first_order(noise: Array, step: float) -> Array:
 
 
 def second_order(noise: Array, step: float) -> Array:
-    """White noise (K, T, 2) through (1 + sqrt(3) s) / (1 + s)^2: (K, T), stationary, of variance 1.
+    """White noise (K, T, 2) through (1 + sqrt(3) s) / (1 + s)^2: (K, T), stationary with variance 1.
 
-    The state is p with p'' + 2 p' + p = 2 w, and p': of variance 1 each when stationary, and uncorrelated.
+    The state is p with p'' + 2 p' + p = 2 w, and p'. Both have variance 1 in the stationary state, uncorrelated.
     """
     decay = np.exp(-step)
     a, b, c, d = decay * (1 + step), decay * step, -decay * step, decay * (1 - step)
-    # What is new in a step has the covariance that keeps the stationary one: I - F F'.
+    # The noise of a step has the covariance that preserves the stationary one, I: I - F F'.
+
     covariance = np.eye(2) - np.array([[a * a + b * b, a * c + b * d], [a * c + b * d, c * c + d * d]])
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 0.0))

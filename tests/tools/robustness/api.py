@@ -40,7 +40,7 @@ FAILURES = ("raw", "hang", "death")
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of one call; `what` says how it was called, `why` what it raised and where."""
+    """Result of one call; `what` is how it was called, `why` what it raised and where."""
 
     number: int
     subject: str
@@ -102,7 +102,7 @@ class Caller:
 
 
 def exercise(made: Any) -> None:
-    """Ask what was made for all that it has: properties, and methods without arguments."""
+    """Read all properties of a result, and call its methods without arguments."""
     # Results and paths do things to files when asked.
     if type(made).__module__.partition(".")[0] != "lqrsim" or isinstance(made, (ls.stress.Results, Path)):
         if inspect.isgenerator(made):
@@ -144,7 +144,7 @@ def where(error: BaseException) -> str:
 
 
 def work(connection: Any, seed: int, only: str, numbers: range) -> None:
-    """The process that makes the calls: says which it begins, and what came of it."""
+    """The process that makes the calls: reports the number of each before it starts, and its verdict."""
     import resource
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -161,7 +161,7 @@ def work(connection: Any, seed: int, only: str, numbers: range) -> None:
 
 
 def calls(count: int, *, seed: int = 0, only: str = "", first: int = 0) -> Iterator[Verdict]:
-    """So many hostile calls, one after the other, in a process that is begun anew where it dies."""
+    """Verdicts of hostile calls, made in a process that is restarted if it dies."""
     context, number = multiprocessing.get_context("spawn"), first
     while number < first + count:
         here, there = context.Pipe()

@@ -1,4 +1,4 @@
-"""What the sections share: what they are told, and a limit of time."""
+"""Settings of the sections, and a time limit."""
 
 import contextlib
 import signal
@@ -33,7 +33,7 @@ class Config(Settings):
 
 
 class Hang(BaseException):
-    """What is tried took too long."""
+    """A call or a file took too long."""
 
 
 @contextlib.contextmanager

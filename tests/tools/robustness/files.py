@@ -47,7 +47,7 @@ PERIODS = 20_000  # physics steps of a run that is tried
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of one file: `what` says how it was spoilt, `why` what was raised."""
+    """Result of one file: `what` is how it was spoilt, `why` what was raised."""
 
     number: int
     subject: str
@@ -127,7 +127,7 @@ class Spoiler:
         return what, data, sealed
 
     def judge(self, number: int, subject: str, what: str, path: Path, *, sealed: bool) -> Verdict:
-        """What comes of a file that takes the place of a saved one."""
+        """The verdict on a file that replaces a saved one."""
         saved, what = self.saved[subject], f"{what}{', sealed' if sealed else ''}"
         begun, had, why = time.process_time(), most_memory(), ""
         try:
@@ -183,7 +183,7 @@ class Spoiler:
         return Verdict(number, "campaign", kind, what, why)
 
     def use(self, solution: ls.Solution) -> None:
-        """What people do with a solution."""
+        """Use a solution as people do."""
         print(solution, file=_Nowhere())
         solution.policy(np.zeros(3), 0.1)
         solution.open_loop()
@@ -194,7 +194,7 @@ class Spoiler:
 
 
 def use_rollout(rollout: ls.Rollout) -> None:
-    """What people do with a rollout, but for drawing it."""
+    """Use a rollout as people do, except for drawing it."""
     print(rollout, rollout.outcome, rollout.saturated.mean(), file=_Nowhere())
     recorded = RecordedTrial(rollout, 0)
     for look in (recorded.driven, recorded.planned, recorded.force_at, recorded.ending):
@@ -203,7 +203,7 @@ def use_rollout(rollout: ls.Rollout) -> None:
 
 
 def originals() -> dict[str, ls.Solution | ls.Rollout]:
-    """Solutions that have between them all that one can have, and a rollout."""
+    """Solutions that together have every optional part, and a rollout."""
     scenario = ls.scenarios.differential_drive()
     clear = ls.Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=0.16)
     found = ls.smooth(scenario.problem)
@@ -223,7 +223,7 @@ def originals() -> dict[str, ls.Solution | ls.Rollout]:
 
 
 def campaign(folder: Path) -> Path:
-    """A small one."""
+    """A small campaign."""
     asked = Campaign(
         scenario="differential_drive",
         sweeps={"gusts": (ls.disturbances.ForceNoise(0.2), ls.disturbances.ControlNoise(0.01))},
@@ -236,7 +236,7 @@ def campaign(folder: Path) -> Path:
 
 
 def everything(results: Results) -> Any:
-    """All that a campaign says of its trials."""
+    """All tables of a campaign."""
     results.summary()
     policies = [results.solution(policy) for policy in results.manifest["policies"]]
     return tuple(results.cells), tuple(results.outcomes(cell) for cell in results.cells), tuple(policies)

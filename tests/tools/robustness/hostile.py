@@ -1,4 +1,4 @@
-"""What arguments are replaced by: other kinds, other shapes, extremes, what is nested, and objects that bite."""
+"""Values that replace arguments: other types, other shapes, extremes, nested values, and objects that raise."""
 
 import contextlib
 import dataclasses
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Deliberate(Exception):
-    """What a user's own function raises, which may come through as it is."""
+    """An exception of a user's own function, which may come through as it is."""
 
 
 class DeliberateValue(Deliberate, ValueError):
@@ -42,7 +42,7 @@ class Text(str):
 
 
 class Unequal:
-    """Something that compares as nothing else does."""
+    """An object whose comparison raises."""
 
     def __eq__(self, other: object) -> Any:
         raise RuntimeError("no")
@@ -51,7 +51,7 @@ class Unequal:
 
 
 class Kind:
-    """A class, and no object of it."""
+    """A class in place of an object."""
 
 
 def endless() -> Any:
@@ -76,7 +76,7 @@ def failing(*_: object, **__: object) -> Any:
 
 
 def answering(answer: Any) -> Callable[..., Any]:
-    """A function that returns that, whatever it is asked."""
+    """A function that returns this value for all arguments."""
 
     def function(*_: object, **__: object) -> Any:
         return answer

@@ -81,8 +81,8 @@ def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
         "check_funnel": ({"funnel": funnel} | common | check, 0.3),
         "FunnelCheck": ({"knot": 0, "level": 1.0, "reached": None, "successes": np.ones(2, dtype=bool)},),
         "smooth_safest": (chosen, 0.1),
-        "SafestPlan": ({"solution": safest.solution, "ways": safest.ways, "reached": safest.reached},),
-        "Way": (safest.ways[0]._asdict(),),
+        "SafestPlan": ({"solution": safest.solution, "compared": safest.compared, "reached": safest.reached},),
+        "ComparedPlan": (safest.compared[0]._asdict(),),
         "plot_funnel": (
             {"funnel": funnel, "path": place.folder / "funnel.png", "world": place.plant.world, "radius": 0.1},
             0.3,

@@ -163,7 +163,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     asked = {
         "scenario": reference, "sweeps": {"noise": (ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
         "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "goal_radius": 0.1,
-        "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "stated": None,
+        "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "design_disturbances": None,
     }  # fmt: skip
     campaign = ls.stress.Campaign(**asked)
     results = ls.stress.run_campaign(campaign, place.folder / "campaign", workers=0)
@@ -213,9 +213,9 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "TrialScore": ({field: getattr(score, field) for field in fields}, 0.5),
         "TrialScore.__call__": ({"self": score, "numbers": np.zeros((2, score.size))},),
         "TrialScore.rollout": ({"self": score, "numbers": np.zeros((2, score.size)), "frames": False},),
-        "collision": ({"rollout": place.rollout},),
-        "miss": ({"rollout": place.rollout},),
-        "split": (searching | {
+        "collision_score": ({"rollout": place.rollout},),
+        "miss_score": ({"rollout": place.rollout},),
+        "failure_probability": (searching | {
             "particles": 20, "keep": 0.25, "moves": 1, "repetitions": 2, "confidence": 0.9, "most_levels": 5,
             "level": print_nothing, "progress": print_nothing,
         },),
@@ -225,7 +225,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "ReliabilityProblem": ({
             "scenario": reference, "sweep": "light", "strength": 1.0, "policy": "smooth", "failure": "miss",
-            "goal_radius": 0.1, "goal_tolerance": None, "stated": None, "solution": None,
+            "goal_radius": 0.1, "goal_tolerance": None, "design_disturbances": None, "solution": None,
         },),
         **{
             f"ReliabilityProblem.{name}": ({

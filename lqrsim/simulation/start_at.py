@@ -1,8 +1,7 @@
-"""Runs that begin at a knot of the plan, in states that somebody chose: the rest of a run that went as planned so far.
+"""Runs that begin at a knot of the plan in given states: the rest of a run that followed the plan until then.
 
-What has a memory is led there: disturbances and controller are shown the plan, period by period, before the run begins.
-So a delay has its past, a filter its estimate, and what happens at a time happens at that time. The physics begins at
-the knot.
+Before the run begins, disturbances and controller are called with the plan, period by period, so that a delay has its
+past, a filter its estimate, and what happens at a given time happens at that time. The physics begins at the knot.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +18,7 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.disturbances import Disturbance, Effect, as_disturbances
 from lqrsim.simulation.plant import Plant
 
 
@@ -34,31 +32,34 @@ def simulate_from(
     controller: ControllerLike | None = None,
     **options: Any,
 ) -> Rollout:
-    """One trial of what is left of a plan after `knot` periods from each of the states (K, n).
+    """Run the rest of a plan after `knot` periods, one trial from each of the states (K, n).
 
-    What an `InitialStateError` draws is replaced by the states. Until the knot the run is taken to have been as
-    planned, and measured so.
+    Until the knot the run is taken to have followed the plan, with measurements of the plan.
 
     Args:
-      options: the other ones of `simulate`, but for `trials`. Times of the rollout count from the knot.
+      plant, plan, controller: as in `simulate`.
+      states: (K, n), where the trials begin.
+      knot: number of the knot.
+      disturbances: as in `simulate`, without those that change the start, such as `InitialStateError`.
+      options: other options of `simulate`, except `trials`. Times of the rollout count from the knot.
 
     Raises:
-      InputError: as `simulate`; or the knot is not one before the plan's end.
+      InputError: as `simulate`; a disturbance changes the start; or the knot is not before the plan's end.
     """
     check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     law, plan = as_controller(controller, plan, plant.robot.dynamics)
     whole = plan.trajectory
     if check_count("knot", knot, at_least=0) >= whole.steps:
         raise InputError(f"knot: got {knot}, want one from 0 to {whole.steps - 1}, before the plan's end")
-    begun = check_array("states", states, (None, whole.states.shape[1]))
+    starts = check_array("states", states, (None, whole.states.shape[1]))
     given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
-    wrong: list[Disturbance] = [_Later(one, whole, knot) for one in given]
+    later: list[Disturbance] = [_Later(one, whole, knot) for one in given]
     rollout = simulate(
         plant,
         plan.shifted(knot, horizon="shrinking"),
-        disturbances=[*wrong, _Begin(begun)],
+        disturbances=[*later, _Start(starts)],
         controller=_LaterController(law, whole, knot) if knot else law,
-        trials=len(begun),
+        trials=len(starts),
         **options,
     )
     run = rollout.controller_run
@@ -66,13 +67,13 @@ def simulate_from(
 
 
 @dataclass(frozen=True, eq=False)
-class _Begin(Disturbance):
-    """Puts the trials where they are to begin."""
+class _Start(Disturbance):
+    """Puts the trials into their first states."""
 
     states: Array
 
     def describe(self, plant: Plant) -> str:
-        return "begun off the plan"
+        return "given first states"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         return Effect(initial_states=lambda planned: self.states)
@@ -91,22 +92,32 @@ class _Later(Disturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         effect = self.of.start(plant, self.plan, generators)
-        if self.knot == 0 or not isinstance(effect, Effect):  # which is refused where it is looked at
+        if not isinstance(effect, Effect):  # `simulate` refuses it
             return effect
-        states, controls = self.plan.states, self.plan.controls
-        shown: dict[str, tuple[Array, ...]] = {  # in the order of a control period
+        states, controls, trials = self.plan.states, self.plan.controls, len(generators)
+        if effect.initial_states is not None:
+            planned = np.tile(states[0], (trials, 1))
+            if not np.array_equal(effect.initial_states(planned.copy()), planned):
+                raise InputError(
+                    f"disturbances: got {type(self.of).__name__}, which changes the start of a run, want others: the"
+                    " runs begin in given states"
+                )
+            effect = replace(effect, initial_states=None)
+        if self.knot == 0:
+            return effect
+        past: dict[str, tuple[Array, ...]] = {  # in the order of a control period
             "measure": (states,), "actuate": (controls,), "force": (states,), "torque": (states,),
             "kick": (states, controls),
         }  # fmt: skip
-        hooks = {name: hook for name in shown if (hook := getattr(effect, name)) is not None}
+        hooks = {name: hook for name in past if (hook := getattr(effect, name)) is not None}
         led = [False]
 
         def lead() -> None:
-            """Once the models are altered, and before anything else: what was until the knot."""
+            """Call the hooks with the plan until the knot: once, after the models have been altered."""
             led[0] = True
             for step in range(self.knot):
                 for name, hook in hooks.items():
-                    hook(step, *(np.tile(values[step], (len(generators), 1)) for values in shown[name]))
+                    hook(step, *(np.tile(values[step], (trials, 1)) for values in past[name]))
 
         def later(hook: Callable[..., Array]) -> Callable[..., Array]:
             def called(step: int, *values: Array) -> Array:
@@ -116,7 +127,7 @@ class _Later(Disturbance):
 
             return called
 
-        return replace(effect, initial_states=None, **{name: later(hook) for name, hook in hooks.items()})
+        return replace(effect, **{name: later(hook) for name, hook in hooks.items()})
 
 
 class _LaterController(Controller):
@@ -127,7 +138,7 @@ class _LaterController(Controller):
 
     def start(self, trials: int) -> ControllerRun:
         run = self.of.start(trials)
-        if not isinstance(self.of, Feedback):  # which remembers nothing
+        if not isinstance(self.of, Feedback):  # which has no memory
             for step in range(self.knot):
                 run.control(step, np.tile(self.whole.states[step], (trials, 1)))
         return _LaterRun(run, self.knot)

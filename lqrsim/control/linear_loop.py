@@ -1,4 +1,4 @@
-"""Mean and covariance of a closed loop about its plan, by its linear model: LQG-MP's recursion.
+"""Mean and covariance of a closed loop about its plan, by the recursion of LQG-MP.
 
 The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
 law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: of u normal with
@@ -17,7 +17,7 @@ from lqrsim.errors import Array
 
 
 class LoopMoments(NamedTuple):
-    """Of a closed loop about its plan, X as above.
+    """Moments of X about its plan.
 
     Attributes:
       mean: of X, (T+1, X).
@@ -35,11 +35,11 @@ class LoopMoments(NamedTuple):
 
 
 @dataclass
-class Loop:
-    """A closed loop about a plan, as matrices.
+class LinearLoop:
+    """A closed loop about a plan as matrices.
 
     Attributes:
-      model: what really happens. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
+      model: of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
       filter_gain: K, (T+1, Z, Y); None for a law of the states that are shown.
       low, high: limits of the controls, (m,).
     """
@@ -52,60 +52,63 @@ class Loop:
     high: Array
 
     def moments(self) -> LoopMoments:
-        """What is predicted of it, from the start to the plan's end."""
+        """Prediction from the start to the plan's end; of C laws, gain (C, T, m, Z), all at once."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
-        width = 2 * size if estimates else size
-        mean, covariance = np.zeros((steps + 1, width)), np.zeros((steps + 1, width, width))
-        across, std = np.empty((steps, n, n)), np.empty((steps, model.m))
-        saturation = np.empty((steps, model.m))
-        covariance[0, :size, :size] = model.start
+        width, many = 2 * size if estimates else size, self.gain.shape[:-3]
+        mean, covariance = np.zeros((*many, steps + 1, width)), np.zeros((*many, steps + 1, width, width))
+        across, std = np.empty((*many, steps, n, n)), np.empty((*many, steps, model.m))
+        saturation = np.empty((*many, steps, model.m))
+        covariance[..., 0, :size, :size] = model.start_root @ model.start_root.T
         for t in range(steps):
             seen, noise = self._seen(t)
-            law = self.gain[t] @ seen  # of X
-            spread = law @ covariance[t] @ law.T + self.gain[t] @ noise @ self.gain[t].T
-            std[t] = np.sqrt(np.maximum(spread.diagonal(), 0.0))
-            centre = model.plan.controls[t] + self.offset[t] + law @ mean[t]
-            slope, level, left = limited(centre, std[t], self.low, self.high)
-            saturation[t] = 1 - slope
-            F, G = model.F[t], model.G[t]
-            onto = np.concatenate([G, G]) if estimates else G
-            M = np.zeros((width, width))
-            M[:size, :size] = F
+            gain, planned, P = self.gain[..., t, :, :], model.plan.controls[t], covariance[..., t, :, :]
+            law = gain @ seen  # of X
+            response = law @ P
+            spread = (response * law).sum(axis=-1) + (gain @ noise * gain).sum(axis=-1)
+            std[..., t, :] = np.sqrt(np.maximum(spread, 0.0))
+            answer = (law @ mean[..., t, :, None])[..., 0]
+            slope, level, left = limited(planned + self.offset[..., t, :] + answer, std[..., t, :], self.low, self.high)
+            saturation[..., t, :] = 1 - slope
+            F = model.F[t]
+            free, onto = self._without_control(t, seen)
+            moved = free @ P + onto @ (slope[..., None] * response)
+            to_noise = onto @ (slope[..., None] * gain)
             if estimates:
-                M[size:] = F @ seen
-            M += onto @ (slope[:, None] * law)
-            to_noise = onto @ (slope[:, None] * self.gain[t])
-            if estimates:
-                to_noise[size:] += F
-            fresh = to_noise @ noise @ to_noise.T + (onto * left) @ onto.T
-            fresh[:size, :size] += model.process_noise[t]
-            moved = M @ covariance[t]
-            across[t] = moved[:n, :n]
-            covariance[t + 1] = moved @ M.T + fresh
-            covariance[t + 1] = 0.5 * (covariance[t + 1] + covariance[t + 1].T)
-            mean[t + 1] = M @ mean[t] + onto @ (level - model.plan.controls[t] - slope * (law @ mean[t]))
-            mean[t + 1, :size] += model.c[t]
-            if estimates:
-                mean[t + 1, size:] += model.c[t]
+                to_noise[..., size:, :] += F
+            ahead = moved @ free.T + moved @ np.swapaxes(slope[..., None] * law, -1, -2) @ onto.T
+            ahead += to_noise @ noise @ np.swapaxes(to_noise, -1, -2) + (onto * left[..., None, :]) @ onto.T
+            ahead[..., :size, :size] += model.process_noise[t]
+            across[..., t, :, :] = moved[..., :n, :n]
+            covariance[..., t + 1, :, :] = 0.5 * (ahead + np.swapaxes(ahead, -1, -2))
+            drift = np.tile(model.c[t], width // size)
+            mean[..., t + 1, :] = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
         return LoopMoments(mean, covariance, across, std, saturation)
 
+    def _without_control(self, t: int, seen: Array) -> tuple[Array, Array]:
+        """Transition of X without control deviations, and their input matrix, (X, X) and (X, m)."""
+        F, G = self.model.F[t], self.model.G[t]
+        if self.filter_gain is None:
+            return F, G
+        return np.vstack([F @ np.eye(len(F), 2 * len(F)), F @ seen]), np.vstack([G, G])
+
     def _seen(self, t: int) -> tuple[Array, Array]:
-        """What the law is told, as a matrix times X, and the covariance of the noise on that."""
+        """Input of the law as a matrix times X, and the covariance of its noise."""
         model, n, size = self.model, self.model.n, self.model.size
         if self.filter_gain is None:
-            return np.eye(n, size), np.diag(model.shown_noise)
+            return np.eye(n, size), np.diag(model.shown_std**2)
         received = 1 - model.uncertainty.loss
         K = received * self.filter_gain[t]
         seen = np.zeros((size, 2 * size))
         seen[:, size:] = np.eye(size)
         seen[:, :n] += K @ model.H[t]
         seen[:, size : size + n] -= K @ model.H[t]
-        return seen, K @ model.measurement_noise[t] @ K.T / max(received, 1e-12)
+        noise = K @ model.measurement_root[t]
+        return seen, noise @ noise.T / max(received, 1e-12)
 
 
 def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Of a normal number that is cut off: mean slope, mean, and variance beyond that of the slope; all (m,)."""
+    """Mean slope, mean and remaining variance of a clipped normal number, elementwise (..., m)."""
     sigma = np.maximum(std, 1e-12)
     a, b = (low - centre) / sigma, (high - centre) / sigma
     inside = ndtr(b) - ndtr(a)

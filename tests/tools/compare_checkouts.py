@@ -1,8 +1,8 @@
-"""Whether two checkouts of this project compute the same: for a change that is not to change results.
+"""Compare the results of two checkouts of this project, for a change that should not change them.
 
-    python experiments/compare_checkouts.py ../before .        # some minutes
-    python experiments/compare_checkouts.py ../before . --quick
-    python experiments/compare_checkouts.py ../before . --tolerance 1e-10    # where rounding may differ
+    python tests/tools/compare_checkouts.py ../before .        # some minutes
+    python tests/tools/compare_checkouts.py ../before . --quick
+    python tests/tools/compare_checkouts.py ../before . --tolerance 1e-10    # where rounding may differ
 
 Each checkout computes in a process of its own, with the packages of this one and a cache of its own. Compared are the
 solutions of the paper's 100 queries of the quadrotor and of the drive, in both forms, with and without the paper's
@@ -86,7 +86,7 @@ def _apart(one: Any, other: Any) -> float:
 
 
 def _computed_by(folder: Path, place: Path, config: Config) -> dict[str, list[Any]]:
-    """What a checkout computes, in a process that imports nothing of another; its arrays are kept in a place."""
+    """Results of a checkout, computed in a process that imports it alone; arrays are saved in `place`."""
     place.mkdir()
     if not (folder / "lqrsim" / "__init__.py").is_file():
         raise SystemExit(f"checkout: got {folder}, want a folder with lqrsim/ in it")
@@ -105,7 +105,7 @@ def _computed_by(folder: Path, place: Path, config: Config) -> dict[str, list[An
 
 
 def compute(queries: int, trials: int, place: str) -> dict[str, list[Any]]:
-    """Of each kind of result one entry each; only names that `lqrsim` itself offers are used."""
+    """Results by kind, one entry per problem; uses only names that `lqrsim` itself offers."""
     scenario, drive = ls.scenarios.quadrotor, ls.scenarios.differential_drive()
     soft = [scenario(query=query).problem for query in range(queries)]
     free = [replace(problem, control_limits=(-np.inf, np.inf)) for problem in soft]
@@ -163,7 +163,7 @@ _CART_POLE = """
 
 
 def _cart_pole(angle: float) -> ls.Problem:
-    """Its pole is to swing up by that angle."""
+    """A cart-pole whose pole swings up by this angle."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cart_pole.xml"
         path.write_text(_CART_POLE, encoding="utf-8")
@@ -185,7 +185,7 @@ def _line(solution: ls.Solution, key: str, arrays: dict[str, np.ndarray]) -> dic
 
 
 def _table(columns: dict[str, np.ndarray], key: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """What is counted has to be the same; what is measured, nearly."""
+    """Counts, which must be equal, and measured columns, which may differ by rounding."""
     measured = {name: column for name, column in columns.items() if column.dtype == np.float64}
     arrays.update({f"{key}/{name}": column for name, column in measured.items()})
     what = [[name, _hash([column])] for name, column in columns.items() if name not in measured]

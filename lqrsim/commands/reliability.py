@@ -1,0 +1,214 @@
+"""Commands that examine how reliable a policy is: rare failures, the smallest failure, and funnels."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import arg
+
+from lqrsim.commands.options import Folder, PolicyOptions, optional
+
+if TYPE_CHECKING:
+    from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, SmallestFailure
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailureOptions(PolicyOptions):
+    """Options of `rare` and `break`."""
+
+    sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
+    """Disturbances, as in `lqrsim stress`. By default those of the scenario's demo."""
+    failure: Literal["collision", "miss"] = "collision"
+    """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal."""
+
+    out: Folder = None
+    """Output folder. By default runs/rare/ or runs/break/ and the name of the scenario."""
+
+    def _begin(self, command: str) -> "tuple[ReliabilityProblem, Path]":
+        """The problem, and the folder for the results. Raises InputError for a folder that cannot be written."""
+        from lqrsim.commands import console
+        from lqrsim.scenarios.references import folder_name
+        from lqrsim.stress.failure_search import ReliabilityProblem
+
+        problem = ReliabilityProblem(
+            self.scenario,
+            sweep=self.sweep,
+            strength=self.strength,
+            policy=self.policy,
+            design_disturbances=self.design_disturbances,
+            solution=self.solution,
+            failure=self.failure,
+            goal_radius=self.goal_radius,
+            goal_tolerance=self.goal_tolerance,
+        )
+        folder = self.out or Path("runs") / command / folder_name(problem.resolved)
+        console.check_output("--out", folder)
+        return problem, folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rare(FailureOptions):
+    """Estimate the probability of a rare failure.
+
+    Multilevel splitting needs far fewer trials than plain sampling: it multiplies the probabilities of levels that come
+    nearer and nearer to a failure. Prints the levels as a pilot run finds them, then the probability with its interval,
+    from independent, unbiased repetitions. Writes rollout.npz, with the worst failure and typical ones, for `lqrsim
+    render`, and rare.json, with settings and results.
+
+    Exits with 1 if no failure was found.
+    """
+
+    particles: int = 250
+    """Number of trials at each level. More of them give a shorter interval."""
+    repetitions: int = 10
+    """Number of independent repetitions; their spread gives the interval."""
+    shown: int = 8
+    """Number of failures to write."""
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim.commands import console
+        from lqrsim.errors import check_count
+        from lqrsim.stress.multilevel_splitting import NoFailure
+
+        check_count("shown", self.shown)
+        problem, folder = self._begin("rare")
+        options = {"particles": self.particles, "repetitions": self.repetitions, "seed": self.seed}
+        try:
+            with console.progress("splitting", "repetition") as progress:
+                rare = problem.rare_failures(report=console.say, progress=progress, **options)
+        except NoFailure as none:
+            return _say_none(none)
+        console.say(rare.summary())
+        failures = len(rare.splitting.failures)
+        written = min(failures, self.shown)
+        console.say(f"the worst of {failures:,} failures, as trial 0, and {written - 1} others:")
+        return _write(rare, folder, "rare.json", shown=self.shown)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Break(FailureOptions):
+    """Find the smallest disturbance that causes a failure.
+
+    It is the failure nearest to the undisturbed trial, measured over all random numbers of a trial in standard
+    deviations. Prints that distance, the first-order estimate of the failure probability, the share of each
+    disturbance, and the largest values in physical units. Writes rollout.npz, with that trial, for `lqrsim render`, and
+    break.json, with settings, results and the random numbers.
+
+    The result does fail; that nothing nearer fails is not proven. Exits with 1 if no failure was found.
+    """
+
+    rounds: int = 40
+    """Largest number of rounds; the search ends earlier if less than 1 % is left to gain."""
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim.commands import console
+        from lqrsim.stress.multilevel_splitting import NoFailure
+
+        problem, folder = self._begin("break")
+        try:
+            with console.progress("searching", "round") as progress:
+                smallest = problem.smallest_failure(
+                    rounds=self.rounds, seed=self.seed, report=console.say, progress=progress
+                )
+        except NoFailure as none:
+            return _say_none(none)
+        console.say(smallest.summary())
+        return _write(smallest, folder, "break.json")
+
+
+def _say_none(none: Exception) -> int:
+    from lqrsim.commands import console
+
+    console.say(f"no failure was found ({none})")
+    console.result(found=None, reason=str(none))
+    return 1
+
+
+def _write(found: "RareFailures | SmallestFailure", folder: Path, name: str, **options: int) -> int:
+    """Write the failures, and print where they are. The result for `--json` is the content of the file."""
+    from lqrsim.commands import console
+
+    console.say(found.save(folder, **options).summary())
+    console.wrote(folder / "rollout.npz")
+    console.wrote(folder / name)
+    console.result(**json.loads((folder / name).read_text(encoding="utf-8")))
+    return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunnelCommand(PolicyOptions):
+    """Find from how far off its plan a policy still works.
+
+    Prints, for some knots of the plan, the largest ellipsoid about it from which runs under disturbances reach the goal
+    with the wanted success rate, and the fresh trials that certify it. Writes funnel.npz, and funnel.png if the robot
+    has a position. Solves the scenario first, unless a solution is given.
+
+      lqrsim funnel quadrotor --disturbances light --rate 0.9
+      lqrsim funnel differential_drive --states x y --knots 0 50 100
+
+    Exits with 1 if there is no level at any knot.
+    """
+
+    disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ("scenario",)
+    """Sets by name, as in `lqrsim simulate`. By default those of the scenario's demo."""
+    rate: float = 0.99
+    """Wanted share of runs that reach the goal."""
+    confidence: float = 0.95
+    """Probability that all levels are right."""
+    knots: Annotated[tuple[int, ...], optional("N ...")] = ()
+    """Numbers of the knots at which runs begin. By default five, from the first on."""
+    states: Annotated[tuple[str, ...], optional("NAME ...")] = ()
+    """States that may be off the plan. By default all."""
+    failures: int = 3
+    """Failures allowed in a test. With more, there are more trials, and levels come out larger."""
+    out: Folder = None
+    """Output folder. By default runs/funnel/ and the name of the scenario."""
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim.commands import as_json, console
+        from lqrsim.results import save_load
+        from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
+        from lqrsim.scenarios.solutions import given
+        from lqrsim.simulation.disturbances import InitialStateError
+        from lqrsim.stress.funnels import funnel
+        from lqrsim.stress.policies import make_policy
+        from lqrsim.view.funnel_plot import plot_funnel
+
+        scenario = resolve(self.scenario)
+        folder = self.out or Path("runs/funnel") / folder_name(scenario)
+        console.check_output("--out", folder)
+        disturbances = []
+        for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
+            if isinstance(one, InitialStateError):
+                console.say("without the InitialStateError of the set: runs begin in states of the funnel")
+                one = one.scaled(0.0)  # keeps the other disturbances' random numbers
+            disturbances.append(one.scaled(self.strength))
+        stored = None if self.solution is None else given(scenario, self.solution)
+        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, stored)
+        with console.progress("looking", "knot") as progress:
+            found = funnel(
+                scenario.plant(),
+                solution,
+                disturbances=disturbances,
+                controller=controller,
+                rate=self.rate,
+                confidence=self.confidence,
+                knots=self.knots or None,
+                states=self.states or None,
+                failures=self.failures,
+                seed=self.seed,
+                progress=progress,
+                **scenario.near_enough(self.goal_radius, self.goal_tolerance),
+            )
+        console.say(found.summary())
+        console.result(funnel=as_json.of_funnel(found))
+        console.wrote(save_load.save(found, folder / "funnel.npz"))
+        position = scenario.problem.dynamics.state_coordinates.position
+        if position and set(position) <= set(found.chosen):
+            world, radius = scenario.scene.world, scenario.robot.radius
+            console.wrote(plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
+        return 0 if found.levels.any() else 1

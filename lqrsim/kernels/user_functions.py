@@ -1,0 +1,81 @@
+"""A user's own functions, called at their addresses. The kernels' subset.
+
+The data of each function begin with its address and, where one is given, that of its derivatives; its parameters
+follow. Outputs are NaN where the user's function does not write them. `differences.py` has derivatives by differences.
+"""
+
+from math import nan
+
+from lqrsim.kernels.declarations import M, N, W, call, stack, zeros
+from lqrsim.kernels.linear_algebra import clear, fill
+
+BALLS = 1  # of `places`
+COORDINATES = 3  # of each ball that the function returns: 2 in a plane
+COLUMNS = 1  # of the noise matrix M
+STRENGTH = 1  # index in the data of the factor of M
+
+
+def rate(x, u, p, out):
+    """Write xdot = f(x, u), (N,)."""
+    fill(out, N, nan)
+    call(p[0], x, u, p, out)
+
+
+def rate_jacobian(x, u, p, out, fx, fu):
+    """Write f (N,), df/dx (N, N) and df/du (N, M)."""
+    rate(x, u, p, out)
+    clear(fx, N, N)
+    clear(fu, N, M)
+    call(p[1], x, u, p, fx, fu)
+
+
+def value(x, u, t, data):
+    """A cost."""
+    out = stack(1)
+    out[0] = nan
+    call(data[0], x, u, data, out)
+    return out[0]
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    """Add the symmetric part of a cost's Hessian (W, W), and its gradient (W,); return the cost."""
+    slope, curve = zeros(W), zeros(W, W)
+    call(data[1], x, u, data, slope, curve)
+    for i in range(W):
+        gradient[i] += slope[i]
+        for j in range(W):
+            hessian[i, j] += 0.5 * (curve[i, j] + curve[j, i])
+    return value(x, u, t, data)
+
+
+def places(x, data, out):
+    """Write the centres of balls, three coordinates each; the third is 0 in a plane."""
+    given = stack(BALLS * COORDINATES)
+    fill(given, BALLS * COORDINATES, nan)
+    call(data[0], x, x, data, given)
+    for k in range(BALLS):
+        out[3 * k + 2] = 0.0
+        for i in range(COORDINATES):
+            out[3 * k + i] = given[COORDINATES * k + i]
+
+
+def places_jacobian(x, data, out, slopes):
+    """Write the centres, and their Jacobian (3 balls, N), which the caller has set to zero."""
+    given = zeros(BALLS * COORDINATES, N)
+    places(x, data, out)
+    call(data[1], x, x, data, given)
+    for k in range(BALLS):
+        for i in range(COORDINATES):
+            for j in range(N):
+                slopes[3 * k + i, j] = given[COORDINATES * k + i, j]
+
+
+def noise_values(x, u, data, out):
+    """Write the noise matrix M (N, COLUMNS), times its strength."""
+    given = stack(N, COLUMNS)
+    for i in range(N):
+        fill(given[i], COLUMNS, nan)
+    call(data[0], x, u, data, given)
+    for i in range(N):
+        for k in range(COLUMNS):
+            out[i, k] = data[STRENGTH] * given[i, k]

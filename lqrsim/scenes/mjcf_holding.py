@@ -1,0 +1,87 @@
+"""The controls that hold a robot from an MJCF still, by MuJoCo's inverse dynamics."""
+
+import copy
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from lqrsim.errors import Array
+
+_HELD = 1e-6  # of the largest force, what may be missed where a robot is said to be held
+_LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
+
+
+@dataclass(frozen=True)
+class Holding:
+    """Controls, and what they leave.
+
+    Attributes:
+      controls: (m,), within their limits, that come nearest to holding the robot still.
+      missed: N or N m, the largest force that a joint is short of.
+      held: whether they hold it.
+    """
+
+    controls: Array
+    missed: float
+    held: bool
+
+
+def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: Array) -> Holding:
+    """The controls of actuators, in that order, with which nothing accelerates at rest.
+
+    Forces of actuators are taken to be affine in the controls, as those of motors and servos are: inverse dynamics say
+    what is wanted of them, and least squares within the controls' limits find it.
+    """
+    free = copy.copy(model)
+    free.actuator_forcelimited[:] = 0
+    free.jnt_actfrclimited[:] = 0
+    data = mujoco.MjData(free)
+    data.qpos[:], data.act[:] = qpos, act
+    mujoco.mj_inverse(free, data)
+    wanted = data.qfrc_inverse.copy()
+    low, high = model.actuator_ctrlrange.T
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+    def force(controls: Array) -> Array:
+        data.ctrl[:] = controls
+        mujoco.mj_forward(free, data)
+        return data.qfrc_actuator.copy()
+
+    middle = np.clip(np.zeros(model.nu), low, high)
+    rest = force(middle)
+    columns = np.stack([force(middle + one) - rest for one in np.eye(model.nu)], axis=1)
+    scale = np.abs(columns).max(axis=0)
+    scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
+    size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
+    rows = np.concatenate([columns / scale, _LIGHT * np.eye(model.nu)])
+    aims = np.concatenate([wanted - rest, np.zeros(model.nu)])
+    bounds = (low - middle) * scale, (high - middle) * scale
+    tight = bounds[1] - bounds[0] < 1e-12  # which lsq_linear refuses
+    bounds = np.where(tight, -1e-12, bounds[0]), np.where(tight, 1e-12, bounds[1])
+    found = middle + lsq_linear(rows, aims, bounds).x / scale
+    found = np.clip(found, low, high)
+    missed = float(np.abs(columns @ (found - middle) + rest - wanted).max(initial=0.0))
+    return Holding(found[actuators], missed, missed <= _HELD * size)
+
+
+def efforts(model: mujoco.MjModel, actuators: Array) -> Array:
+    """How large each control can be, (m,): by its own limits, else by those of its force; 1 where there are none."""
+    found = np.ones(model.nu)
+    for number in range(model.nu):
+        gain, gear = abs(float(model.actuator_gainprm[number, 0])), abs(float(model.actuator_gear[number, 0]))
+        joint = int(model.actuator_trnid[number, 0])
+        of_joint = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT and model.jnt_actfrclimited[joint]
+        servo = model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE  # its control is no force
+        if model.actuator_ctrllimited[number]:
+            largest = float(np.abs(model.actuator_ctrlrange[number]).max())
+        elif model.actuator_forcelimited[number] and gain and not servo:
+            largest = float(np.abs(model.actuator_forcerange[number]).max()) / gain
+        elif of_joint and gain and gear and not servo:
+            largest = float(np.abs(model.jnt_actfrcrange[joint]).max()) / (gain * gear)
+        else:
+            continue
+        found[number] = largest if largest > 0 else 1.0
+    return found[actuators]

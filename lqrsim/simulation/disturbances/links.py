@@ -1,0 +1,249 @@
+"""Links to sensors and actuators: late or lost measurements and commands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import Array, check_count, check_number
+from lqrsim.results.solution_parts import Trajectory
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, left_out, times, uniform
+from lqrsim.simulation.plant import Plant
+
+
+@dataclass(frozen=True)
+class Late(Disturbance):
+    """Base class of delays.
+
+    Args:
+      periods: the delay in control periods.
+    """
+
+    periods: int
+
+    what: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        periods = check_count(f"{type(self).__name__}: periods", self.periods, at_least=0)
+        object.__setattr__(self, "periods", periods)
+
+    def describe(self, plant: Plant) -> str:
+        return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"
+
+    def scaled(self, strength: float) -> Self:
+        """The same with `strength` times the periods, rounded to whole ones.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A disturbance of the same kind.
+        """
+        return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
+
+
+class ControlDelay(Late):
+    """Commands arrive late; until the first one arrives, the plan's controls are applied.
+
+    Args:
+      periods: the delay in control periods.
+    """
+
+    what = "commands"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        under_way: list[Array] = []
+
+        def actuate(step: int, controls: Array) -> Array:
+            under_way.append(controls.copy())
+            if len(under_way) > self.periods:
+                return under_way.pop(0)
+            return np.tile(plan.controls[step], (len(controls), 1))
+
+        return Effect(actuate=actuate)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(delay=self.periods)
+
+
+class MeasurementLatency(Late):
+    """Measurements arrive late; until then the first one is repeated.
+
+    Args:
+      periods: the delay in control periods.
+    """
+
+    what = "measurements"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        seen: list[Array] = []
+
+        def measure(step: int, states: Array) -> Array:
+            seen.append(states.copy())
+            return seen.pop(0) if len(seen) > self.periods else seen[0].copy()
+
+        return Effect(measure=measure)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(latency=self.periods)
+
+
+@dataclass(frozen=True)
+class GilbertElliott:
+    """A link with losses in bursts. It has a good and a bad state, and begins with their stationary distribution.
+
+    Args:
+      to_bad: probability per control period of turning bad while good.
+      to_good: probability per control period of turning good while bad.
+      lost_when_good: share that is lost while good.
+      lost_when_bad: share that is lost while bad.
+    """
+
+    to_bad: float
+    to_good: float
+    lost_when_good: float = 0.0
+    lost_when_bad: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("to_bad", "to_good", "lost_when_good", "lost_when_bad"):
+            above, at_least = (0.0, None) if name == "to_good" else (None, 0.0)  # or a bad link stays bad forever
+            field = f"GilbertElliott: {name}"
+            value = check_number(field, getattr(self, name), above=above, at_least=at_least, at_most=1.0)
+            object.__setattr__(self, name, value)
+
+    @property
+    def bad(self) -> float:
+        """Share of the time in which the link is bad."""
+        return self.to_bad / (self.to_bad + self.to_good)
+
+    @property
+    def lost(self) -> float:
+        """Share that is lost in the long run."""
+        return (1 - self.bad) * self.lost_when_good + self.bad * self.lost_when_bad
+
+    def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
+        """Draw whether each of T items is lost.
+
+        Args:
+          steps: T.
+          generators: K of them, one per trial.
+
+        Returns:
+          (K, T), True where the item is lost.
+        """
+        numbers = uniform(generators, steps, 2)
+        bad, lost = numbers[:, 0, 0] < self.bad, np.empty(numbers.shape[:2], dtype=bool)
+        for t in range(steps):
+            if t:
+                bad = np.where(bad, numbers[:, t, 0] >= self.to_good, numbers[:, t, 0] < self.to_bad)
+            lost[:, t] = numbers[:, t, 1] < np.where(bad, self.lost_when_bad, self.lost_when_good)
+        return lost
+
+
+@dataclass(frozen=True)
+class Dropouts(Disturbance):
+    """Base class of losses on a link.
+
+    Args:
+      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    """
+
+    loss: float | GilbertElliott
+
+    what: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.loss, GilbertElliott):
+            loss = check_number(f"{type(self).__name__}: loss", self.loss, at_least=0.0, at_most=1.0)
+            object.__setattr__(self, "loss", loss)
+
+    def describe(self, plant: Plant) -> str:
+        if not isinstance(self.loss, GilbertElliott):
+            return f"{100 * self.loss:g} % of {self.what} lost"
+        length = 1 / self.loss.to_good
+        share = f"{100 * self.loss.lost:.3g} % of {self.what} lost"
+        return f"{share}, in bad spells of {length:.3g} control periods on average"
+
+    @property
+    def share(self) -> float:
+        """Share that is lost in the long run."""
+        return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
+
+    def scaled(self, strength: float) -> Self:
+        """The same with `strength` times as many losses or bad spells, at most all.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A disturbance of the same kind.
+        """
+        strength, loss = check_strength(self, strength), self.loss
+        if not isinstance(loss, GilbertElliott):
+            return replace(self, loss=min(1.0, strength * loss))
+        to_bad, lost = min(1.0, strength * loss.to_bad), min(1.0, strength * loss.lost_when_good)
+        return replace(self, loss=replace(loss, to_bad=to_bad, lost_when_good=lost))
+
+    def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
+        """Draw whether each of T items is lost, (K, T)."""
+        if isinstance(self.loss, GilbertElliott):
+            return self.loss.draw(steps, generators)
+        return uniform(generators, steps, 1)[..., 0] < self.loss
+
+
+class MeasurementDropouts(Dropouts):
+    """Measurements are lost: the last one that arrived is repeated, at first the plan's first state.
+
+    Args:
+      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    """
+
+    what = "measurements"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        lost = self.draw(plan.steps + 1, generators)
+        return Effect(measure=_last_received(lost, plan.states[0]))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """The share that is lost, as if losses were independent.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `loss`.
+        """
+        return Uncertainty(loss=self.share)
+
+
+class CommandDropouts(Dropouts):
+    """Commands are lost: the actuators keep the last one that arrived, at first the plan's first control.
+
+    Args:
+      loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
+    """
+
+    what = "commands"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        lost = self.draw(plan.steps, generators)
+        return Effect(actuate=_last_received(lost, plan.controls[0]))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if self.share == 0:
+            return Uncertainty()
+        return left_out(self, plant, "its effect depends on how commands change, and that of noise does not")
+
+
+def _last_received(lost: npt.NDArray[np.bool_], first: Array) -> Hook:
+    """A hook that repeats the last value of each trial that was not lost."""
+    last = np.tile(first, (len(lost), 1))
+
+    def receive(step: int, values: Array) -> Array:
+        last[~lost[:, step]] = values[~lost[:, step]]
+        return last.copy()
+
+    return receive

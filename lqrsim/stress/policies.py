@@ -1,0 +1,194 @@
+"""The policies that a stress test compares, by name: how each is solved for, and which controller runs it."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lqrsim.control.controllers import Controller
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.replanner import Replanner
+from lqrsim.control.tracking import track
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import InputError, check_name
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios import solutions as solving
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenarios.references import disturbance_set
+from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.uncertainty_of import uncertainty_of
+
+_log = logging.getLogger("lqrsim")
+
+
+class PolicyKind(NamedTuple):
+    """How a policy is made.
+
+    Attributes:
+      solver: computes its plan; a key of `scenarios.solutions.SOLVERS`.
+      controller: runs it; one of CONTROLLERS.
+      designed: whether it is designed for disturbances that the user may choose.
+    """
+
+    solver: str = "smooth"
+    controller: str = "feedback"
+    designed: bool = False
+
+
+POLICY_KINDS = {
+    "smooth": PolicyKind(),
+    "ilqr": PolicyKind(solver="ilqr"),
+    "open_loop": PolicyKind(),
+    "replan": PolicyKind(controller="replan"),
+    "track": PolicyKind(designed=True),  # `solve` puts the tracking law into its solution
+    "offset_free": PolicyKind(controller="offset_free", designed=True),
+}
+POLICIES = tuple(POLICY_KINDS)
+DESIGNED = tuple(name for name, kind in POLICY_KINDS.items() if kind.designed)
+DEFAULT_POLICIES = tuple(name for name, kind in POLICY_KINDS.items() if not kind.designed)
+CONTROLLERS = ("feedback", "track", "offset_free", "replan")
+DEFAULT_DESIGN = "moderate"  # the set for which policies are designed by default
+
+Design = Sequence[Disturbance] | str | None  # disturbances, the name of a set, or None for the default
+
+
+def check_designed(policies: Sequence[str]) -> None:
+    """Raise InputError unless one of the policies can be designed for disturbances."""
+    if not {*DESIGNED} & {*policies}:
+        raise InputError(
+            f"design_disturbances: got them with {', '.join(policies)}, want {' or '.join(DESIGNED)}, or leave them out"
+        )
+
+
+def design_disturbances(scenario: Scenario, design: Design = None) -> Sequence[Disturbance]:
+    """The disturbances for which "track" and "offset_free" are designed."""
+    design = DEFAULT_DESIGN if design is None else design
+    return disturbance_set(design, scenario) if isinstance(design, str) else design
+
+
+def design_uncertainty(scenario: Scenario, design: Design = None) -> Uncertainty:
+    """The same as an Uncertainty. Raises InputError if the scenario's robot cannot have one of them."""
+    disturbances = design_disturbances(scenario, design)
+    try:
+        return uncertainty_of(scenario.plant(), disturbances)
+    except InputError as error:
+        raise InputError(f"design_disturbances: {error}") from None
+
+
+def solve(
+    policies: Sequence[str], scenario: Scenario, design: Design = None, given: Solution | None = None
+) -> dict[str, Solution]:
+    """The solution that each policy runs, by the policy's name.
+
+    The policy of the solution for "track" is the tracking law. That of "offset_free" has the policy of "smooth".
+
+    Args:
+      policies: some of POLICIES.
+      scenario: what is solved.
+      design: for "track" and "offset_free".
+      given: from `solutions.given`; replaces what its solver would compute.
+
+    Raises:
+      InputError: a plan is not finite, or no policy uses the given solution.
+    """
+    check_used(given, policies)
+    plans = {} if given is None else {solver_of(given): given}
+    solutions: dict[str, Solution] = {}
+    for policy in policies:
+        solver = POLICY_KINDS[policy].solver
+        if solver not in plans:
+            plans[solver] = solving.solve(scenario, solver)
+        solutions[policy] = plans[solver].open_loop() if policy == "open_loop" else plans[solver]
+    for solver, plan in plans.items():
+        if not np.isfinite(plan.trajectory.states).all():
+            raise InputError(f"policies: got those of {solver}, whose plan is not finite ({plan.status.name})")
+        for remark in solving.remarks(scenario, plan):
+            _log.warning("the solution of %s %s", solver, remark)
+    if "track" in policies:
+        law = track(scenario.problem, solutions["track"], uncertainty=design_uncertainty(scenario, design))
+        solutions["track"] = replace(solutions["track"], policy=law)
+    return solutions
+
+
+def solver_of(solution: Solution) -> str:
+    """The solver whose result a given solution replaces."""
+    return "ilqr" if solution.solver == "ilqr" else "smooth"
+
+
+def check_used(given: Solution | None, policies: Sequence[str]) -> None:
+    """Raise InputError if a solution is given and none of the policies uses it."""
+    if given is None:
+        return
+    users = [policy for policy, kind in POLICY_KINDS.items() if kind.solver == solver_of(given)]
+    if not {*users} & {*policies}:
+        raise InputError(
+            f"solution: got one of {given.solver} with {', '.join(policies)}, want it with one of {', '.join(users)}"
+        )
+
+
+def impossible_policies(scenario: Scenario, given: Solution | None = None) -> dict[str, str]:
+    """The policies that cannot run in the scenario, with the given solution if there is one, each with the reason."""
+    found: dict[str, str] = {}
+    if scenario.problem.constraints:
+        found["ilqr"] = "which cannot keep the scenario's constraints"
+    replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
+    if replanned is not None and replanned.problem_digest != scenario.problem.digest:
+        found["replan"] = "which re-plans the scenario's problem, while the solution is of another problem"
+    return found
+
+
+def left_out(policies: Sequence[str], impossible: Mapping[str, str]) -> str:
+    """A line with the impossible policies that were left out; empty if there are none."""
+    missing = [f"{policy}, {why}" for policy, why in impossible.items() if policy not in policies]
+    return f"left out: {'; '.join(missing)}" if missing else ""
+
+
+def make_controller(
+    name: str,
+    scenario: Scenario,
+    solution: Solution,
+    *,
+    design: Design = None,
+    replan_every: float | None = None,
+) -> Controller | AffinePolicy:
+    """A controller for a solution of the scenario.
+
+    Args:
+      name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
+        `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
+      scenario: what was solved.
+      solution: with the plan.
+      design: for "track" and "offset_free".
+      replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
+
+    Raises:
+      InputError: there is no such controller, or it does not fit the scenario and the solution.
+    """
+    problem = scenario.problem
+    match check_name("controller", name, CONTROLLERS):
+        case "track":
+            return track(problem, solution, uncertainty=design_uncertainty(scenario, design))
+        case "offset_free":
+            return OffsetFree(problem, solution, design_uncertainty(scenario, design))
+        case "replan":
+            if solution.problem_digest != problem.digest:
+                raise InputError(
+                    f"controller: got replan for a solution of another problem than that of {scenario.name}, want a"
+                    f" solution of the scenario's own problem, or one of {', '.join(CONTROLLERS[:-1])}"
+                )
+            every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
+            return Replanner(problem, solution, every=every, deadline=0.0)
+    return solution.policy
+
+
+def make_policy(
+    policy: str, scenario: Scenario, design: Design = None, given: Solution | None = None
+) -> tuple[Solution, Controller | AffinePolicy]:
+    """Solve for one policy. Returns its solution and the controller that runs it; raises InputError as `solve` does."""
+    if design is not None:
+        check_designed((policy,))
+    solution = solve((policy,), scenario, design, given)[policy]
+    return solution, make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)
