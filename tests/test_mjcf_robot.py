@@ -217,6 +217,66 @@ def test_states_by_name_and_keyframe() -> None:
         robot.at(hinge=1.0)
 
 
+@pytest.mark.parametrize("kind", ["motor", "position", "general"])
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> None:
+    """The acceleration by MuJoCo is zero there; and where a limit is too tight, the joint that is short is told of."""
+    rng = np.random.default_rng(seed)
+    given = {"motor": 'gear="3"', "position": 'kp="80" kv="2"', "general": 'gainprm="5" gear="-2"'}[kind]
+    links = "".join(
+        f'<body pos="{rng.uniform(0.1, 0.3)} 0 0"><joint name="j{i}" axis="{i % 2} 1 0" armature="0.01"/>'
+        f'<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>'
+        for i in range(3)
+    )
+    tight = f"""<mujoco><compiler autolimits="true"/><worldbody><body>{links}</body></body></body></body></worldbody>
+      <actuator>{"".join(f'<{kind} name="a{i}" joint="j{i}" {given}/>' for i in range(3))}</actuator></mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(tight, "arm"))
+    state = robot.at(None, **{f"j{i}": float(rng.uniform(-1, 1)) for i in range(3)})
+    data = mujoco.MjData(robot.scene.model)
+    data.qpos[:], data.ctrl[:] = state[:3], robot.hold(state)
+    mujoco.mj_forward(robot.scene.model, data)
+    np.testing.assert_allclose(data.qacc, 0, rtol=0, atol=1e-6)
+    problem = robot.problem(state, state, steps=5)
+    np.testing.assert_allclose(problem.nominal_control, robot.hold(state), rtol=1e-9)
+    assert "held at rest by: a0" in str(robot)
+    assert "short of it" not in str(robot)
+    weak = tight.replace(f"<{kind} ", f'<{kind} ctrlrange="-1e-3 1e-3" ')
+    assert "short of it" in str(ls.MjcfRobot(scene_from_xml(weak, "arm")))
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
+    """Two fingers that one motor moves; against gravity and each other's weight, by MuJoCo's own steps."""
+    rng = np.random.default_rng(seed)
+    offset, ratio = rng.uniform(-0.02, 0.02), rng.choice([-1.0, 1.0, 0.5])
+    fingers = "".join(
+        f'<body pos="0 {side} 0"><joint name="{name}" type="slide" axis="0 0 1" damping="5"/>'
+        f'<geom size="0.02" mass="{mass}" contype="0" conaffinity="0"/></body>'
+        for name, side, mass in (("left", 0.1, 0.2), ("right", -0.1, 0.3))
+    )
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{fingers}</worldbody>
+      <equality><joint joint1="right" joint2="left" polycoef="{offset} {ratio}" solref="0.005 1"/></equality>
+      <actuator><motor name="grip" joint="left"/></actuator></mujoco>""", "gripper"), position=())  # fmt: skip
+    state = robot.at(left=0.05)
+    np.testing.assert_allclose(state, [0.05, offset + ratio * 0.05, 0, 0], rtol=1e-12)
+    np.testing.assert_allclose(robot.hold(state), 9.81 * (0.2 + ratio * 0.3), rtol=1e-6)
+    after = robot.dynamics.step(state, robot.hold(state), 0.1)
+    # The constraint is soft: what it carries of the other finger moves it by less than a millimetre.
+    np.testing.assert_allclose(after[:2], state[:2], rtol=0, atol=1e-3)
+
+
+def test_a_camera_and_a_light_where_there_are_none() -> None:
+    bare = mjcf_files.draw("cart", 0).xml
+    assert "<camera" not in bare
+    model = ls.MjcfRobot(scene_from_xml(bare, "cart")).scene.model
+    assert (model.ncam, model.nlight) == (1, 1)
+    own = bare.replace("<worldbody>", '<worldbody><light name="lamp"/><camera name="side"/>')
+    model = ls.MjcfRobot(scene_from_xml(own, "cart")).scene.model
+    assert (model.camera(0).name, model.light(0).name, model.ncam, model.nlight) == ("side", "lamp", 1, 1)
+
+
 def test_joint_limits_are_bounds() -> None:
     robot, _ = robot_of("cart", 0)
     bounds = robot.joint_limits
@@ -309,9 +369,9 @@ BAD = {
     "nothing moves": ('<worldbody><geom size="0.1"/></worldbody>', "got no joints, want a robot that moves"),
     "equality": (
         '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><body name="b"><joint name="b"/>'
-        '<geom size="0.1"/></body></worldbody><equality><joint joint1="a" joint2="b"/></equality>'
+        '<geom size="0.1"/></body></worldbody><equality><joint joint1="a" joint2="b" polycoef="0 1 2"/></equality>'
         '<actuator><motor joint="a"/></actuator>',
-        "equality: got constraints that make coordinates depend on each other, want none",
+        "equality: got constraints that are not linear in two joints, want those with polycoef",
     ),
 }
 

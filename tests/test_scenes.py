@@ -1,5 +1,7 @@
 """The rule that makes obstacles of an MJCF, the packaged scenes, and what a bad file is told."""
 
+import time
+
 import mujoco
 import numpy as np
 import pytest
@@ -240,3 +242,34 @@ def test_names_that_obstacles_without_one_get_are_free(scene_of):
         <geom name="sphere 0_" size="0.3"/>
     """)
     assert list(by_name(scene)) == ["sphere 0__", "sphere 0", "sphere 0_"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<replicate count="100000000" offset="1 0 0"><geom size="1"/></replicate>', "100,000,000 copies, want 1,000,000"),
+        (
+            '<replicate count="9999" offset="1 0 0"><replicate count="999" offset="0 1 0"><geom size="1"/></replicate>'
+            "</replicate>",
+            "<replicate> of 9,989,001 copies",
+        ),
+        ('<body><geom name="load" mass="nan" size="1"/></body>', "got NaN for the mass of geom 'load', want a number"),
+        ('<body><geom density="NaN" size="1"/></body>', "got NaN for the density of geom, want a number"),
+    ],
+)
+def test_what_mujoco_would_not_survive_or_not_say(text, message):
+    with pytest.raises(InputError, match=f"^scene odd: got .*{message}|^scene odd: {message}"):
+        scene_from_xml(f"<mujoco><worldbody>{text}</worldbody></mujoco>", "odd")
+
+
+def test_replicas_are_obstacles_and_thousands_of_them_are_loaded_quickly():
+    """In processor time, as a ratio: at most three times what MuJoCo needs by itself."""
+    text = '<mujoco><worldbody><light/><camera pos="0 0 1"/><replicate count="100" offset="1 0 0"><replicate count="50"'
+    text += ' offset="0 1 0"><geom type="box" size=".1 .1 .1"/></replicate></replicate></worldbody></mujoco>'
+    began = time.process_time()
+    mujoco.MjModel.from_xml_string(text)
+    alone = time.process_time() - began
+    began = time.process_time()
+    scene = scene_from_xml(text, "many")
+    assert time.process_time() - began < 3 * alone + 0.1
+    assert len(scene.world) == 5000

@@ -48,6 +48,8 @@ class MjcfRobot(Robot):
     `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
     actuators' names, limited by their ctrlrange. What has no name in the MJCF gets one, as `unnamed_joint_0`.
 
+    Where the file has no camera, or no light, it gets one named overview.
+
     Obstacles are the geoms that are fixed to the world and can touch the robot, but its own base, which carries it, and
     the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of them, at
     MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are MuJoCo's.
@@ -73,7 +75,7 @@ class MjcfRobot(Robot):
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: equality constraints, delays, plugins with states.
+        describe: equality constraints but those that couple joints linearly, delays, plugins with states.
     """
 
     def __init__(
@@ -90,6 +92,9 @@ class MjcfRobot(Robot):
         self.name, xml = (file.name, file.xml) if isinstance(file, Scene) else read_mjcf(file)
         xml, who = mjcf_joints.named(xml), f"MjcfRobot {self.name}"
         model = checked_model(xml, self.name)
+        seen = mjcf_joints.lit(xml, model)
+        if seen != xml:
+            xml, model = seen, checked_model(seen, self.name)
         number = mjcf_joints.body_of(model, body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         default = in_the_way(model, candidates, number, floors=check_flag(f"{who}: floors", floors))
@@ -113,7 +118,7 @@ class MjcfRobot(Robot):
             angles=tuple(one.dof for one in self._joints if one.kind == "hinge" and one.limits is None),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
-            xml, who, body=number, obstacles=tuple(geoms), states=states,
+            xml, who, model=model, body=number, obstacles=tuple(geoms), states=states,
             controls=Coordinates(
                 names=self.actuators or ("none",), units=tuple(one.unit for one in actuators) or ("",),
                 low=tuple(one.low for one in actuators), high=tuple(one.high for one in actuators),
@@ -290,6 +295,8 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
+        Joints that an equality constraint couples to others follow these, unless they are named.
+
         Args:
           keyframe: its name; None for the MJCF's rest.
           **values: name of a state -> value.
@@ -311,6 +318,9 @@ class MjcfRobot(Robot):
         names = self.dynamics.state_coordinates.names
         for name, value in values.items():
             state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
+        for one in mjcf_joints.couplings_of(model) if keyframe is None or values else ():
+            if names[one.dof] not in values:
+                state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
         return state
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:

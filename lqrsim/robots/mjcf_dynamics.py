@@ -43,7 +43,7 @@ class MjcfDynamics(Dynamics):
     discrete: ClassVar[bool] = True
 
     def __init__(
-        self, xml: str, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
+        self, xml: str, name: str, *, model: Any = None, body: int, obstacles: tuple[int, ...], states: Coordinates,
         controls: Coordinates, actuators: tuple[int, ...],
     ) -> None:  # fmt: skip
         self._name = name
@@ -52,11 +52,11 @@ class MjcfDynamics(Dynamics):
         self.parameters: dict[str, float] = {}
         self.disturbances = dict.fromkeys(WRENCH, 0.0)
         self.state_coordinates, self.control_coordinates = states, controls
-        self._set_mjcf(xml)
+        self._set_mjcf(xml, model)
 
-    def _set_mjcf(self, xml: str) -> None:
+    def _set_mjcf(self, xml: str, model: Any = None) -> None:
         self.xml, self.fixed = xml, sha256(xml, repr(self._stated))
-        self.physics = MjcfPhysics(xml, self._name, **self._stated)
+        self.physics = MjcfPhysics(xml, self._name, model=model, **self._stated)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without MuJoCo's memory, which another process makes anew."""

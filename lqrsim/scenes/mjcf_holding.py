@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_joints import couplings_of
 
 _HELD = 1e-6  # of the largest force, what may be missed where a robot is said to be held
 _LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
@@ -34,6 +34,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: Array) ->
     Forces of actuators are taken to be affine in the controls, as those of motors and servos are: inverse dynamics say
     what is wanted of them, and least squares within the controls' limits find it.
     """
+    from scipy.optimize import lsq_linear
+
     free = copy.copy(model)
     free.actuator_forcelimited[:] = 0
     free.jnt_actfrclimited[:] = 0
@@ -53,9 +55,11 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: Array) ->
     middle = np.clip(np.zeros(model.nu), low, high)
     rest = force(middle)
     columns = np.stack([force(middle + one) - rest for one in np.eye(model.nu)], axis=1)
+    size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
+    carried = _carried(model)
+    columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
     scale = np.abs(columns).max(axis=0)
     scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
-    size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
     rows = np.concatenate([columns / scale, _LIGHT * np.eye(model.nu)])
     aims = np.concatenate([wanted - rest, np.zeros(model.nu)])
     bounds = (low - middle) * scale, (high - middle) * scale
@@ -65,6 +69,15 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: Array) ->
     found = np.clip(found, low, high)
     missed = float(np.abs(columns @ (found - middle) + rest - wanted).max(initial=0.0))
     return Holding(found[actuators], missed, missed <= _HELD * size)
+
+
+def _carried(model: mujoco.MjModel) -> Array:
+    """What forces on all joints come to on those that are free to move, (free, nv), through coupled ones."""
+    moves, coupled = np.eye(model.nv), couplings_of(model)
+    for one in coupled:
+        moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0
+    kept = np.setdiff1d(np.arange(model.nv), [one.dof for one in coupled])
+    return moves[:, kept].T
 
 
 def efforts(model: mujoco.MjModel, actuators: Array) -> Array:

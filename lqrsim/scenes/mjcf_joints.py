@@ -45,6 +45,21 @@ class Actuator:
     high: float
 
 
+@dataclass(frozen=True)
+class Coupling:
+    """A joint that an equality constraint moves with another one: by how much it is linear.
+
+    Attributes:
+      dof: of the joint. other: of the one that it follows; -1 where it stands still. offset: of its position, where the
+        other's is 0, in m or rad. ratio: of both.
+    """
+
+    dof: int
+    other: int
+    offset: float
+    ratio: float
+
+
 UNNAMED = "unnamed_"  # what begins the name of a body, joint, geom or actuator that has none in the MJCF
 
 
@@ -68,6 +83,28 @@ def named(xml: str) -> str:
         name(list(world.iter("geom")), "geom")
     name([one for section in root.iter("actuator") for one in section], "actuator")
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def lit(xml: str, model: mujoco.MjModel) -> str:
+    """An MJCF with a camera and a light named overview, where it has none of the kind; the same text where it has both.
+
+    Args:
+      xml: the MJCF. model: compiled from it, which says how large the whole is.
+    """
+    if (model.ncam and model.nlight) or "</mujoco>" not in xml:
+        return xml
+    middle, size = model.stat.center, float(model.stat.extent)
+    added = ElementTree.Element("worldbody")
+    if not model.ncam:
+        place = " ".join(f"{number:.6g}" for number in middle + size * np.array([1.0, -1.6, 0.8]))
+        axes = "0.848 0.53 0 -0.207 0.331 0.921"  # which looks from there at the middle
+        ElementTree.SubElement(added, "camera", {"name": "overview", "pos": place, "xyaxes": axes})
+    if not model.nlight:
+        place = " ".join(f"{number:.6g}" for number in middle + size * np.array([-1.0, -1.0, 3.0]))
+        light = {"name": "overview", "pos": place, "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
+        ElementTree.SubElement(added, "light", light)
+    end = xml.rindex("</mujoco>")  # the text is ElementTree's, and can be long
+    return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
 
 
 def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
@@ -113,6 +150,27 @@ def _unit(model: mujoco.MjModel, number: int) -> str:
     if gain[0] == -bias[1] and bias[0] == 0:
         return length
     return f"{length}/s" if bias[1] == 0 and gain[0] == -bias[2] else ""
+
+
+def couplings_of(model: mujoco.MjModel) -> tuple[Coupling, ...]:
+    """The active equality constraints of joints, all of which must be linear: see `is_linear`."""
+    found = []
+    for number in np.flatnonzero(model.eq_active0):
+        first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
+        offset, ratio = (float(entry) for entry in model.eq_data[number, :2])
+        rest = float(model.qpos0[model.jnt_qposadr[first]])
+        if second < 0:
+            found.append(Coupling(int(model.jnt_dofadr[first]), -1, rest + offset, 0.0))
+            continue
+        offset += rest - ratio * float(model.qpos0[model.jnt_qposadr[second]])
+        found.append(Coupling(int(model.jnt_dofadr[first]), int(model.jnt_dofadr[second]), offset, ratio))
+    return tuple(found)
+
+
+def is_linear(model: mujoco.MjModel, number: int) -> bool:
+    """Whether an equality constraint couples a joint linearly to another one, or holds it."""
+    joints = model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT
+    return bool(joints and (int(model.eq_obj2id[number]) < 0 or not model.eq_data[number, 2:5].any()))
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:

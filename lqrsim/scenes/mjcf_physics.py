@@ -12,6 +12,7 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
+from lqrsim.scenes.mjcf_joints import is_linear
 from lqrsim.scenes.scene import model_from_xml
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: what it leaves is divided by the difference of a derivative
@@ -45,9 +46,9 @@ class MjcfPhysics:
     """
 
     def __init__(
-        self, xml: str, name: str, *, body: int, actuators: tuple[int, ...], obstacles: tuple[int, ...]
+        self, xml: str, name: str, *, model: mujoco.MjModel | None = None, body: int, actuators: tuple[int, ...], obstacles: tuple[int, ...]
     ) -> None:
-        self.model = model_from_xml(xml, name)
+        self.model = model_from_xml(xml, name) if model is None else copy.copy(model)
         _check(self.model, name)
         _prepare(self.model, obstacles)
         self._exact = _for_distances(self.model)
@@ -102,9 +103,9 @@ def _check(model: mujoco.MjModel, name: str) -> None:
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
         "equality": (
-            any(model.eq_active0),
-            "got constraints that make coordinates depend on each other",
-            'none, or active="false"',
+            any(not is_linear(model, number) for number in np.flatnonzero(model.eq_active0)),
+            "got constraints that are not linear in two joints",
+            'those with polycoef="a b", or active="false"',
         ),
         "plugins": (model.npluginstate > 0, "got some with states of their own", "none"),
         "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),

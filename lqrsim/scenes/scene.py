@@ -48,6 +48,9 @@ DEEPEST = 490  # MuJoCo's reader refuses a little more
 _FLAT = 1e-9  # m, for what has no thickness
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
+MOST_COPIES = 1_000_000  # elements that <replicate> makes: some minutes of MuJoCo's, and GBs
+_MASSES = frozenset(("mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "armature"))
+
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 
@@ -240,16 +243,37 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     return np.flatnonzero(fixed & collides).tolist()
 
 
+def geom_names(model: mujoco.MjModel) -> list[str]:
+    """The names of all geoms, empty for those without one."""
+    text = model.names
+    return [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
+
+
 def _check_elements(xml: str, what: str) -> None:
-    """Raises InputError for what would end the process: too deep elements, too large height fields."""
-    reader, depth = ElementTree.XMLPullParser(["start", "end"]), 0
+    """Raises InputError for what MuJoCo would not survive or not say: too much of something, or NaN for unknown.
+
+    It takes a NaN for the mass or density of a geom as if there were none.
+    """
+    reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
     try:
         reader.feed(xml)
+        made = 0
         events: Any = reader.read_events()
         for event, element in events:
             depth += 1 if event == "start" else -1
             if depth > DEEPEST:
                 raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies")
+            if element.tag == "replicate":
+                copies = [*copies, copies[-1] * _whole(element.get("count", ""))] if event == "start" else copies[:-1]
+            if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", "replicate"):
+                made += copies[-1]
+                if made > MOST_COPIES:
+                    got = f"<replicate> of {copies[-1]:,} copies"
+                    raise InputError(f"{what}: got {got}, want {MOST_COPIES:,} elements at most")
+            for key in _MASSES.intersection(element.attrib) if event == "start" else ():
+                if "nan" in element.attrib[key].lower().split():
+                    name = f" {element.attrib['name']!r}" if "name" in element.attrib else ""
+                    raise InputError(f"{what}: got NaN for the {key} of {element.tag}{name}, want a number")
             if event == "start" and element.tag == "hfield":
                 sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
                 cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
@@ -259,6 +283,11 @@ def _check_elements(xml: str, what: str) -> None:
     except (ElementTree.ParseError, ValueError) as error:
         if isinstance(error, InputError):
             raise  # the rest is for MuJoCo to say
+
+
+def _whole(text: str) -> int:
+    """A count in an MJCF; 1 for what MuJoCo refuses itself."""
+    return int(text) if text.strip().isdecimal() else 1
 
 
 def _check_numbers(model: mujoco.MjModel, what: str) -> None:
@@ -273,23 +302,26 @@ def _check_numbers(model: mujoco.MjModel, what: str) -> None:
 def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: Collection[str]) -> list[Obstacle]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    taken = {model.geom(geom).name for geom in range(model.ngeom)}
+    names = geom_names(model)
+    taken, types = set(names), model.geom_type.tolist()
+    kind_of = {one: mujoco.mjtGeom(one).name.removeprefix("mjGEOM_").lower() for one in set(types)}
+    places, axes = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
+    sizes, still = model.geom_size.copy(), np.zeros(3)
     found: list[Obstacle] = []
     for geom in geoms:
-        kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-        name = model.geom(geom).name or free_name(f"{kind} {geom}", taken)
+        kind = kind_of[types[geom]]
+        name = names[geom] or free_name(f"{kind} {geom}", taken)
         if kind not in kinds:
             raise InputError(
                 f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
                 ' or contype="0" conaffinity="0" if it is only to be drawn; or obstacles= to choose others; or an'
                 " MjcfRobot, which has MuJoCo's distances"
             )
-        position, rotation = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
-        size = np.zeros(3) if kind == "plane" else model.geom_size[geom].copy()
+        position, size = places[geom], np.zeros(3) if kind == "plane" else sizes[geom]
         if kind in OTHER_KINDS:
             middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], _FLAT)
-            position += rotation @ middle
-        found.append(Obstacle(name, kind, position, rotation, size))
+            position = position + axes[geom] @ middle
+        found.append(Obstacle._of_mujoco(name, kind, position, axes[geom], size, still))
     planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
     return [_endless(obstacle, planes) if obstacle.kind in ("capsule", "cylinder") else obstacle for obstacle in found]
 

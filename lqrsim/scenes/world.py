@@ -58,6 +58,17 @@ class Obstacle:
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "velocity", check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
 
+    @classmethod
+    def _of_mujoco(
+        cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array
+    ) -> "Obstacle":
+        """One that MuJoCo has compiled, and that needs no checks: of these there can be tens of thousands."""
+        made = object.__new__(cls)
+        vars(made).update(
+            name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity
+        )
+        return made
+
     @property
     def row(self) -> Array:
         """This obstacle as `ROW` numbers.
