@@ -50,6 +50,8 @@ from .results.solution_parts import Trajectory as Trajectory
 from .robots.base import Robot as Robot
 from .robots.differential_drive import DifferentialDrive as DifferentialDrive
 from .robots.mjcf import MjcfRobot as MjcfRobot
+from .robots.mjcf_sites import SiteConstraint as SiteConstraint
+from .robots.mjcf_sites import SiteCost as SiteCost
 from .robots.quadrotor import Quadrotor as Quadrotor
 from .scenarios.packaged import Scenario as Scenario
 from .scenes.scene import Scene as Scene

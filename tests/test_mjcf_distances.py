@@ -187,6 +187,84 @@ def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> N
     assert 0.02 * (first - 1) - 1e-9 <= table.ended[0] <= 0.02 * first + 1e-9
 
 
+SITES = '<site name="tool" pos="0.25 0.01 0.02" euler="10 20 30"/>'
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xml = arm("capsule", "sphere", seed % 7).scene.xml.replace('<geom name="tip"', f'{SITES}<geom name="tip"')
+    robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
+    n = len(robot.dynamics.state_coordinates)
+    state, orientation = robot.at() + rng.normal(0, 0.4, n), rng.normal(size=4)
+    model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+    data.qpos[:] = robot.configuration(state)[0]
+    mujoco.mj_kinematics(model, data)
+    own, wanted, apart, turn = data.site("tool").xpos.copy(), rng.normal(size=3), np.zeros(4), np.zeros(3)
+    orientation /= np.linalg.norm(orientation)
+    mujoco.mju_mat2Quat(apart, data.site("tool").xmat)
+    mujoco.mju_subQuat(turn, apart, orientation)
+    cost = ls.SiteCost("tool", position=wanted, orientation=orientation, weight=(1, 2, 3), turn_weight=4.0)
+    value, gradient, _ = evaluate(cost.bind(robot.dynamics), robot.dynamics, state, np.zeros(1))
+    expected = 0.5 * np.array([1, 2, 3]) @ (own - wanted) ** 2 + 2.0 * turn @ turn
+    np.testing.assert_allclose(value, expected, rtol=1e-9)
+    if np.linalg.norm(turn) > 3.0:
+        return  # half a turn off there are two ways back
+    term, h = cost.bind(robot.dynamics), 1e-6
+    slopes = [
+        (evaluate(term, robot.dynamics, state + h * e, np.zeros(1))[0]
+         - evaluate(term, robot.dynamics, state - h * e, np.zeros(1))[0]) / (2 * h) for e in np.eye(n)
+    ]  # fmt: skip
+    np.testing.assert_allclose(gradient[:n], slopes, rtol=0, atol=1e-6 * (1 + np.abs(gradient).max()))
+
+
+def test_a_gripper_reaches_a_pose_past_a_post(tmp_path: Path) -> None:
+    """To 1 mm and 1 degree, by MuJoCo's own kinematics, and clear of the post."""
+    file = arm_file(tmp_path)
+    file.write_text(file.read_text().replace('<geom type="box" pos="0.12', f'{SITES}<geom type="box" pos="0.12'))
+    robot = ls.MjcfRobot(file, obstacles=("post",))
+    model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+    data.qpos[:] = 1.4, 0.2, -0.3
+    mujoco.mj_kinematics(model, data)
+    place, turn = data.site("tool").xpos.copy(), np.zeros(4)
+    mujoco.mju_mat2Quat(turn, data.site("tool").xmat)
+    final = ls.QuadraticCost([0.0] * 3 + [100.0] * 3, about=robot.at())
+    near = ls.SiteCost("tool", position=place, orientation=turn, weight=1e5, turn_weight=1e3)
+    shy = ls.ObstacleCost(robot.scene.world, geoms=robot.geoms, sharpness=20.0, weight=0.01)
+    for kept, cost in (([], final + near), ([ls.SiteConstraint("tool", position=place)], final)):
+        problem = ls.Problem(
+            dynamics=robot.dynamics, dt=0.02, steps=60, initial=ls.FixedState(robot.at()),
+            stage_cost=ls.ControlCost(np.full(3, 0.01)) + shy, final_cost=cost, control_limits=(-20, 20),
+            constraints=[ls.Clearance(robot.scene.world, geoms=robot.geoms, margin=0.02), *kept],
+        )  # fmt: skip
+        assert all(check.good for check in ls.check_derivatives(problem, samples=2, tolerance=1e-4))
+        solution = ls.smooth(problem)
+        assert solution.success, solution
+        assert solution.clearance is not None
+        assert solution.clearance[1:].min() > 0.02 - 1e-4
+        data.qpos[:] = solution.trajectory.states[-1, :3]
+        mujoco.mj_kinematics(model, data)
+        assert np.linalg.norm(data.site("tool").xpos - place) < 1e-3
+        if not kept:
+            found, off = np.zeros(4), np.zeros(3)
+            mujoco.mju_mat2Quat(found, data.site("tool").xmat)
+            mujoco.mju_subQuat(off, found, turn)
+            assert np.degrees(np.linalg.norm(off)) < 1.0
+
+
+def test_sites_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    robot = ls.MjcfRobot(arm_file(tmp_path))
+    with pytest.raises(InputError, match=r"SiteCost: site: got 'tool', want one of"):
+        ls.SiteCost("tool", position=np.zeros(3)).bind(robot.dynamics)
+    with pytest.raises(InputError, match=r"SiteConstraint: got neither position nor orientation"):
+        ls.SiteConstraint("tool")
+    with pytest.raises(InputError, match=r"SiteCost: orientation: got \[0.0, 0.0, 0.0, 0.0\], want a quaternion"):
+        ls.SiteCost("tool", orientation=np.zeros(4))
+    with pytest.raises(InputError, match=r"want the dynamics of an MjcfRobot"):
+        ls.SiteCost("tool", position=np.zeros(3)).bind(ls.Quadrotor().dynamics)
+
+
 @pytest.mark.parametrize(
     ("chosen", "found"),
     [

@@ -247,7 +247,10 @@ def test_names_that_obstacles_without_one_get_are_free(scene_of):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('<replicate count="100000000" offset="1 0 0"><geom size="1"/></replicate>', "100,000,000 copies, want 1,000,000"),
+        (
+            '<replicate count="100000000" offset="1 0 0"><geom size="1"/></replicate>',
+            "100,000,000 copies, want 1,000,000",
+        ),
         (
             '<replicate count="9999" offset="1 0 0"><replicate count="999" offset="0 1 0"><geom size="1"/></replicate>'
             "</replicate>",

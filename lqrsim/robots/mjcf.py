@@ -225,7 +225,10 @@ class MjcfRobot(Robot):
         be held at both. Solvers begin with these.
 
         Args:
-          start: (n,). goal: (n,). steps: of dt. dt: seconds, about 0.02 by default.
+          start: (n,), a state.
+          goal: (n,), a state.
+          steps: how many control periods.
+          dt: seconds of one, about 0.02 by default.
           weights: of what misses the goal at the end, for all states or (n,).
           effort: of the controls, (m,); by default 1 for a control at its limit, or that of its force, or at 1.
           damping: of the velocities of hinges, slides and ball joints at each step.

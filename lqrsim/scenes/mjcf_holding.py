@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import couplings_of
@@ -28,7 +29,7 @@ class Holding:
     held: bool
 
 
-def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: Array) -> Holding:
+def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
     """The controls of actuators, in that order, with which nothing accelerates at rest.
 
     Forces of actuators are taken to be affine in the controls, as those of motors and servos are: inverse dynamics say
@@ -80,7 +81,7 @@ def _carried(model: mujoco.MjModel) -> Array:
     return moves[:, kept].T
 
 
-def efforts(model: mujoco.MjModel, actuators: Array) -> Array:
+def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
     """How large each control can be, (m,): by its own limits, else by those of its force; 1 where there are none."""
     found = np.ones(model.nu)
     for number in range(model.nu):

@@ -221,6 +221,18 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
     return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
 
 
+def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
+    """The body of a site, and its place (3,) and axes (3, 3) in those of the body."""
+    return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
+
+
+def axes_of(quaternion: Array) -> Array:
+    """The rotation matrix (3, 3) of a quaternion (4,) of length 1."""
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, quaternion)
+    return axes.reshape(3, 3)
+
+
 def reach_of(model: mujoco.MjModel, body: int) -> float:
     """How far from a body's origin what collides of it and of all it carries can be, at most, in metres.
 

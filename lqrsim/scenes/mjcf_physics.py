@@ -46,7 +46,14 @@ class MjcfPhysics:
     """
 
     def __init__(
-        self, xml: str, name: str, *, model: mujoco.MjModel | None = None, body: int, actuators: tuple[int, ...], obstacles: tuple[int, ...]
+        self,
+        xml: str,
+        name: str,
+        *,
+        model: mujoco.MjModel | None = None,
+        body: int,
+        actuators: tuple[int, ...],
+        obstacles: tuple[int, ...],
     ) -> None:
         self.model = model_from_xml(xml, name) if model is None else copy.copy(model)
         _check(self.model, name)
@@ -103,7 +110,7 @@ def _check(model: mujoco.MjModel, name: str) -> None:
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
         "equality": (
-            any(not is_linear(model, number) for number in np.flatnonzero(model.eq_active0)),
+            any(not is_linear(model, number) for number in np.flatnonzero(model.eq_active0).tolist()),
             "got constraints that are not linear in two joints",
             'those with polycoef="a b", or active="false"',
         ),

@@ -64,9 +64,7 @@ class Obstacle:
     ) -> "Obstacle":
         """One that MuJoCo has compiled, and that needs no checks: of these there can be tens of thousands."""
         made = object.__new__(cls)
-        vars(made).update(
-            name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity
-        )
+        vars(made).update(name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity)
         return made
 
     @property

@@ -164,7 +164,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Clearance of balls": ({"call": ls.Clearance, "world": world, "balls": balls, "margin": 0.1},),
         "ConstraintTerm": ({
             "source": source, "data": [1.0], "rows": 1, "describe": str, "uses_control": False, "equality": True,
-            "final_only": False, "balls": 0, "functions": (),
+            "final_only": False, "shared": 0, "functions": (),
         },),
         "SymbolicConstraint": ({"function": bowl, "parameters": {"a": 1.0}, "equality": True, "at": "all"},),
         "Clearance.ahead": ({"self": ls.Clearance(world, radius=0.2, margin=np.linspace(0, 0.1, 5)), "steps": 2},),
@@ -174,6 +174,12 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "StateBounds.ahead": ({"self": ls.StateBounds({"x": -1.0}), "steps": 2},),
         "GoalState": ({"goal": [0.0, 1.0], "states": ("x", "v")},),
         "StateBounds": ({"low": {"x": -1.0}, "high": {"v": 1.0}},),
+        "SiteCost": ({
+            "site": "tool", "position": np.zeros(3), "orientation": [1.0, 0, 0, 0], "weight": 1.0, "turn_weight": 2.0,
+        },),
+        "SiteConstraint": ({
+            "site": "tool", "position": np.zeros(3), "orientation": [1.0, 0, 0, 0], "at": "final",
+        },),
         "FixedState": ({"state": [0.0, 1.0]},),
         "Problem": (stated | {
             "control_limits": (-0.4, 0.4), "constraints": [], "noise": ls.Noise(np.eye(3)), "risk": 0.1,
