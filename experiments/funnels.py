@@ -125,7 +125,8 @@ def robots(config: Config) -> dict[str, Any]:
         begun, used = time.perf_counter(), time.process_time()
         with counting(f"funnel of the {robot}") as progress:
             funnel = ls.funnel(
-                plant, solution, rate=config.rate, confidence=config.confidence, seed=config.seed, progress=progress,
+                plant, solution, rate=config.rate, confidence=config.confidence, seed=config.seed,
+                progress=lambda done, of, _, progress=progress: progress(done, of),
                 **how,
             )  # fmt: skip
         took, busy = time.perf_counter() - begun, time.process_time() - used

@@ -1,3 +1,5 @@
+from typing import Any, cast
+
 """What every disturbance has in common: found by name, validated, scaled, repeatable to the last bit, composable."""
 
 import dataclasses
@@ -264,7 +266,10 @@ def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, fi
         ),
         (lambda: MassMismatch(factor=0.0), "^MassMismatch: factor: got 0, want numbers > 0$"),
         *[
-            (lambda kind=kind: KINDS[kind](factor=()), f"^{kind}: factor: got no numbers, want at least one$")
+            (
+                lambda kind=kind: cast(Any, KINDS[kind])(factor=()),
+                f"^{kind}: factor: got no numbers, want at least one$",
+            )
             for kind in KINDS
             if kind.endswith("Mismatch")
         ],

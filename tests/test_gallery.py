@@ -76,7 +76,7 @@ def test_command_lines_of_the_pages_parse() -> None:
         arguments = shlex.split(line)[1:]
         if not arguments[0].startswith("--"):
             command = tyro.cli(Command, prog="lqrsim", args=arguments)
-            assert type(command).__name__.lower() == arguments[0], line
+            assert type(command).__name__.removesuffix("Command").lower() == arguments[0], line
 
 
 def test_videos_move_and_last_as_long_as_their_runs(pictures: Mapping[str, tuple[str, ...]]) -> None:

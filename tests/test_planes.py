@@ -363,8 +363,8 @@ class Idle(PlanarQuadrotor):
 @pytest.mark.parametrize(
     ("robot", "message"),
     [
-        (Mirrored(), r"z along -z; want it to move by a metre along its own axis"),
-        (Millimetres(), r"x along \(0.001, 0, 0\), z along \(0, 0, 0.001\); want it to move by a metre"),
+        (Mirrored(), r"z along -z; want each to move it by a metre along its own axis"),
+        (Millimetres(), r"x along \(0.001, 0, 0\), z along \(0, 0, 0.001\); want each to move it by a metre"),
         (
             Shifted(),
             r"got \(0, 0\) m in the plane 'xz', where MuJoCo has the origin of body 'drone' at \(0.5, 0, 0\) m",

@@ -112,9 +112,9 @@ def test_a_simulation_that_becomes_unstable_is_told() -> None:
     [
         (
             'ctrlrange="-2 2"',
-            r"got controls \(torque -3\) within them, of which actuation\(\) makes -3 for actuator 'motor'",
+            r"got controls \(torque -3\), for which actuation\(\) commands -3 of actuator 'motor'",
         ),
-        ('ctrlrange="-3 2.9"', r"got controls \(torque 3\) within them, of which actuation\(\) makes 3"),
+        ('ctrlrange="-3 2.9"', r"got controls \(torque 3\), for which actuation\(\) commands 3"),
     ],
 )
 def test_limits_that_an_actuator_cuts_off_are_refused(limited: str, got: str) -> None:

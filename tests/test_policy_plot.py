@@ -69,7 +69,7 @@ def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
             off = state - come.mean[knot]
             cost = (
                 0.5 * state @ hessian @ state + state @ gradient + np.asarray(go.constant)[knot]
-                + 0.5 * off @ precise @ off + come.constant[knot]
+                + 0.5 * off @ precise @ off + np.asarray(come.constant)[knot]
             )  # fmt: skip
             # Inverting the covariance costs some of the digits, and the terms are far larger than their sum.
             assert cost - least[knot] == pytest.approx(2.0, rel=1e-3)

@@ -173,6 +173,6 @@ def test_what_the_viewer_decides_is_refused(
     assert main(["render", str(run), "--out", str(tmp_path / "run.rrd"), *options]) == 2
     assert capsys.readouterr().err == (
         f"lqrsim: error: --out: got run.rrd with {named}, want it with one run, one --trial,"
-        " at most one --funnel, and nothing else\n"
+        " at most one --funnel, and no other options\n"
     )
     assert not list(tmp_path.iterdir())

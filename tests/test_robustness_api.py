@@ -354,7 +354,7 @@ class TestFunctions:
         [
             ("x = 1", "which does not define value(...), want it to"), ("def value(", "which is not valid Python"),
             (3, "got 3, want text"),
-            ("def value(x):\n    pass\n", "got value of 1 arguments, want 5"), ("import os\n" * 2, "value"),
+            ("def value(x):\n    pass\n", "got value(...) with 1 arguments, want 5"), ("import os\n" * 2, "value"),
         ],
     )  # fmt: skip
     def test_sources_that_are_none(self, source: Any, wanted: str) -> None:

@@ -351,7 +351,7 @@ def test_the_primal_form_wants_a_soft_start(differential_drive: ls.Scenario) -> 
 
 def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     text = str(drive_solution)
-    assert text.splitlines()[0] == ls.types.Iteration.HEADER
+    assert len(text.splitlines()) <= 15
     assert "CONVERGED after 6 iterations of smooth" in text
     assert "the plan is from the start 'straight', one of 7; 6 were dropped" in text
     assert "clearance: 0.141 m" in text

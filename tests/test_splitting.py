@@ -204,7 +204,8 @@ def test_one_level_is_plain_trials() -> None:
     found = failure_probability(along(2, 0.5), 2, repetitions=4)
     counted = round(float(found.repetitions.sum()) * 500)
     assert found.probability == rate(counted, 2000)
-    small = failure_probability(along(2, 0.5), np.int8(2), particles=np.int16(10), keep=0.2, repetitions=np.int8(2))
+    short: Any = np.int8(2)
+    small = failure_probability(along(2, 0.5), short, particles=10 * np.int16(1), keep=0.2, repetitions=short)  # pyright: ignore[reportArgumentType]
     assert small.probability == failure_probability(along(2, 0.5), 2, particles=10, keep=0.2, repetitions=2).probability
     always = failure_probability(lambda z: np.ones(len(z)), 2, particles=10, keep=0.2, repetitions=2).probability
     assert always == rate(20, 20)

@@ -33,7 +33,7 @@ def of_light(config: Config, query: int) -> dict[str, Any]:
     score = ls.stress.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
     row: dict[str, Any] = {"query": query, "asked": asked, "predicted": safe.tube.collision_chance}
     try:
-        options = {"particles": config.particles, "repetitions": 6, "moves": 3, "seed": config.seed}
+        options: dict[str, Any] = {"particles": config.particles, "repetitions": 6, "moves": 3, "seed": config.seed}
         found = ls.stress.failure_probability(score, score.size, **options)
         return row | {"measured": interval(found.probability), "simulations": found.simulations}
     except ls.stress.NoFailure:

@@ -53,9 +53,9 @@ class Clearance(Constraint):
         steps = check_count("steps", steps, at_least=0)
         if not isinstance(self.margin, np.ndarray):
             return self
-        return self.keeping(self.margin[min(steps, len(self.margin) - 1) :])
+        return self._keeping(self.margin[min(steps, len(self.margin) - 1) :])
 
-    def keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
+    def _keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
         """The same constraint with another margin.
 
         Args:

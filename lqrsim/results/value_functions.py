@@ -41,7 +41,7 @@ class Quadratic:
 
     hessian: Annotated[Array, "... n n"]
     gradient: Annotated[Array, "... n"]
-    constant: Annotated[Array, "..."]
+    constant: Annotated[Array | float, "..."]
 
     def __post_init__(self) -> None:
         _check(self)
@@ -98,7 +98,7 @@ class Moments:
 
     covariance: Annotated[Array, "... n n"]
     mean: Annotated[Array, "... n"]
-    constant: Annotated[Array, "..."]
+    constant: Annotated[Array | float, "..."]
 
     def __post_init__(self) -> None:
         _check(self)
@@ -117,7 +117,7 @@ class Moments:
 
     def minimum(self) -> Array:
         """The minimum at each knot, (T+1,)."""
-        return self.constant
+        return np.asarray(self.constant)
 
 
 @dataclass(frozen=True)

@@ -32,20 +32,20 @@ class StateError(GaussianDisturbance):
 
     what: ClassVar[str]
 
-    def coordinates(self, plant: Plant) -> Coordinates:
+    def _coordinates(self, plant: Plant) -> Coordinates:
         """What the error is added to."""
         return plant.robot.dynamics.state_coordinates
 
     def describe(self, plant: Plant) -> str:
-        return f"{self.what}, std {with_units(self, self.std, self.coordinates(plant))}"
+        return f"{self.what}, std {with_units(self, self.std, self._coordinates(plant))}"
 
-    def deviations(self, plant: Plant) -> Array:
+    def _deviations(self, plant: Plant) -> Array:
         """One standard deviation for each coordinate."""
-        return fit(self, self.std, self.coordinates(plant).names)
+        return fit(self, self.std, self._coordinates(plant).names)
 
-    def std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
+    def _std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
         """The standard deviations as an Uncertainty has them: 0 for none."""
-        std = self.deviations(plant)
+        std = self._deviations(plant)
         return tuple(std.tolist()) if std.any() else 0.0
 
 
@@ -58,16 +58,16 @@ class ControlNoise(StateError):
 
     what = "control noise"
 
-    def coordinates(self, plant: Plant) -> Coordinates:
+    def _coordinates(self, plant: Plant) -> Coordinates:
         return plant.robot.dynamics.control_coordinates
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self.deviations(plant)
+        std = self._deviations(plant)
         noise = std * normal(generators, plan.steps, len(std))
         return Effect(actuate=lambda step, controls: controls + noise[:, step])
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(control=self.std_for_filters(plant))
+        return Uncertainty(control=self._std_for_filters(plant))
 
 
 class MeasurementNoise(StateError):
@@ -80,12 +80,12 @@ class MeasurementNoise(StateError):
     what = "measurement noise"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self.deviations(plant)
+        std = self._deviations(plant)
         noise = std * normal(generators, plan.steps + 1, len(std))
         return Effect(measure=lambda step, states: states + noise[:, step])
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(measurement=self.std_for_filters(plant))
+        return Uncertainty(measurement=self._std_for_filters(plant))
 
 
 class MeasurementBias(StateError):
@@ -98,7 +98,7 @@ class MeasurementBias(StateError):
     what = "measurement bias"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self.deviations(plant)
+        std = self._deviations(plant)
         bias = std * normal(generators, 1, len(std))[:, 0]
         return Effect(measure=lambda step, states: states + bias)
 
@@ -118,12 +118,12 @@ class InitialStateError(StateError):
     what = "initial state off"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self.deviations(plant)
+        std = self._deviations(plant)
         error = std * normal(generators, 1, len(std))[:, 0]
         return Effect(initial_states=lambda states: states + error)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(start=self.std_for_filters(plant))
+        return Uncertainty(start=self._std_for_filters(plant))
 
 
 class WrenchNoise(GaussianDisturbance):

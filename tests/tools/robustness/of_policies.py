@@ -62,7 +62,7 @@ def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
     common = {"plant": place.plant, "solution": place.solution, "disturbances": [ControlNoise(0.01)], "threads": 1,
               "controller": place.solution.policy, "goal_radius": 1.0, "goal_tolerance": None}  # fmt: skip
     asked = {"rate": 0.5, "confidence": 0.8, "knots": (0, 2), "states": ("x", "y"), "shape": None, "largest": 0.5,
-             "failures": 2, "seed": 0, "progress": lambda done, of: None}  # fmt: skip
+             "failures": 2, "seed": 0, "progress": lambda done, of, found: None}  # fmt: skip
     funnel = ls.funnel(**common, **asked)
     check = {"trials": 3, "between": (0.0, 0.5), "seed": 1}
     chosen = {"problem": place.problem, "plant": place.plant, "disturbances": [ControlNoise(0.01)], "trials": 2,

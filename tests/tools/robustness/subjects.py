@@ -25,8 +25,18 @@ from robustness.place import Place
 
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
-HOOKS |= {"displace", "across", "clearance_at", "middles", "world_seen", "record_of_balls", "uncertainty", "spread"}
-HOOKS |= {"solving", "check_period", "ControllerRun.control"}
+HOOKS |= {
+    "displace",
+    "across",
+    "clearance_at",
+    "middles",
+    "travel",
+    "world_seen",
+    "record_of_balls",
+    "uncertainty",
+    "spread",
+}
+HOOKS |= {"solving", "check_period", "ControllerRun.control", "Plant.nearest"}
 
 RAISES = {"Results.read": (Damaged,)}
 
