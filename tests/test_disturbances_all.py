@@ -1,10 +1,9 @@
-from typing import Any, cast
-
 """What every disturbance has in common: found by name, validated, scaled, repeatable to the last bit, composable."""
 
 import dataclasses
 import itertools
 import re
+from typing import Any, cast
 
 import numpy as np
 import pytest
