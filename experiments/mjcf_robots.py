@@ -4,8 +4,10 @@
     python experiments/mjcf_robots.py               # all eleven, with pictures
     python experiments/mjcf_robots.py --only acrobot swimmer
     python experiments/mjcf_robots.py --quick       # a few iterations of each
+    python experiments/mjcf_robots.py --family --models models    # arms, hands, legs and vehicles, as they come
 
-`experiments/mjcf/tasks.py` says what each is to do. What is not installed is left out, and named.
+`experiments/mjcf/tasks.py` says what each is to do, `experiments/mjcf/family.py` what the family is, and how to get its
+files. What is not installed is left out, and named.
 """
 
 import time
@@ -13,7 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
+from mjcf.family import FAMILY, FamilyTask
 from mjcf.tasks import TASKS, Task
 from paper.common import render_still
 from PIL import Image
@@ -34,13 +38,18 @@ class Config(FolderSettings):
     """Names of robots, or words of them; by default all."""
     iterations: int = 300
     """At most, of each solver."""
+    family: bool = False
+    """The family of arms, hands, legs and vehicles, and not the eleven."""
+    models: Path | None = None
+    """Folder with unpacked packages, for those that are not installed."""
     pictures: bool = True
     """Draw each run."""
 
 
 def main(config: Config) -> Result:
     most = min(config.iterations, 2) if config.quick else config.iterations
-    wanted = [task for task in TASKS if not config.only or any(word in task.name for word in config.only)]
+    tasks = [task.found_in(config.models) for task in FAMILY] if config.family else TASKS
+    wanted = [task for task in tasks if not config.only or any(word in task.name for word in config.only)]
     here = [task for task in wanted if task.path is not None]
     result = opening(config) | {"rows": [], "missing": [task.name for task in wanted if task not in here]}
     for task in progress(here, "robots"):
@@ -62,15 +71,19 @@ def sheet(config: Config, result: Result) -> None:
     result["figures"].append("mjcf_robots.png")
 
 
-def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, Any]:
+def of_task(config: Config, task: Task | FamilyTask, most: int, result: Result) -> dict[str, Any]:
     """Solve by both methods from the same start, and run the plan."""
     robot = task.robot()
     problem, plant = task.problem(robot), ls.Plant(robot, robot.scene)
     found, seconds = {}, {}
+    assert problem.start is not None
+    # iLQR begins at rest, where what holds the robot between start and goal would let it fall.
+    held = np.tile(robot.hold(problem.start), (problem.steps, 1)) if isinstance(task, FamilyTask) else None
     for name, solve in (("smooth", ls.smooth), ("ilqr", ls.ilqr)):
-        solve(problem, max_iterations=1)  # compiles
+        start = held if name == "ilqr" else None
+        solve(problem, max_iterations=1, start=start)  # compiles
         clock = time.perf_counter()
-        found[name] = solve(problem, max_iterations=most)
+        found[name] = solve(problem, max_iterations=most, start=start)
         seconds[name] = time.perf_counter() - clock
     solution, other = found["smooth"], found["ilqr"]
     rollout = ls.simulate(plant, solution)
@@ -80,11 +93,13 @@ def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, 
         "controls": len(robot.dynamics.control_coordinates), "status": solution.status.name, "cost": solution.cost,
         "ilqr_cost": other.cost, "ilqr_status": other.status.name, "iterations": len(solution.iterations),
         "ms": float(np.median([1000 * one.seconds for one in solution.iterations])), "seconds": seconds["smooth"],
-        "ilqr_seconds": seconds["ilqr"], "off": float(outcome.worst[0]), "unit": rollout.tracking_unit,
+        "ilqr_seconds": seconds["ilqr"], "off": float(outcome.worst[0]), "replayed": replayed(robot, solution),
+        "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
+        "bindings": clearance_by_bindings(robot, solution), "unit": rollout.tracking_unit,
         "missed": {
             name: float(solution.trajectory.states[-1, i] - problem.goal[i])
             for i, name in enumerate(robot.dynamics.state_coordinates.names)
-            if task.ends.get(name, 0) >= 10 and problem.goal is not None
+            if (task.ends.get(name, 0) >= 10 if task.ends else i < robot.scene.model.nv) and problem.goal is not None
         },
     }  # fmt: skip
     if config.pictures:
@@ -97,6 +112,44 @@ def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, 
     return row
 
 
+def replayed(robot: ls.MjcfRobot, solution: ls.Solution) -> float:
+    """How far a run of the policy by plain `mj_step`, in the whole MJCF, comes from the plan's positions at most."""
+    model, plan = robot.scene.model, solution.trajectory
+    data, nv = mujoco.MjData(model), robot.scene.model.nv
+    data.qpos[:], data.qvel[:] = robot.configuration(plan.states[0])
+    data.act[:] = plan.states[0, 2 * nv :]
+    numbers, worst, substeps = [model.actuator(one).id for one in robot.actuators], 0.0, robot_steps(robot, plan.dt)
+    for step, nominal in enumerate(plan.states[:-1]):
+        state = np.concatenate([robot.state(data.qpos, data.qvel, near=nominal), data.act])
+        data.ctrl[numbers] = solution.policy(state, step * plan.dt)
+        mujoco.mj_step(model, data, substeps)
+        there = robot.state(data.qpos, data.qvel, near=plan.states[step + 1])
+        worst = max(worst, float(np.abs(there[:nv] - plan.states[step + 1, :nv]).max()))
+    return worst
+
+
+def robot_steps(robot: ls.MjcfRobot, dt: float) -> int:
+    """Physics steps of a control period."""
+    return round(dt / float(robot.scene.model.opt.timestep))
+
+
+def clearance_by_bindings(robot: ls.MjcfRobot, solution: ls.Solution) -> float | None:
+    """The least distance along the plan by `mujoco.mj_geomDistance`; None without obstacles."""
+    model, obstacles = robot.scene.model, robot.scene.geoms
+    if solution.clearance is None:
+        return None
+    data, least = mujoco.MjData(model), np.inf
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    moving = np.flatnonzero(collides & (model.body_weldid[model.geom_bodyid] != 0)).tolist()
+    for state in solution.trajectory.states[1:]:
+        data.qpos[:] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        for obstacle in obstacles:
+            for geom in moving:
+                least = min(least, mujoco.mj_geomDistance(model, data, geom, obstacle, 10.0, None))
+    return float(least)
+
+
 def camera_of(robot: ls.MjcfRobot) -> str:
     """One of the scene's cameras."""
     model = robot.scene.model
@@ -107,13 +160,15 @@ def camera_of(robot: ls.MjcfRobot) -> str:
 def report(result: Result) -> str:
     rows, head = [], (
         "robot", "states", "controls", "status", "cost", "iLQR's cost", "iterations", "ms an iteration",
-        "tracking error in MuJoCo", "farthest from the goal",
+        "tracking error in MuJoCo", "by plain mj_step", "clearance (m)", "less the bindings'", "farthest from the goal",
     )  # fmt: skip
     for row in result["rows"]:
         missed = max(row["missed"].items(), key=lambda pair: abs(pair[1]), default=("", 0.0))
         rows.append([
             row["name"], row["states"], row["controls"], row["status"], f"{row['cost']:.4g}",
             f"{row['ilqr_cost']:.4g}", row["iterations"], f"{row['ms']:.1f}", f"{row['off']:.1e} {row['unit']}",
+            f"{row['replayed']:.1e}", "" if row["clearance"] is None else f"{row['clearance']:.4f}",
+            "" if row["clearance"] is None else f"{row['clearance'] - row['bindings']:+.0e}",
             f"{missed[0]} {missed[1]:+.2g}",
         ])  # fmt: skip
     ratios = [row["cost"] / row["ilqr_cost"] for row in result["rows"]]

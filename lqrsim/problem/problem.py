@@ -30,6 +30,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.scenes.world import World
 
+TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
 @dataclass(frozen=True)
 class FixedState:
@@ -418,7 +419,7 @@ class Problem:
         """Raises InputError if a geom is in an obstacle where the robot starts."""
         if len(world) and self.start is not None:
             distances = geoms.clearances(self.dynamics, world, self.start)
-            if distances.min() < 0:
+            if distances.min() < -TOUCHING:
                 name = world.names[int(distances.argmin())]
                 raise InputError(
                     f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or, where"

@@ -25,6 +25,7 @@ from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obst
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
+_SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touches one: 2 % of it at 8 cm
 _PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
@@ -257,7 +258,7 @@ class MjcfRobot(Robot):
         if moves.any():
             cost = cost + QuadraticCost(moves, about=np.zeros(n))
         if len(self.scene.world):
-            cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms)
+            cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
             dynamics=dynamics, dt=dynamics.period_near(_PERIOD) or float(model.opt.timestep) if dt is None else dt,
             steps=steps, initial=FixedState(start), stage_cost=cost,

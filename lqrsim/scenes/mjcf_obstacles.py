@@ -8,6 +8,7 @@ from lqrsim.errors import Array
 
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's
 
+_NEAR = 1e-3  # m, from the floor, where something is on it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 
 
@@ -18,10 +19,12 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
 
     Args:
       body: the robot's first that moves. floors: whether level planes and height fields are for standing on, if a free
-        joint, or a slide that is not level, lets the robot sink to them.
+        joint, or a slide that is not level, lets the robot sink to them, or it touches them at rest.
     """
     base, touched = _base(model), set(touching_pairs(model, candidates)[:, 1].tolist())
-    ground = _ground(model) if floors and _sinks(model, body) else set[int]()
+    ground = _ground(model) if floors else set[int]()
+    if not _sinks(model, body):
+        ground = {geom for geom in ground if _touches(model, geom)}
     return [
         geom
         for geom in candidates
@@ -125,6 +128,14 @@ def _ground(model: mujoco.MjModel) -> set[int]:
     mujoco.mj_kinematics(model, data)
     planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (data.geom_xmat[:, 8] > _LEVEL)
     return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
+
+
+def _touches(model: mujoco.MjModel, ground: int) -> bool:
+    """Whether something that moves touches a geom, or is in it, where all joints are at rest."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    pairs = touching_pairs(model, [ground])[:, 0].tolist()
+    return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
 
 
 def _sinks(model: mujoco.MjModel, body: int) -> bool:

