@@ -43,6 +43,7 @@ from lqrsim.kernels import (
     interior_point,
     iterations,
     linear_algebra,
+    mjcf_distances,
     mjcf_dynamics,
     mjcf_places,
     model_functions,
@@ -753,6 +754,20 @@ X, U = np.array([0.45, 0.3, 0.2]), np.array([0.7, -0.2])
 SIZES = {"N": 3, "M": 2, "W": 5}
 
 
+FLOATING = """<mujoco>
+  <asset><mesh name="rock" vertex="0 0 .2  .1 0 0  0 .1 0  -.1 0 0  0 -.1 0  0 0 -.2"/></asset>
+  <worldbody>
+    <geom name="rock" type="mesh" mesh="rock" pos="0.9 0 0"/>
+    <geom name="plane" type="plane" size="1 1 1" pos="0 0 -0.6" euler="20 30 0"/>
+    <body name="hull"><freejoint/><geom size="0.1"/>
+      <body name="upper" pos="0.2 0 0"><joint type="ball"/><geom type="capsule" size="0.03" fromto="0.05 0 0 0.2 0 0"/>
+        <body name="fore" pos="0.25 0 0"><joint name="elbow" axis="0 1 0.3"/>
+          <geom type="box" size="0.08 0.03 0.03"/><site name="tip" pos="0.1 0 0" euler="0 20 0"/></body></body></body>
+  </worldbody>
+  <actuator><motor joint="elbow"/></actuator>
+</mujoco>"""
+
+
 def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
     n, m = len(x), len(u)
     sizes, data = {"N": n, "M": m, "W": n + m}, compiled.numbers(term)
@@ -760,17 +775,18 @@ def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
     replay(term.code, sizes, "derivatives", x, u, 2, data, np.zeros((n + m, n + m)), np.zeros(n + m))
 
 
-def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0) -> None:
+def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0, x: Array = X, u: Array = U) -> None:
     data, source = compiled.numbers(term), source_of(augmented_lagrangian, SHARED=term.shared)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
     if term.shared:
         pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
-    source, sizes = source.filled(**pairs), SIZES | {"EQUALITY": equality}
+    w = len(x) + len(u)
+    source, sizes = source.filled(**pairs), {"N": len(x), "M": len(u), "W": w, "EQUALITY": equality}
     multipliers = np.concatenate([[3.0, term.rows, 0.0, 0.01], np.linspace(0.0, 2.0, 4 * term.rows)])
-    replay(source, sizes, "augment", X, U, 2, data, multipliers, np.zeros((5, 5)), np.zeros(5))
-    replay(source, sizes, "augmentation", X, U, 2, data, multipliers)
-    replay(source, sizes, "constraint_values", X, U, 2, 1, data, multipliers, np.zeros(4 * term.rows))
-    replay(source, sizes, "add_slope", X, U, 2, term.rows - 1, data, np.zeros(5))
+    replay(source, sizes, "augment", x, u, 2, data, multipliers, np.zeros((w, w)), np.zeros(w))
+    replay(source, sizes, "augmentation", x, u, 2, data, multipliers)
+    replay(source, sizes, "constraint_values", x, u, 2, 1, data, multipliers, np.zeros(4 * term.rows))
+    replay(source, sizes, "add_slope", x, u, 2, term.rows - 1, data, np.zeros(w))
 
 
 def two_balls(x, p):
@@ -805,7 +821,7 @@ class TestParts:
         points[:2, 2] = 0.05
         count = len(WORLD)
         source = source_of(signed_distance)
-        replay(source, {}, "nearest", count, 6, 3, data, points, np.zeros((2, 3 * count)), np.zeros(6))
+        replay(source, {}, "nearest", count, 6, 3, data, points, np.zeros((2 * count, 3)), np.zeros(6))
         normals = np.zeros((6 * count, 3))
         replay(source, {}, "each_with_normal", count, 6, data, points, np.zeros(6 * count), normals)
         at = np.zeros(3), np.zeros((3, 3))
@@ -928,6 +944,27 @@ class TestParts:
             places = robot.balls.bind(dynamics)
             assert places.code == source_of(mjcf_places)
             self.places(places, 3 * len(robot.balls), x)
+
+    @pytest.mark.parametrize("touching", [False, True])
+    def test_distances_and_sites_of_mujoco(self, touching: bool) -> None:
+        """Of a robot with a free, a ball and a hinge joint, clear of a mesh and a plane or within them."""
+        robot = ls.MjcfRobot(scene_from_xml(FLOATING, "floating", obstacles=False), obstacles=("rock", "plane"))
+        n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
+        x, u, world = 0.3 * np.random.default_rng(0).normal(size=n), np.ones(m), robot.scene.world
+        x[:3] = (0.8, 0.1, 0.1) if touching else (0.3, 0.1, 0.2)
+        of_term(ls.ObstacleCost(world, geoms=robot.geoms, sharpness=5.0).bind(robot.dynamics), x, u)
+        of_constraint(ls.Clearance(world, geoms=robot.geoms, margin=0.1).bind(robot.dynamics), 0, x, u)
+        pose = {"position": (0.4, 0.2, 0.3), "orientation": (0.6, 0.0, 0.8, 0.0)}
+        for wanted in (pose, {"position": pose["position"]}, {"orientation": pose["orientation"]}):
+            of_term(ls.SiteCost("tip", **wanted).bind(robot.dynamics), x, u)
+            of_constraint(ls.SiteConstraint("tip", **wanted).bind(robot.dynamics), 1, x, u)
+        data = robot.geoms._to_each(robot.dynamics, np.arange(2))
+        source, sizes, states = source_of(mjcf_distances), {"N": n, "M": m, "W": n + m}, np.stack([x, 1.1 * x])
+        scratch = np.zeros(3), np.zeros((3, 6))
+        for moved in (0, 1):
+            away = np.linspace(0.0, 0.2, 12)
+            replay(source, sizes, "distances_of", 2, states, 1, away, moved, data, np.zeros(4), *scratch)
+        replay(source, sizes, "slopes_of", 2, states, data, np.zeros(4), np.zeros((4, n)), *scratch)
 
     def test_threads_that_help_mujoco(self) -> None:
         """With a helper that never comes, one thread does all columns; and a helper all that it finds to do."""
@@ -1130,16 +1167,12 @@ class TestActiveSet:
         replay(source, SIZES, "rollout_of_active_set", *given)
 
 
-# Compared with MuJoCo's own distances and with differences, in test_mjcf_distances.py.
-ELSEWHERE = ("mjcf_distances", "distance_cost", "distance_constraint")
-
-
 def test_no_kernel_is_left_out() -> None:
     folder = Path(str(kernels.__file__)).parent
     written = {
         f"lqrsim.kernels.{path.stem}.{node.name}"
         for path in folder.glob("*.py")
         for node in ast.parse(path.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.FunctionDef) and path.stem not in ("declarations", "records", *ELSEWHERE)
+        if isinstance(node, ast.FunctionDef) and path.stem not in ("declarations", "records")
     }
     assert written - COMPARED.keys() == set()

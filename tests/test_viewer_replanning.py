@@ -356,7 +356,7 @@ def test_rates_and_options_that_are_refused(capsys: pytest.CaptureFixture[str], 
         (["differential_drive", "--replan", "30"], "--replan: got 30"),
         (["quadrotor", "--replan", "30", "--speed", "2"], "--speed: got 2 with --replan, want at most 1"),
         (["quadrotor", "--replan", "30", "--controller", "track"], "--controller: got track with --replan"),
-        (["run.npz", "--replan", "30"], "--replan: got 30.0 with run.npz, want it with a SCENARIO"),
+        (["run.npz", "--replan", "30"], "--replan: got 30 with run.npz, want it with a SCENARIO"),
     )
     for arguments, line in cases:
         assert main(["view", *arguments]) == 2

@@ -23,7 +23,8 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
     trials, count, size = points.shape
     flat, table, out = np.zeros((trials * count, 3)), np.array(world_seen.table), np.empty(trials * count)
     flat[:, :size] = points.reshape(-1, size)
-    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials, 3 * len(table))
+    # One row for each obstacle, so that their number is not part of the type: another world compiles nothing.
+    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials * len(table), 3)
     _distances().nearest(len(table), len(flat), count, table.ravel(), flat, away, out)
     return out.reshape(trials, count)
 

@@ -197,8 +197,8 @@ class View:
         if self.what.endswith(".npz"):
             for name in ("controller", "design_disturbances", "solution", "replan"):
                 if (value := getattr(self, name)) not in (None, "feedback"):
-                    option = name.replace("_", "-")
-                    raise InputError(f"--{option}: got {value} with {self.what}, want it with a SCENARIO")
+                    option, got = name.replace("_", "-"), f"{value:g}" if isinstance(value, float) else value
+                    raise InputError(f"--{option}: got {got} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load(self.what, Rollout)
             arguments = viewer.arguments_for_rollout(rollout, self.trial)
 

@@ -147,7 +147,7 @@ class _Search:
         self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances then
 
     def solve(self, deviations: float | None) -> None:
-        """Plan with so many standard deviations of clearance, and predict what becomes of it."""
+        """Plan with a margin of that many standard deviations, and predict the outcome."""
         problem, start, margin = self.problem, None, self.margin
         second = len(self.plans) == 1  # of which all steps have the same clearance: where the first is matters little
         if deviations is not None:

@@ -78,9 +78,10 @@ class ControllerRun(abc.ABC):
         """
 
     def estimator_diverged(self) -> Mapping[int, str]:
-        """The trials whose estimate is useless -> why, in a line. They end there, as diverged.
+        """Trials whose estimate is useless, each with the reason in one line.
 
-        Asked after each control period. Controllers that estimate nothing leave it as it is.
+        They end in that period and count as diverged. It is called after each control period; controllers that estimate
+        nothing need not override it.
 
         Returns:
           Row of the trial -> the reason.

@@ -143,18 +143,19 @@ def nearest(obstacles, count, each, data, points, displaced, out):
     """Write the distances (count,) of points (count, 3) to the nearest of the obstacles.
 
     Args:
-      each: points per trial. displaced: (trials, 3 obstacles) by how much obstacles have moved.
+      each: points per trial. displaced: (trials obstacles, 3) by how much obstacles have moved, trial by trial.
     """
     for i in range(count):
-        out[i] = nearest_to(obstacles, data, points[i], displaced[i // each])
+        out[i] = nearest_to(obstacles, data, points[i], displaced, obstacles * (i // each))
 
 
 @outline
-def nearest_to(obstacles, data, point, displaced):
-    """The distance of one point (3,) to the nearest obstacle; these are displaced, (3 obstacles,)."""
+def nearest_to(obstacles, data, point, displaced, first):
+    """The distance of one point (3,) to the nearest obstacle; they are displaced by the rows from `first` on."""
     least = inf
     for k in range(obstacles):
-        x, y, z = point[0] - displaced[3 * k], point[1] - displaced[3 * k + 1], point[2] - displaced[3 * k + 2]
+        x, y = point[0] - displaced[first + k, 0], point[1] - displaced[first + k, 1]
+        z = point[2] - displaced[first + k, 2]
         distance = signed_distance(data, ROW * k, x, y, z)
         if not distance >= least:  # a NaN stays
             least = distance

@@ -98,8 +98,8 @@ class CollisionSpheres:
 
         ls.CollisionSpheres(rotors, [0.12] * 4)
 
-    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear, and the `balls` of a
-    `Robot` are what collides when it is run. A robot without any is one ball at its position. `Capsule` makes chains.
+    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear. The `balls` of a
+    `Robot` are its collision shape in simulation; without any it is one ball at its position. `Capsule` makes chains.
 
     To place balls otherwise, subclass it and write `bind`.
 

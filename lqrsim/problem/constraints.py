@@ -249,7 +249,7 @@ class GoalState(Constraint):
 class StateBounds(Constraint):
     """Bounds on states, kept at each step; only at a start that is given exactly they do not act.
 
-    Nor at the end on a state that a GoalState fixes there, which may be at its bound.
+    Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
     Args:
       low: name of a state -> its lower bound, in its unit.

@@ -85,7 +85,7 @@ class Dynamics:
 
     # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
     discrete: ClassVar[bool] = False
-    # What defines them besides their source and parameters, as a hash; none for functions.
+    # Hash of what else defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
 
     def __init__(

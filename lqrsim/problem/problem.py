@@ -32,6 +32,7 @@ from lqrsim.scenes.world import World
 
 TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
+
 @dataclass(frozen=True)
 class FixedState:
     """An initial state (n,) that is given exactly, in place of an initial cost.

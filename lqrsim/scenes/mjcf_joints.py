@@ -236,7 +236,7 @@ def axes_of(quaternion: Array) -> Array:
 def reach_of(model: mujoco.MjModel, body: int) -> float:
     """How far from a body's origin what collides of it and of all it carries can be, at most, in metres.
 
-    What is only drawn counts where nothing collides.
+    If no geom collides, the visual geoms count instead.
     """
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]

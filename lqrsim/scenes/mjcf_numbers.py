@@ -146,7 +146,7 @@ def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
 
 
 def _set(element: ElementTree.Element, name: str, numbers: list[float]) -> None:
-    """Write numbers so that they are read as the same."""
+    """Write numbers so that they read back exactly."""
     element.set(name, " ".join(repr(float(number)) for number in numbers))
 
 

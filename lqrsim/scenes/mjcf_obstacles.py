@@ -13,7 +13,7 @@ _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is le
 
 
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
-    """Those of the candidates, ids of geoms that are fixed to the world, that are obstacles of the robot.
+    """The candidates (ids of geoms fixed to the world) that are obstacles to the robot.
 
     They can touch it, are not its own base, and not the floor that it stands on.
 

@@ -31,7 +31,7 @@ class Obstacle:
       rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
         lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
-        the half length is; box half lengths, and of other kinds those of the box that they are in; plane (0, 0, 0).
+        the half length is; box half lengths, and for other kinds those of the bounding box; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
         it into account; the scene that MuJoCo simulates is another matter, and stands still.
     """

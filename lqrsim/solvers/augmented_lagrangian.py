@@ -131,7 +131,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool) 
         if done == len(rows) or (settled and lagrangian.solved):
             break
         # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
-        off = max(last.gap / most, last.violation / run.settings.missed(run.problem))
+        off = max(last.gap / most, last.violation / run.settings.violation_tolerance(run.problem))
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
         if stale == STALE and not known and run.settings.safeguard:
@@ -254,7 +254,7 @@ class AugmentedLagrangian:
     def __init__(self, run: SolveRun) -> None:
         self._problem, self._work = run.problem, run.work
         self._terms = run.problem.constraint_terms
-        self._near = tolerance = run.settings.missed(run.problem)
+        self._near = tolerance = run.settings.violation_tolerance(run.problem)
         # Of inequalities and of equalities, if there are any.
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False
@@ -300,7 +300,7 @@ class AugmentedLagrangian:
             short = np.abs(values).max(initial=0.0) if term.equality else -values.min(initial=np.inf)
             missed[term.equality] = max(missed[term.equality], short)
         worst = max(missed, key=lambda kind: missed[kind])
-        # Equalities that are nearly kept can be: what they wait for is a better minimum.
+        # Equalities that nearly hold can be met: they need a better inner minimum, not a larger penalty.
         near = {kind: kind and short <= self._near for kind, short in missed.items()}
         self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._last[worst] and not near[worst] else 0
         for kind, tolerance in self._tolerance.items():

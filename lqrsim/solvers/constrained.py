@@ -15,6 +15,7 @@ lead to plans whose violation is stationary and equally large.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,6 @@ AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
 MOST, RESTORED = 300, 150  # iterations of the interior point from one plan, and of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
-MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # initial barrier and slack, far from the optimum and near to it
 PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
 PENALTY = 8.0  # of the augmented Lagrangian that makes the policy keep the constraints, in the same unit
@@ -59,19 +59,30 @@ class Known:
     rows: Array | None = None
 
 
+class Barrier(NamedTuple):
+    """How the interior point begins: barrier parameter, least slacks, and whether the plan may be near the optimum."""
+
+    parameter: float
+    room: float
+    near: bool
+
+
+MUCH, LITTLE = Barrier(1.0, 0.02, near=False), Barrier(0.01, 0.01, near=True)
+
+
 class Ladder:
     """Tries one way to a plan that keeps the constraints after another."""
 
     def __init__(self, run: SolveRun, known: Known) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
-        self._allowed = run.settings.missed(run.problem)
+        self._allowed = run.settings.violation_tolerance(run.problem)
         clock = time.perf_counter()
         self._stages = Stages(run.problem)
         run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self._given: RunResult | None = None
-        self._valley: Motion | None = None
+        self._smoothed: Motion | None = None
         # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
         self._known = known
@@ -92,17 +103,17 @@ class Ladder:
             self._given = start  # the answer is no worse
         rungs: list[Callable[[], RunResult | None]] = []
         if guess.found is not None:
-            rungs.append(lambda: self._answered(guess.found))
+            rungs.append(lambda: self._finished(guess.found))
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
-            known = tuple(one.values for one in guess.multipliers)
-            rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
+            values = tuple(one.values for one in guess.multipliers)
+            rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=values))
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
             near = LITTLE if start.violation <= self._allowed else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
+            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._smoothed)]
         if stay or not self._known.from_start:  # the runs of a search have the same start
             rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
@@ -133,17 +144,17 @@ class Ladder:
         plan = run.work.arrays.rollout if settled else run.work.plan  # the plan of least cost so far
         if ending is not run.ending or not np.isfinite(run.work.memory["plan_cost"]):
             return None
-        self._valley = _plan(plan)
+        self._smoothed = _plan(plan)
         if self._budget.stop.due:
             return None
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
-            return self._interior(self._valley, MUCH)
+            return self._interior(self._smoothed, MUCH)
         # If the bottom of the valley keeps the constraints, it is the answer; with an ObstacleCost it is next to it.
         checkpoint = run.checkpoint()
         found = run.newton()
         if found.success and found.violation == 0:
-            return self._note(found)
-        bottom = _plan(found) if found.success else self._valley
+            return self._remember(found)
+        bottom = _plan(found) if found.success else self._smoothed
         run.go_on(checkpoint)
         return None if self._budget.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
 
@@ -160,7 +171,7 @@ class Ladder:
     def _augmented(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays in the valley that smoothing has chosen."""
         run = self._run
-        if self._valley is None or run.settings.elastic is not None or not self._guided:
+        if self._smoothed is None or run.settings.elastic is not None or not self._guided:
             return None
         with self._budget.limited(AUGMENTED):
             found = augmented_lagrangian.satisfy(run, run.result(run.ending))
@@ -183,7 +194,7 @@ class Ladder:
             if priced is None:
                 return None
             plan = priced.plan
-            self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            self._remember(self._result(plan.states, plan.controls, self._without_gains(plan)))
             if priced.settled:
                 return None
             if priced.near or price == PRICES[-1]:
@@ -236,23 +247,19 @@ class Ladder:
             self._known.evidence.append((found, there))
         return found is not None
 
-    def _interior(
-        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
-    ) -> RunResult | None:
+    def _interior(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
         """Run the interior point from a plan, and finish its result."""
-        return self._answered(self._iterate(plan, barrier, multipliers=multipliers))
+        return self._finished(self._interior_point(plan, barrier, multipliers=multipliers))
 
-    def _answered(self, found: Found | None) -> RunResult | None:
+    def _finished(self, found: Found | None) -> RunResult | None:
         """Finish a result of the interior point: with Newton's method if it converged, else as a rollout."""
         if found is None or not np.isfinite(found.plan.states).all():
             return None
-        if found.solved and (result := self._kept(found)) is not None and result.success:
-            return self._note(result)
-        return self._note(self._rolled_out(found.plan, found.gain))
+        if found.solved and (result := self._polished(found)) is not None and result.success:
+            return self._remember(result)
+        return self._remember(self._rolled_out(found.plan, found.gain))
 
-    def _iterate(
-        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
-    ) -> Found | None:
+    def _interior_point(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> Found | None:
         """Run the interior point; its iterations go to the log. None if it was interrupted."""
         budget, left = self._budget, self._budget.left - 1
         if left < 1 or budget.stop.due:
@@ -269,12 +276,12 @@ class Ladder:
         try:
             with np.errstate(all="ignore"):
                 point = InteriorPoint(
-                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=self._run.settings.price,
+                    self._problem, plan, barrier=barrier.parameter, room=barrier.room, price=self._run.settings.price,
                     multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
                     tolerance=self._run.final, violation=self._allowed, most=min(MOST, left),
-                    near=barrier is LITTLE, watch=watch,
+                    near=barrier.near, watch=watch,
                 )  # fmt: skip
         except BaseException as error:  # Ctrl-C: raised again when there is a solution
             budget.stop.error = error
@@ -309,7 +316,7 @@ class Ladder:
             cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
         )  # fmt: skip
 
-    def _kept(self, found: Found) -> RunResult | None:
+    def _polished(self, found: Found) -> RunResult | None:
         """Finish a converged plan: put controls at their limits there, and compute the policy by Newton's method.
 
         That minimises the augmented Lagrangian with the multipliers found, of which the plan is a minimum.
@@ -372,7 +379,7 @@ class Ladder:
         lagrangian.evaluate(result.states, result.controls)
         return result
 
-    def _note(self, found: RunResult) -> RunResult:
+    def _remember(self, found: RunResult) -> RunResult:
         """Copy a result if it is the best so far."""
         if self._best is None or found.rank < self._best.rank:
             law = found.law[0].copy(), found.law[1].copy()

@@ -380,7 +380,7 @@ class SolveRun:
         """How smoothing ended; NOT_FINITE if a function is not finite at the start.
 
         Raises:
-          InputError: so it is, and the budget is attentive.
+          InputError: a function is not finite at the start, and the budget is attentive.
         """
         start, control = self.work.start, self.initial_guess.offset[0]
         return check_finite_at_start(
@@ -689,7 +689,7 @@ class Workspace:
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve, also after another one of the same size with as many steps."""
-        self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
+        self._problem, self._tolerance, steps = problem, settings.violation_tolerance(problem), problem.steps
         self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0

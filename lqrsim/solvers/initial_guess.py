@@ -167,7 +167,7 @@ class InitialGuess:
         """The same with this penalty for all constraints from the first iteration on; unchanged for None.
 
         Raises:
-          InputError: there are no constraints, or there is a prior, whose iterations are without constraints.
+          InputError: the problem has no constraints, or there is a prior, during whose iterations constraints are off.
         """
         if penalty is None:
             return self

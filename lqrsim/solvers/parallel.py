@@ -77,7 +77,7 @@ def list_of(problems: Iterable[Problem]) -> list[Problem]:
 
 
 def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
-    """The problems as a list, with that noise and risk; None keeps their own."""
+    """The problems as a list, with noise and risk replaced where they are given."""
     listed = list_of(problems)
     if noise is None and risk is None:
         return listed

@@ -45,11 +45,11 @@ def prepare(
 
     Args:
       problem: one of the problems; others may have other states, goals, obstacles and parameters.
-      tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls,
-        times their ranges and relative to the cost.
+      tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, times that control's
+        range and relative to the cost; by default 1e-6.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: by how much equalities may be missed, by default 1e-6; inequalities are kept. With noise, or
-        dynamics of an MJCF, what inequalities are to have to spare, by default 1e-3.
+      constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise, or
+        the dynamics of an MJCF, the margin of inequalities, by default 1e-3.
       max_iterations: as in `smooth`.
       finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
@@ -109,7 +109,7 @@ class PreparedSolver:
             stages.change(worst=False)
             with np.errstate(all="ignore"):
                 InteriorPoint(self.problem, plan, stages=stages).run(
-                    tolerance=run.final, violation=run.settings.missed(self.problem), most=1
+                    tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
                 )
 
     def _stages_of(self, problem: Problem) -> Stages:
@@ -277,7 +277,7 @@ class _Neighbour:
     def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._run, self._stages, self._plan, self._best = run, stages, plan, best
         self._closing, self._budget = closing, run.budget
-        self._allowed = run.settings.missed(run.problem)
+        self._allowed = run.settings.violation_tolerance(run.problem)
         self.ended, self._cost = time.perf_counter(), np.inf
         self._out_of_time = False
 
@@ -298,8 +298,8 @@ class _Neighbour:
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    run.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
-                    room=LITTLE[1], multipliers=known, stages=self._stages,
+                    run.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE.parameter,
+                    room=LITTLE.room, multipliers=known, stages=self._stages,
                 )  # fmt: skip
 
                 def watch(measures: Measures) -> bool:
@@ -374,7 +374,7 @@ class _Best:
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
         # Equalities are kept only within a tolerance.
-        allowed = run.settings.missed(run.problem)
+        allowed = run.settings.violation_tolerance(run.problem)
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._copies: tuple[Array, ...] = ()
 

@@ -113,7 +113,7 @@ class SmootherSettings(Settings):
         """Price of violating constraints, in cost per unit; infinite unless they are elastic."""
         return np.inf if self.elastic is None else self.elastic
 
-    def missed(self, problem: Problem) -> float:
+    def violation_tolerance(self, problem: Problem) -> float:
         """Tolerance of constraints: the allowed violation, or the margin that the augmented Lagrangian aims at."""
         return self.constraint_tolerance or (MISSED if self.second_order(problem) else SPARED)
 

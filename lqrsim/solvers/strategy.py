@@ -85,7 +85,7 @@ def solve(
             search.retry_without_risk()
     chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
-    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)}
+    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
     solution = assemble(
         problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
         options=settings.options(chosen.initial_guess) | tolerances, candidates=search.candidates(),
@@ -190,7 +190,7 @@ class Search:
         return clearance is not None and not clearance.min() >= -0.5 * radius
 
     def _idle(self) -> bool:
-        """Whether the best plan does nothing, as where no control at rest helps alone, but several may together."""
+        """Whether the best plan does nothing, as when no single control helps from rest, but several together would."""
         found, nominal = self.best[1], self._problem.nominal_control
         off = np.abs(found.controls - nominal).max()
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
@@ -335,7 +335,7 @@ def _solve_for_duration(
             problem,
             begin.trajectory,
             tolerance=settings.final(problem),
-            violation=settings.missed(problem),
+            violation=settings.violation_tolerance(problem),
             watch=watch,
         )
         if (

@@ -189,7 +189,7 @@ def _check_folder(folder: Path) -> None:
             name for name in os.listdir(folder) if name not in _CAMPAIGN_FILES and not name.startswith(".unfinished-")
         )
         if others:
-            raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
+            raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
 
 
 def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path, given: Solution | None) -> None:
