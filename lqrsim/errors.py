@@ -99,6 +99,16 @@ def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> A
     return array
 
 
+def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
+    """Weights (size,), given as one number for all or as so many. Raises InputError unless they are finite and >= 0."""
+    if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
+        return np.full(size, check_number(field, value, at_least=0.0))
+    weights = check_array(field, value, (size,))
+    if (weights < 0).any():
+        raise InputError(f"{field}: got {excerpt(weights.tolist())}, want numbers >= 0")
+    return weights
+
+
 def vectors_of(field: str, value: npt.ArrayLike, size: int) -> Array:
     """`value` as float64 of shape (..., size), NaN included; copied only if necessary. Raises InputError."""
     array = real(field, value, f"numbers of shape (..., {size})")

@@ -8,7 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.errors import Array, InputError, check_array, check_flag, check_name, check_number, excerpt, vectors_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_flag,
+    check_name,
+    check_number,
+    check_weights,
+    excerpt,
+    vectors_of,
+)
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
@@ -200,9 +210,12 @@ class MjcfRobot(Robot):
           state: (n,), whose velocities do not count.
 
         Returns:
-          (m,), within their limits; where nothing holds it, what comes nearest, by the sum of squared forces.
+          (m,), within their limits; where nothing holds it, those with the least sum of squared forces left.
+
+        Raises:
+          InputError: the state is not (n,) finite numbers.
         """
-        return self._held(vectors_of("state", state, len(self.dynamics.state_coordinates))).controls
+        return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
     def _held(self, state: Array) -> Holding:
         model = self.dynamics.physics.model
@@ -220,25 +233,25 @@ class MjcfRobot(Robot):
         effort: npt.ArrayLike | None = None,
         damping: float = 1e-3,
     ) -> Problem:
-        """From one state to another, within the actuators' limits, and clear of obstacles by an ObstacleCost.
+        """Make a problem: from one state to another, within the actuators' limits, clear of obstacles at a cost.
 
-        Controls cost what they differ from those that hold the robot: at the start, or between start and goal if it can
-        be held at both. Solvers begin with these.
+        The cost of the controls is about those that hold the robot still at the start; if it can be held at the goal,
+        too, about the mean of both. Solvers start from these controls.
 
         Args:
           start: (n,), a state.
           goal: (n,), a state.
-          steps: how many control periods.
-          dt: seconds of one, about 0.02 by default.
-          weights: of what misses the goal at the end, for all states or (n,).
-          effort: of the controls, (m,); by default 1 for a control at its limit, or that of its force, or at 1.
-          damping: of the velocities of hinges, slides and ball joints at each step.
+          steps: the number of control periods.
+          dt: the control period in seconds; by default about 0.02.
+          weights: of the final error, one number for all states, or (n,).
+          effort: weights of the controls, (m,); by default such that a control at its limit costs 1/2.
+          damping: weight of the velocities of hinges, slides and ball joints at each step.
 
         Returns:
           The Problem.
 
         Raises:
-          InputError: as `Problem` does.
+          InputError: an argument is not as described.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
@@ -262,7 +275,7 @@ class MjcfRobot(Robot):
         return Problem(
             dynamics=dynamics, dt=dynamics.period_near(_PERIOD) or float(model.opt.timestep) if dt is None else dt,
             steps=steps, initial=FixedState(start), stage_cost=cost,
-            final_cost=QuadraticCost(np.broadcast_to(weights, (n,)), about=goal),
+            final_cost=QuadraticCost(check_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
         )  # fmt: skip
 

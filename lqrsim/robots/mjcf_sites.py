@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import Source, source_of
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number, check_text
+from lqrsim.errors import Array, InputError, check_array, check_name, check_text, check_weights
 from lqrsim.kernels import distance_constraint, mjcf_sites, residual_cost
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
@@ -84,7 +84,7 @@ class SiteCost(Cost):
     ) -> None:
         self.pose = _Pose("SiteCost", site, position, orientation)
         self.weights = tuple(
-            check_array(f"SiteCost: {name}", np.broadcast_to(check_weights(name, given), (3,)), (3,))
+            check_weights(f"SiteCost: {name}", given, 3)
             for name, given in (("weight", weight), ("turn_weight", turn_weight))
         )
 
@@ -139,13 +139,3 @@ class SiteConstraint(Constraint):
             shared=len(rows),
             functions=(memory,),
         )
-
-
-def check_weights(name: str, given: npt.ArrayLike) -> Array:
-    """A weight, or three, from 0. Raises InputError."""
-    if np.ndim(given) == 0:  # pyright: ignore[reportArgumentType]
-        return np.array(check_number(f"SiteCost: {name}", given, at_least=0.0))
-    weights = check_array(f"SiteCost: {name}", given, (3,))
-    if (weights < 0).any():
-        raise InputError(f"SiteCost: {name}: got {weights.tolist()}, want numbers from 0")
-    return weights

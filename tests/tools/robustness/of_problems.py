@@ -119,6 +119,11 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "parameters": {"mass": 2.0},
         }, 0.2),
         "MjcfRobot.with_parameters": ({"self": slider, "mass": 2.0, "slider_damping": 0.1},),
+        "MjcfRobot.hold": ({"self": slider, "state": slider.at(slider=0.1)},),
+        "MjcfRobot.problem": ({
+            "self": slider, "start": slider.at(), "goal": slider.at(slider=0.2), "steps": 5, "dt": 0.02,
+            "weights": 10.0, "effort": [1.0], "damping": 1e-3,
+        }, 0.3),
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),
@@ -156,7 +161,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             for kind, one in {
                 "Cost": cost, "QuadraticCost": cost, "ControlCost": ls.ControlCost([1.0], about=[0.0]),
                 "ObstacleCost": ls.ObstacleCost(world, radius=0.2), "SymbolicCost": ls.SymbolicCost(bowl),
-                "FunctionCost": ls.FunctionCost(bowl),
+                "FunctionCost": ls.FunctionCost(bowl), "SiteCost": ls.SiteCost("tip", position=(0.0, 0.0, 0.0)),
             }.items()
         },
         "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
@@ -171,6 +176,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "SymbolicConstraint.ahead": ({"self": ls.SymbolicConstraint(bowl, parameters={"a": 1.0}), "steps": 2},),
         "Constraint.ahead": ({"self": ls.GoalState([0.0, 1.0], states=("x", "v")), "steps": 2},),
         "GoalState.ahead": ({"self": ls.GoalState([0.0, 1.0], states=("x", "v")), "steps": 2},),
+        "SiteConstraint.ahead": ({"self": ls.SiteConstraint("tip", position=(0.0, 0.0, 0.0)), "steps": 2},),
         "StateBounds.ahead": ({"self": ls.StateBounds({"x": -1.0}), "steps": 2},),
         "GoalState": ({"goal": [0.0, 1.0], "states": ("x", "v")},),
         "StateBounds": ({"low": {"x": -1.0}, "high": {"v": 1.0}},),
