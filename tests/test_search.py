@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from comparing import same
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracle import kkt
 
 import lqrsim as ls
@@ -196,6 +198,60 @@ def arcs(x: Array, u: Array, p: Any) -> list[float]:
     return [speed * np.cos(x[2]), speed * np.sin(x[2]), (u[1] - u[0]) / p.axle_length]
 
 
+def among_discs(seed: int) -> ls.Problem:
+    """A point mass that is to get past two discs, which are constraints and no costs."""
+    rng = np.random.default_rng(seed)
+    discs = np.column_stack([rng.uniform([-0.5, -0.3], [0.5, 0.3], (2, 2)), rng.uniform(0.15, 0.3, 2)])
+    numbers = {f"{name}{i}": float(one[k]) for i, one in enumerate(discs) for k, name in enumerate("abr")}
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[2], x[3], u[0], u[1]],
+        states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s^2", "ay": "m/s^2"},
+        position=("x", "y"),
+    )  # fmt: skip
+
+    def outside(x: Any, u: Any, p: Any) -> list[Any]:
+        return [(x[0] - p.a0) ** 2 + (x[1] - p.b0) ** 2 - p.r0**2, (x[0] - p.a1) ** 2 + (x[1] - p.b1) ** 2 - p.r1**2]
+
+    return ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=30, initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),
+        stage_cost=ls.ControlCost((0.1, 0.1)), final_cost=ls.QuadraticCost(np.full(4, 100.0), about=(1.0, 0.0, 0.0, 0.0)),
+        constraints=[ls.SymbolicConstraint(outside, parameters=numbers)],
+    )  # fmt: skip
+
+
+class TestConstraintsInTheWay:
+    @given(seed=st.integers(0, 10_000))
+    @settings(max_examples=10, deadline=None, derandomize=True)
+    def test_a_plan_that_touches_one_costs_no_more_than_those_from_either_side(self, seed: int) -> None:
+        problem = among_discs(seed)
+        found = ls.smooth(problem)
+        alone = ls.smooth(problem, starts=1)
+        assert found.success
+        assert alone.candidates == ()
+        touches = any(one.values.any() for one in alone.multipliers)
+        assert [one.start for one in found.candidates] == (
+            ["nominal control", "a path 0.4 m to the left", "a path 0.4 m to the right"] if touches else []
+        )
+        costs = [alone.cost]
+        for aside in (-0.4, 0.4) if touches else ():
+            share = np.linspace(0, 1, problem.steps + 1)
+            way = share**3 * (10 - 15 * share + 6 * share**2)
+            states = np.outer(2 * way - 1, [1.0, 0.0, 0.0, 0.0])
+            states[:, 1] = aside * np.sin(np.pi * way)
+            side = ls.smooth(problem, start=ls.Trajectory(states, np.zeros((problem.steps, 2)), problem.dt))
+            costs.append(side.cost if side.success else np.inf)
+        assert found.cost == pytest.approx(min(costs), rel=1e-9)  # the same runs
+
+    def test_a_bound_of_a_speed_has_no_other_side(self) -> None:
+        """A plan at its bound is not searched for a way round; it is asked for in a line."""
+        problem = replace(among_discs(0), constraints=[ls.StateBounds(high={"vx": 0.8})])
+        solution = ls.smooth(problem)
+        assert any(one.values.any() for one in solution.multipliers)
+        assert solution.candidates == ()
+        with pytest.raises(ls.InputError, match="starts: got 3, want 1 without a start and a goal"):
+            ls.smooth(problem, starts=3)
+
+
 class TestWithoutAWay:
     def test_plain_functions_are_searched_with_too(self) -> None:
         """One thread, two, and formulas: all the same."""
@@ -228,7 +284,7 @@ class TestWithoutAWay:
         for changes in changed:
             problem = in_the_plane(**changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
-            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, a start"):
+            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without a start and a goal"):
                 ls.smooth(problem, starts=2)
             with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
                 ls.smooth_many([nowhere, problem], starts=2)

@@ -89,6 +89,30 @@ def _ours_in_free_time(solver: Callable[..., ls.Solution]) -> Solve:
     return solve
 
 
+def _search(problem: ls.Problem, *, compile: bool) -> Solve:
+    """`ls.smooth` with starts of its own, all of whose iterations count."""
+    if problem.duration is not None:
+        raise NotImplementedError("a free duration")
+
+    def solve(problem: ls.Problem, start: Start) -> Run:
+        log: list[ls.types.Iteration] = []
+        solution = ls.smooth(problem, constraint_tolerance=VIOLATION, threads=1, callback=log.append)
+        # Starts that are dropped after a few iterations tell the callback nothing. They come first.
+        dropped = max(sum(one.iterations for one in solution.candidates) - len(log), 0)
+        seconds = np.cumsum([log[0].seconds * dropped, *(one.seconds for one in log)])[1:].tolist()
+        moments = [
+            Moment(dropped + number, when, one.cost, missed(one))
+            for number, (when, one) in enumerate(zip(seconds, log, strict=True), 1)
+        ]
+        exact = solution.success and solution.optimality <= TOLERANCE and solution.violation < VIOLATION
+        return Run(
+            plan=solution.trajectory, cost=solution.cost, status=solution.status.name, solved=solution.success,
+            exact=moments[-1] if exact else None, first=partial(_first, moments),
+        )  # fmt: skip
+
+    return solve
+
+
 def _first(moments: list[Moment], enough: Enough) -> Moment | None:
     return next((moment for moment in moments if enough(moment)), None)
 
@@ -135,10 +159,13 @@ def _guess(problem: ls.Problem, start: Start) -> tuple[Array, Array]:
 
 _smooth = partial(_ours, ls.smooth, constraint_tolerance=VIOLATION, threads=1)
 
+SEARCH = "lqrsim, search"  # begins with starts of its own, where others begin with the one they are given
+
 # How each is made for problems of a kind. It raises peers.Unavailable where it is not installed, and
 # NotImplementedError where it does not take such problems.
 CONTESTANTS: dict[str, Callable[..., Solve]] = {
     "lqrsim": _smooth,
+    SEARCH: _search,
     "lqrsim, no finish": partial(_smooth, finish=None, tolerance=TOLERANCE),
     "ilqr": partial(_ours, ls.ilqr, tolerance=TOLERANCE),
     "box-FDDP": _box_fddp,

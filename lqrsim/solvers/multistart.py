@@ -10,15 +10,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from lqrsim.errors import Array, InputError
+from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.parallel import workers
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7
+ASIDE = 3  # the same where a constraint is to be passed
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
 PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
@@ -55,6 +58,32 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     return found
 
 
+def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]:
+    """Paths to the goal that bend to the sides, by name; none without a position, or where the goal is at the start.
+
+    Args:
+      count: the number of starts with the straight one, which is not among these; by default `ASIDE`.
+    """
+    place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
+    if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
+        return {}
+    found = {}
+    for name, bend in bends((goal - begin)[place], ASIDE if count is None else count)[1:]:
+        states = path(begin, goal, np.zeros(len(begin)), problem.steps)
+        states[:, place] = path(begin[place], goal[place], bend, problem.steps)
+        controls = np.tile(problem.nominal_control, (problem.steps, 1))
+        found[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+    return found
+
+
+def passable(problem: Problem) -> list[bool]:
+    """Whether each constraint may be one that a robot passes on one side or another: an inequality of states."""
+    return [
+        not (term.equality or term.final_only or term.uses_control or isinstance(constraint, StateBounds))
+        for constraint, term in zip(problem.constraints, problem.constraint_terms, strict=True)
+    ]
+
+
 def reweighted(problem: Problem, times: float) -> Problem:
     """The problem with heavier obstacles and goal, whose plans go round and arrive whatever the controls cost.
 
@@ -84,10 +113,10 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
 
 def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is asked for where there is nothing to go round."""
-    if count is not None and count > 1 and pull(problem) == 0:
+    if count is not None and count > 1 and pull(problem) == 0 and not (any(passable(problem)) and detours(problem)):
         raise InputError(
-            f"starts: got {count}, want 1 without an ObstacleCost, a start and a goal some way apart: there is nothing"
-            " to go round; or give a start"
+            f"starts: got {count}, want 1 without a start and a goal some way apart, and an ObstacleCost or a constraint"
+            " of states between them: there is nothing to go round; or give a start"
         )
 
 

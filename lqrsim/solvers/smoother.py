@@ -69,8 +69,9 @@ def smooth(
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
         multipliers it takes up. Or a function of the problem that returns one. Controls are cut off at their limits.
         With constraints the answer costs no more than a feasible plan that is given.
-      starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
-        The candidates are in the solution.
+      starts: how many starts to try. By default 7 where there is an ObstacleCost; 3 where the first plan touches an
+        inequality of the states, other than StateBounds, in a problem with a position; else 1, the straight way to the
+        goal or the nominal control. The candidates are in the solution.
       constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
         equalities no more than that. Where the augmented Lagrangian keeps them (see `finish`), inequalities are solved
         for with so much to spare, by default 1e-3.

@@ -5,7 +5,9 @@
      constraints, the others follow as long as they may cost less.
   2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
      ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
-  3. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
+  3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
+     (`Search.look_aside`).
+  4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
@@ -19,6 +21,7 @@ The budget of each start is `max_iterations`; the deadline is one for all (`budg
 """
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -31,7 +34,7 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Status
 from lqrsim.solvers import augmented_lagrangian
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.budget import Budget, Callback, Stop
@@ -40,7 +43,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import find_duration, settled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import Measures, iteration_of
-from lqrsim.solvers.multistart import SWAYS, bends, choose, guides, path, pull, reweighted, sinusoidal_controls
+from lqrsim.solvers.multistart import SWAYS, choose, detours, guides, passable, pull, reweighted, sinusoidal_controls
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
 
@@ -81,6 +84,8 @@ def solve(
         poor = search.says_infeasible or (default and search.is_unacceptable)
         if settings.safeguard and not stop.due and poor:
             search.widen()
+        if settings.start is None and search.best[0].second_order and not stop.due:
+            search.look_aside()
         if problem.risk > 0 and settings.safeguard and not stop.due:
             search.retry_without_risk()
     chosen, found = search.best
@@ -232,20 +237,25 @@ class Search:
         starts: dict[str, StartLike] = {
             f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
         }
-        place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
-        if place and begin is not None and goal is not None and (goal != begin)[place].any():
-            for name, bend in bends((goal - begin)[place], 3)[1:]:
-                states = path(begin, goal, np.zeros(len(begin)), problem.steps)
-                states[:, place] = path(begin[place], goal[place], bend, problem.steps)
-                controls = np.tile(problem.nominal_control, (problem.steps, 1))
-                starts[f"a path {name}"] = Trajectory(states, controls, problem.dt)
-        for name, one in starts.items():
+        for name, one in (starts | detours(problem)).items():
             if self._budget.stop.due or self.best[1].success:
                 return
-            run = self._another(resolve(one, problem))
-            self._named.append((name, run))
             self._known.from_start = False
-            self._finish(run)
+            self._finish_from(name, one)
+
+    def look_aside(self) -> None:
+        """Finish plans from paths aside, if the best plan touches a constraint that may be passed on another side."""
+        problem, tried = self._problem, {name for name, _ in self._named}
+        touched = any(one.values.any() for one in itertools.compress(self.best[1].multipliers, passable(problem)))
+        if touched and pull(problem) == 0:
+            for name, one in detours(problem, self._settings.starts).items():
+                if name not in tried and not self._budget.stop.due:
+                    self._finish_from(name, one)
+
+    def _finish_from(self, name: str, start: StartLike) -> None:
+        run = self._another(resolve(start, self._problem))
+        self._named.append((name, run))
+        self._finish(run)
 
     def _try_reweighted(self, times: float) -> None:
         """Solve for heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
