@@ -34,7 +34,7 @@ from lqrsim.solvers.restoration import Restored, restore
 FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
 STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
 AUGMENTED = 100  # iterations of the augmented Lagrangian
-OPENING, GUIDED = 10, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
+OPENING, GUIDED = 6, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
 MOST, RESTORED = 300, 150  # iterations of the interior point from one plan, and of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
@@ -67,7 +67,7 @@ class Barrier(NamedTuple):
     near: bool
 
 
-MUCH, LITTLE = Barrier(1.0, 0.02, near=False), Barrier(0.01, 0.01, near=True)
+MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
 
 
 class Ladder:

@@ -41,7 +41,7 @@ LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
 LATELY = 4  # iterations with that rule, than the worst of which the measures must be better for it to go on
 CLOSINGS, CLOSER = 3, 0.3  # corrections after a long step at most, and what each must leave of what was missed
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
-NOTHING = 1e-4  # relative to the typical cost of a change, a cost that counts as zero
+NOTHING, FAR = 1e-4, 1e-2  # scale of the first plan, relative to the typical cost of a change: the least; if infinite
 SHORTEST = 1e-7  # part of a step before the line search gives up
 MARGIN = 1e-5  # improvement that the filter requires
 ARMIJO = 1e-4  # part of the promised decrease that a step must achieve
@@ -432,7 +432,7 @@ class InteriorPoint:
         cost, arrived = stages.trial(plan)
         numbers = stages.values(plan)[live]
         # A cost near zero, as of standing still, says nothing about the scale of the problem.
-        self._scale = cost if NOTHING * self._typical < cost < np.inf else 1e-2 * self._typical
+        self._scale = max(cost, NOTHING * self._typical) if cost < np.inf else FAR * self._typical
         shape = live.shape
         size = np.broadcast_to(self._row_size, shape)[live]
         equality = np.broadcast_to(stages.equality, shape)[live]
@@ -449,6 +449,7 @@ class InteriorPoint:
         self._hard = np.concatenate([~np.isfinite(highest[below]), np.zeros(len(above), dtype=bool)])
         self._regularised = np.where(np.isfinite(lowest), 0.0, REGULARISATION * size**2 / self._scale)
         # In units of cost.
+        self._barrier = barrier
         self._first = barrier * self._scale / max(len(self._row), 1)
         self.parameter = self._first
         known = np.zeros(shape)
@@ -654,6 +655,10 @@ class InteriorPoint:
         stages, point, scale = self.stages, self.point, self._scale
         least = 0.1 * tolerance * scale
         free = self._falls()
+        # A bad first plan may cost a hundred times the optimum, which would make the first barrier too high.
+        self._first = min(self._first, self._barrier * scale / max(len(self._row), 1))
+        if self.parameter > self._first and self.iterations:
+            self.parameter, self._filter = self._first, []
         if self._mixed or self._part < LONG or not free:
             self._lower_barrier(least)
         duals = self._duals(self._force)
