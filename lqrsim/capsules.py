@@ -33,7 +33,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 
     Attributes:
-      length: of its segment, without the round ends, in metres; 0 for a ball.
+      length: length of its segment, without the round ends, in metres; 0 for a ball.
       radius: in metres, of the capsule and of each ball.
       tolerance: largest protrusion of the capsule from the balls, in metres, more than 0.
 

@@ -120,7 +120,7 @@ VECTOR = Pointer()
 
 
 def describe(kind: Type | None) -> str:
-    """How messages call a type."""
+    """Name of a type in messages."""
     match kind:
         case None:
             return "nothing"

@@ -27,7 +27,7 @@ logger = logging.getLogger("lqrsim")
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _SYMBOL = "function"
 
-# What was loaded in this process, by its key.
+# Functions loaded in this process, by key.
 _loaded: dict[str, tuple[Any, int]] = {}
 
 
@@ -124,7 +124,7 @@ def _numba_names() -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """The lines of numba's long error message that say what is wrong."""
+    """The lines of numba's long error message that describe the error."""
     if isinstance(error, AttributeError) and "NoneType" in str(error):
         return "a function that returns on every path, and does not change x and u"
     if "readonly" in str(error) and "setitem" in str(error):

@@ -1,4 +1,4 @@
-"""Functions in the kernels' subset, and what the names in them mean.
+"""Functions in the kernels' subset, and the meaning of the names in them.
 
 A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as which states are
 the position, and functions, such as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
@@ -79,7 +79,7 @@ def source_of(module: ModuleType, **constants: Constant) -> Source:
     """The functions of a module of `lqrsim/kernels`.
 
     Args:
-      module: of the kernels.
+      module: module of the kernels.
       **constants: numbers and tuples of numbers, in place of the module's.
 
     Raises:

@@ -73,7 +73,7 @@ def kept(
 
 @functools.cache
 def _writers() -> str:
-    """The source of the modules that write what is cached, which it depends on."""
+    """The source of the modules that write the cached files, because these depend on it."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
     files += [

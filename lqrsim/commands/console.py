@@ -62,7 +62,7 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 
 def result(**parts: object) -> None:
-    """Add to what `--json` prints; without it, do nothing."""
+    """Add to the output of `--json`; without it, do nothing."""
     found = _RESULT.get()
     if found is not None:
         found.update(parts)

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
-# Names with another meaning: what the written files use, MuJoCo's first body, pytest's own file, Windows' devices.
+# Names with another meaning: those used in the written files, MuJoCo's first body, pytest's own file, Windows' devices.
 TAKEN = {
     "any", "path", "self", "world", "conftest", "con", "prn", "aux", "nul",
     *(f"{port}{number}" for port in ("com", "lpt") for number in range(10)),

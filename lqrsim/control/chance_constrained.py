@@ -1,8 +1,8 @@
 """Plans that keep so far from obstacles, step by step, that they collide no more often than is asked.
 
 The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
-for all steps, and such that the chance of colliding at all, as `collision_chance.py` counts it, is what is asked. A
-plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+for all steps. It is chosen such that the chance of any collision, as `collision_chance.py` computes it, is the
+requested one. A plan with that clearance has a tube of its own, so it is found by solving again, a few times.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,10 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.solvers.smoother import smooth
 
-# How far below what is asked a plan may be, and is not made cheaper any more.
+# A plan whose chance is below the requested one by no more than this factor is not made cheaper.
 ENOUGH = 0.5
 HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
-AIM = 0.8  # of what is asked, the chance that a next plan is to have
+AIM = 0.8  # target for the next plan, relative to the requested chance
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
@@ -42,8 +42,8 @@ class SafePlan:
 
     Attributes:
       problem: with the clearances that were found as constraints.
-      solution: of it.
-      controller: what runs it, an OffsetFree or a policy.
+      solution: solution of it.
+      controller: the controller that follows the plan, an OffsetFree or a policy.
       tube: where that will be; `tube.collision_chance` is the chance.
       asked: the chance that was asked for.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
@@ -87,16 +87,17 @@ def smooth_chance_constrained(
     rounds: int = 8,
     progress: Callable[[int, int], object] | None = None,
 ) -> SafePlan:
-    """A plan whose predicted chance of collision is at most what is asked, at little more cost than need be.
+    """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
-    It ends where the chance is between half of what is asked and that, or where the plan without any clearance is safe
-    enough. Where nothing is, it returns the safest plan that it found, with `success` False: say with print(plan) how
+    It ends when the chance is between half of the requested one and the requested one, or when the plan without any
+    clearance is safe enough. Where nothing is, it returns the safest plan that it found, with `success` False: say with
+    print(plan) how
     far it got, and allow more, estimate better, or have another way round.
 
     Args:
       problem: with obstacles in its costs or constraints.
-      uncertainty: what runs meet; see `uncertainty_of`.
-      chance: of collision, between 0 and 1.
+      uncertainty: the uncertainty in a run; see `uncertainty_of`.
+      chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
       rounds: plans to solve for, at most.
@@ -205,7 +206,7 @@ class _Search:
         best = self._best()
         if not first and best.success and best.tube.collision_chance >= ENOUGH * self.asked:
             return None
-        if np.isfinite(self.impossible):  # between what has a plan and what has none
+        if np.isfinite(self.impossible):  # between a margin that has a plan and one that has none
             low = self.too_few if not np.isfinite(self.enough) else None
             if low is None or self.impossible - low < 0.05 * self.impossible:
                 return None

@@ -42,11 +42,11 @@ class Surroundings:
     """Obstacles of a problem, as its robot sees them.
 
     Attributes:
-      dynamics: of the problem.
+      dynamics: dynamics of the problem.
       worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
       seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
-      place: which states are its position. position: these, or, with balls, all that move it.
-      std: of where an obstacle is, in m.
+      place: the states that are its position. position: the same, or, with balls, all states that move it.
+      std: standard deviation of an obstacle's position, in m.
     """
 
     dynamics: Dynamics

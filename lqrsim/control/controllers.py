@@ -1,6 +1,6 @@
 """Whatever decides on the controls: a policy, a function or a `Controller`; and one run of it.
 
-Affine laws run compiled for many trials at once, so that each trial gets what it gets alone, to the last bit.
+Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone.
 `AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
 """
 
@@ -27,7 +27,7 @@ from lqrsim.results.policy import AffinePolicy
 def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
     """What evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
 
-    As `AffinePolicy.__call__`, but that each trial gets what it gets alone, to the last bit.
+    As `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
     """
     limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
     laws = _laws(len(states), len(controls))
@@ -61,7 +61,7 @@ ControlFunction = Callable[[Array, float], npt.ArrayLike]
 
 
 class ControllerRun(abc.ABC):
-    """One run of a controller: what it remembers of K trials, and what it records of them."""
+    """One run of a controller: its memory of K trials, and what it records."""
 
     @abc.abstractmethod
     def control(self, step: int, measured: Array) -> Array:
@@ -96,7 +96,7 @@ class ControllerRun(abc.ABC):
 class Controller(abc.ABC):
     """What decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
 
-    Running a controller does not change it: `start` makes what a run remembers, so one controller can serve several
+    Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
     """
 
@@ -138,10 +138,10 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
     Args:
       given: what runs; None for the policy of the plan.
       plan: None for the controller's own.
-      dynamics: of the robot that it runs on.
+      dynamics: dynamics of the robot that it runs on.
 
     Raises:
-      InputError: what is given controls nothing, or there is no plan.
+      InputError: the object is no controller, or there is no plan.
     """
     check_kind("plan", plan, (Plan, type(None)), "a Plan, such as smooth(problem)")
     if plan is None and isinstance(given, Controller):
@@ -244,7 +244,7 @@ class FunctionController(Controller):
 
     @property
     def digest(self) -> str:
-        """Of what the function does, where that can be told, or else of its name."""
+        """Hash of what the function does, where that can be determined, else of its name."""
         known = fingerprint(self.function) or f"function {getattr(self.function, '__qualname__', type(self.function))}"
         return sha256(f"{known} {self.dt!r}")[:16]
 

@@ -29,7 +29,7 @@ class FilterLaw:
       plan: that it follows, as solved.
       model: the linear model about it, which the filter assumes.
       filter: its gains and covariances.
-      weights: of deviations from the plan.
+      weights: weights of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
     """
@@ -83,7 +83,7 @@ class FilterRun(ControllerRun):
       law: in force.
       first: the step that its plan begins at.
       z: the estimates now, (K, Z), of the knot that the newest measurement is of.
-      estimates: what was recorded of them, (T+1, K, Z), or None; see `OffsetFree`.
+      estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.
       innovations: likewise, (T+1, K, Y).
     """
 
@@ -188,7 +188,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     measured = _expected(law)
     for t in range(steps):
         knot = max(t - latency, 0)  # of z
-        under_way = min(t, latency) + delay  # commands, of which the newest are last
+        under_way = min(t, latency) + delay  # commands, the newest last
         first = width - under_way * m
         arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
         if t >= latency:

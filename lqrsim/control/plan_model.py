@@ -5,8 +5,7 @@ else none), and the states of the unknowns (D). With u the deviation of the comm
 
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 
-c is what the lag does to a plan that does not know of it: the actuators' nominal is what they reach when they are given
-the planned controls.
+c is the effect of the lag on a plan made without it: nominally the actuators are where the planned controls take them.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +49,7 @@ class Sensor(NamedTuple):
 
     Attributes:
       source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
-      data: what these take. size: Y, how many numbers there are. names: what messages call them.
+      data: their parameters. size: Y, how many numbers there are. names: what messages call them.
     """
 
     source: Source
@@ -63,7 +62,8 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     """Return the sensor for a user's `sensors`.
 
     Raises:
-      InputError: there is no such state, a matrix of another shape, or a function that depends on what is no state.
+      InputError: there is no such state, a matrix has another shape, or a function depends on something that is no
+        state.
     """
     if sensors is None:
         sensors = space.names
@@ -137,12 +137,12 @@ class Lag:
 
 @dataclass(frozen=True)
 class PlanModel:
-    """A plan with what is uncertain about it, linearised.
+    """A plan and its uncertainty, linearised.
 
     Attributes:
       dynamics: with the disturbances as parameters.
       plan: nominal states (T+1, n) and controls (T, m).
-      uncertainty: what there is. sensor: what is measured.
+      uncertainty: the uncertainty in a run. sensor: the measured quantities.
     """
 
     dynamics: Dynamics

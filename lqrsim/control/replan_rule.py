@@ -70,12 +70,12 @@ class ReplanRecord:
     """How one solve went.
 
     Attributes:
-      step: the control period in which it began.
-      trial: of a simulation, else 0.
+      step: control period in which the solve began.
+      trial: number of a simulation, else 0.
       status: how the solve ended.
       iterations: how many it took.
       seconds: how long it took.
-      cost: of the new plan.
+      cost: cost of the new plan.
       before: cost of continuing with the law in force.
       used: whether its plan came into force.
       reason: why not, or why it is no better; empty if all went well.
@@ -113,9 +113,9 @@ class ReplanLog:
         """Count a solve.
 
         Args:
-          step: in which it began.
-          trial: of a simulation, else 0.
-          replan: its answer.
+          step: control period in which the solve began.
+          trial: number of a simulation, else 0.
+          replan: the answer of the solve.
           late: whether it came after the deadline.
 
         Returns:
@@ -192,7 +192,7 @@ class ReplanRule:
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
       predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
       when: a funnel of the solution, if solves are only for states outside it.
-      share: of the funnel's level that counts as its boundary.
+      share: share of the funnel's level that counts as its boundary.
       changes: (time in s, problem) -> the problem as it is known by then.
 
     Attributes:
@@ -249,7 +249,7 @@ class ReplanRule:
         self.solver = prepare(problem)
 
     def problem_at(self, step: int, problem: Problem) -> Problem:
-        """A problem as it is known in a control period: with what `changes` makes of it."""
+        """A problem as it is known in a control period, with the result of `changes`."""
         if self.changes is None:
             return problem
         return self.checked(f"{self._who}: changes", self.changes(step * self.problem.dt, problem))

@@ -1,11 +1,11 @@
 """Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
 At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
-constants at their estimated values. Where that collides or misses the goal, what is left of the horizon is solved from
-there, and the law and the filter are made anew about that plan. Elsewhere a new plan would do harm: it is of less cost,
-and as near to obstacles as its constraints let it. The estimates go on as they are; the law acts on what they differ by
-from what the new plan takes for granted. Gusts pass, and plans do not know of them; gains and offsets of the controls
-and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
+constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved from
+there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it is of less cost, and
+as near to obstacles as its constraints let it. The estimates continue unchanged; the law acts on their difference from
+the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of the controls and
+the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
 simulation.
 """
 
@@ -39,7 +39,7 @@ class ReplannedRun(ControllerRun):
       always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
-      plans: of each trial, by the step that they begin at; without the first.
+      plans: plans of each trial, by the step that they begin at; without the first.
       log: how the solves went.
       estimates: as of `FilterRun`.
       innovations: likewise.

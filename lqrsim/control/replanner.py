@@ -59,7 +59,7 @@ class LiveReplanner:
       clock: likewise.
 
     Attributes:
-      problem: that is solved from now on.
+      problem: the problem that is solved from now on.
       active: the plan in force, `active.plan`, and the control period that it begins at, `active.first`.
       log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, how many were used; and
         `log.kept`, why others were not, and the law before went on: reason -> how many.
@@ -167,7 +167,7 @@ class LiveReplanner:
         self._queue.put(solve)
 
     def _take(self, step: int) -> None:
-        """Put an answer into force whose time has come; what is not there by then is not used."""
+        """Put an answer into force when its time has come; an answer that is late is not used."""
         solve = self._solve
         if solve is None or step < solve.request.first:
             return
@@ -212,12 +212,12 @@ class Replanner(Controller):
     has a `log` of the solves, as a `LiveReplanner` has, and the plans in force, `active`.
 
     Args:
-      problem: that was solved.
+      problem: the problem that was solved.
       solution: its solution, or another plan of it.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default one control period, or as long as `computing` takes, where that is a number and longer.
-      horizon: "shrinking", what is left of the first plan's, or "moving", always as long as that.
+      horizon: "shrinking", the rest of the first plan's, or "moving", always as long as the first plan's.
       predict: whether to solve from where the law in force leads by the deadline, by the model. Without it, plans begin
         where the robot was, not where it is.
       changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
@@ -226,11 +226,12 @@ class Replanner(Controller):
       when: a funnel of the solution, for the horizon "shrinking": solve only for states that are outside at the time,
         about the plan in force. What is certified is the first plan's; about a later one, or after a change, the same
         ellipsoids are a rule of thumb.
-      share: of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and loses
+      share: share of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and
+        loses
         fewer trials, for a plan that begins at the boundary often comes too late.
       computing: how long a solve takes in simulations, in seconds: a number; a function of a `numpy.random.Generator`,
         which draws it; or "measured".
-      seed: of what `computing` draws.
+      seed: seed of the random numbers for `computing`.
 
     Raises:
       InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.
@@ -274,7 +275,7 @@ class Replanner(Controller):
         Args:
           interpolate: whether laws are blended between two knots, for loops that are faster than the plan; see
             `AffinePolicy`.
-          clock: what time it is, in seconds, for deadlines.
+          clock: returns the time in seconds, for deadlines.
 
         Returns:
           A LiveReplanner, for one run.

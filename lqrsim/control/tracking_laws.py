@@ -32,8 +32,8 @@ class Weights:
 
     Attributes:
       state: the diagonal of Q, (n,); or of several to compare, (C, n).
-      control: of R, (m,).
-      end: of Q_T, likewise.
+      control: diagonal of R, (m,).
+      end: diagonal of Q_T, likewise.
     """
 
     state: Array

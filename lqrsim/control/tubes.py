@@ -31,15 +31,16 @@ class Tube:
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: what the states are.
-      mean: of the deviation of the state, (T+1, n).
-      covariance: of it, (T+1, n, n).
+      state_coordinates: names and units of the states.
+      mean: mean of the deviation of the state, (T+1, n).
+      covariance: covariance of that deviation, (T+1, n, n).
       across: of the deviation with that of the knot before, (T, n, n).
-      estimate_covariance: of the error of the estimate, before each measurement, (T+1, n, n); None without a filter.
+      estimate_covariance: covariance of the error of the estimate, before each measurement, (T+1, n, n); None without a
+        filter.
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
       step_chance: the chance of being in collision at each knot, (T+1,); bounded by the sum over obstacles.
-      collision_chance: of colliding at all.
+      collision_chance: chance of colliding at all.
 
     Raises:
       InputError: arrays that do not fit together.
@@ -80,7 +81,7 @@ class Tube:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
         Args:
-          rollout: of the same plan.
+          rollout: rollout of the same plan.
 
         Returns:
           The rollout with its `tube` and `collision_chance`.
@@ -102,10 +103,10 @@ def predict_tube(
     """Where a run will be about its plan, and how likely it is to collide, before any run.
 
     Args:
-      problem: that was solved, with the obstacles in its costs and constraints.
+      problem: the problem that was solved, with the obstacles in its costs and constraints.
       solution: with the plan.
-      uncertainty: what the run meets.
-      controller: what runs it: an OffsetFree or an AffinePolicy; by default the solution's policy.
+      uncertainty: the uncertainty in a run.
+      controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
 
     Returns:
       The Tube.
@@ -131,7 +132,8 @@ def predict_tube(
 
 
 def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
-    """The tube of a closed loop among obstacles. Raises InputError for what the linear model does not have."""
+    """The tube of a closed loop among obstacles. Raises InputError for a controller that the linear model does not
+    cover."""
     model = loop.model
     for field in ("latency", "delay"):
         if getattr(model.uncertainty, field):

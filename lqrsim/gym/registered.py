@@ -42,7 +42,7 @@ def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasi
     """Make many environments of one scenario, run by MuJoCo as one batch: see `VectorEnvironment`.
 
     Args:
-      scenario: as in `make_env`. num_envs: how many. options: those of `VectorEnvironment`.
+      scenario: as in `make_env`. num_envs: number of environments. options: those of `VectorEnvironment`.
 
     Raises:
       InputError: as `VectorEnvironment` does.

@@ -134,8 +134,8 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
       policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.
 
     Returns:
-      The step whose control block is not positive definite, T + 1 if it is the start's, or -1; and how many rows are
-      wrong.
+      The step whose control block is not positive definite (T + 1 for the start's, -1 for none), and the number of rows
+      with the wrong state.
     """
     stage, slope = stack(W, W), stack(W)
     for t in range(steps, -1, -1):

@@ -1,4 +1,4 @@
-"""One step of the Riccati recursion, which makes the cost-to-go at t of that at t + 1. The kernels' subset.
+"""One step of the Riccati recursion, from the cost-to-go at t + 1 to that at t. The kernels' subset.
 
 Paper: Eqs. (9)-(13), in discrete time.
 """

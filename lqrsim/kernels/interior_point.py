@@ -247,7 +247,7 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
 
     Args:
       part: the fraction. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
-      limits: of the controls at each step, (T, M) each. out: Motion, written.
+      limits: limits of the controls at each step, (T, M) each. out: Motion, written.
     """
     copy(plan.states[0], N, out.states[0])
     for t in range(steps):

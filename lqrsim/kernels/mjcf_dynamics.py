@@ -29,9 +29,9 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
 # is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# what lets others run; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
-# mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and places in qpos and qvel,
-# three numbers each.
+# the function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
+# mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and
+# places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
 RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, TABLE = 22, 23, 24, 25, 26, 27
@@ -47,7 +47,7 @@ JOBS = 65536  # the ticket is JOBS * job + column
 PATIENT = 2000  # looks at the ticket before a helper lets others run
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
-LARGEST = 1e10  # MuJoCo's mjMAXVAL: what is beyond is no state of anything
+LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are no valid state
 
 
 def advance(x, u, p, h, out):
@@ -115,7 +115,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
 
 
 def help_out(p):
-    """Do columns of what others linearise about, until told to stop.
+    """Compute columns for the threads that linearise, until told to stop.
 
     A column is taken first and its job looked at then: as long as it is not done, nobody writes another job.
     """

@@ -154,7 +154,8 @@ class ModelOrder(NamedTuple):
 
     Attributes:
       damping: weight on changes of the controls.
-      share: of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for Newton's,
+      share: share of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
+        Newton's,
         with true Hessians of the costs, and those of the dynamics times the costate.
       known: the cost-to-go that weighs noise, if `share` is above 0.
     """

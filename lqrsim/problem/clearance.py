@@ -22,9 +22,10 @@ class Clearance(Constraint):
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
+      radius: radius of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
       balls: the robot's balls, as for an ObstacleCost.
-      geoms: what collides of a robot from an MJCF, as for an ObstacleCost: one distance for each body and obstacle.
+      geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
+        obstacle.
       margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 

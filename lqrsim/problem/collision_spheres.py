@@ -44,7 +44,7 @@ class SphereCenters:
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
       in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
-      functions: what the source calls with `call`; their addresses come first in what it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: str | Source
@@ -109,7 +109,7 @@ class CollisionSpheres:
         in a plane, and then they see the world as the position does: see `World.seen_by`. p has the dynamics'
         parameters as attributes.
       radii: (K,) of the balls, in metres.
-      names: of the balls, by which messages call them; by default "ball 0", "ball 1", ....
+      names: names of the balls, by which messages call them; by default "ball 0", "ball 1", ....
       sites: of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that the
         middle of each is where the formula has it.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
@@ -192,7 +192,7 @@ class CollisionSpheres:
         """Bind the places to a system.
 
         Args:
-          dynamics: of the system whose states move the balls.
+          dynamics: dynamics of the system whose states move the balls.
 
         Returns:
           The `SphereCenters`.
@@ -297,7 +297,7 @@ class CollisionSpheres:
         Of places in a plane that is seen from above, the height is 0.
 
         Args:
-          dynamics: of the system whose states move the balls.
+          dynamics: dynamics of the system whose states move the balls.
           states: (..., n).
 
         Returns:
@@ -313,7 +313,7 @@ class CollisionSpheres:
 def check_outline(
     field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
 ) -> float:
-    """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest; of geoms, 0.
+    """The radius that is kept clear of obstacles, checked: of balls, that of the largest; of geoms, 0.
 
     Raises:
       InputError: it is negative, these are no balls or geoms, or it is not one of the three.
@@ -366,7 +366,7 @@ def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[A
 
 
 def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> None:
-    """Call a function of `kernels/sphere_centers.py`; what a user's function raises comes through."""
+    """Call a function of `kernels/sphere_centers.py`; exceptions of a user's function pass through."""
     filled = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
     data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)

@@ -45,14 +45,14 @@ class ConstraintTerm:
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
       rows: how many numbers there are at a step.
-      describe: what a message calls a row.
+      describe: returns the name of a row for messages.
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
       equality: whether they are to be zero.
       final_only: whether they act at the last step alone.
       shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
         source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
         these numbers (shared,) and their derivatives (shared, n) in place of x and u.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: str | Source
@@ -93,7 +93,7 @@ class Constraint(abc.ABC):
         """Bind the constraint to a system.
 
         Args:
-          dynamics: of the system.
+          dynamics: dynamics of the system.
 
         Returns:
           The ConstraintTerm that solvers use.
@@ -227,7 +227,7 @@ class GoalState(Constraint):
             raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
 
     def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
-        """What is asked of which state, by its index. Raises InputError if it does not fit."""
+        """The required value or bounds of each state, by its index. Raises InputError if it does not fit."""
         names = dynamics.state_coordinates.names
         wanted = names if self.states is None else self.states
         if len(self.goal) != len(wanted):
@@ -289,7 +289,8 @@ class StateBounds(Constraint):
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
-    """What all GoalStates ask of which state, by its index. Raises InputError if two contradict each other."""
+    """The values that all GoalStates require, by the index of the state. Raises InputError if two contradict each
+    other."""
     goals: dict[int, float] = {}
     for constraint in constraints:
         for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():

@@ -51,9 +51,9 @@ class CostTerm:
       nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
         sum of all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
-      factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
+      factor: index in `data` of a number that the whole term is proportional to, if it may be reduced in the first
         iterations; see `InitialPrior`. None where there is none.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
       exact_hessian: whether the Hessian is all of it. Where a part is left out on purpose, `check_derivatives` does not
         compare it with differences.
     """
@@ -101,7 +101,7 @@ class Cost(abc.ABC):
         """Bind the cost to a system.
 
         Args:
-          dynamics: of the system.
+          dynamics: dynamics of the system.
 
         Returns:
           The CostTerm that solvers use.
@@ -134,7 +134,7 @@ class CostSum(Cost):
 
 
 def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
-    """The terms of a sum; a single cost is its own. Raises InputError for what is no cost."""
+    """The terms of a sum; a single cost is its own. Raises InputError for an object that is no cost."""
     if isinstance(cost, CostSum):
         return cost.terms
     if not isinstance(cost, Cost):
@@ -190,10 +190,11 @@ class ObstacleCost(Cost):
 
     Args:
       world: the obstacles.
-      radius: of the robot at its position, in metres.
+      radius: radius of the robot at its position, in metres.
       balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
-      geoms: what collides of a robot from an MJCF, as `robot.geoms`, at MuJoCo's distances: the sum is over its bodies
-        and the obstacles, and what is farther away than 16 / sharpness costs nothing. One of radius, balls and geoms.
+      geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances: the sum is over its
+        bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. One of radius, balls and
+        geoms.
       sharpness: in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """
@@ -335,7 +336,7 @@ class SymbolicCost(Cost):
 
 
 class FunctionCost(Cost):
-    """A cost given as a numba or a plain Python function, for what `SymbolicCost` cannot express.
+    """A cost given as a numba or a plain Python function, where `SymbolicCost` cannot express it.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.

@@ -1,4 +1,5 @@
-"""Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
+"""Checks the values and derivatives of a user's functions: before the first iteration, and where derivatives are in
+doubt."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
 
 
 def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
-    """The cost terms, with what messages call them."""
+    """The cost terms, with their names in messages."""
     for name in ("initial", "stage_cost", "final_cost"):
         cost = getattr(problem, name)
         if not isinstance(cost, FixedState):
@@ -139,7 +140,7 @@ class DerivativeCheck:
       difference: the difference quotient there.
       state: (n,), where that was.
       control: (m,), where that was.
-      tolerance: what the error must not exceed.
+      tolerance: the largest acceptable error.
     """
 
     what: str
@@ -188,8 +189,8 @@ def check_derivatives(
       subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
       samples: how many points.
       spread: their standard deviation, in the units of states and controls.
-      tolerance: of the error, relative to each entry.
-      seed: of the points.
+      tolerance: tolerance of the error, relative to each entry.
+      seed: seed of the points.
 
     Returns:
       One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
@@ -222,8 +223,8 @@ class _Derivative(NamedTuple):
     """A matrix of derivatives at a point.
 
     Attributes:
-      what: as messages call it. rows, columns: names.
-      stated: by the function that is checked. differences: what `_differences` returns.
+      what: its name in messages. rows, columns: names.
+      stated: derivatives from the function that is checked. differences: the result of `_differences`.
       x, u: the point.
     """
 

@@ -34,7 +34,7 @@ LONGEST = 1500  # operations of a formula whose second derivatives are derived: 
 
 
 class Dynamics:
-    """`xdot = f(x, u)`: Eq. (1), with what its states and controls mean.
+    """`xdot = f(x, u)`: Eq. (1), with the meaning of its states and controls.
 
     A pendulum, swung by a motor:
 
@@ -62,8 +62,8 @@ class Dynamics:
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
-      disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
-        the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
+      disturbances: quantities unknown when planning, such as a wind or the remaining share of a motor's force: name ->
+        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants
         and are not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
@@ -73,7 +73,7 @@ class Dynamics:
       offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
-      control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
+      control_limits: lowest and highest control, numbers or (m,); the actuators' range, for execution.
       jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
         that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
@@ -85,7 +85,7 @@ class Dynamics:
 
     # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
     discrete: ClassVar[bool] = False
-    # Hash of what else defines the dynamics besides source and parameters; empty for functions.
+    # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
 
     def __init__(
@@ -167,7 +167,7 @@ class Dynamics:
         self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is derived and cannot be pickled."""
+        """Without derived attributes that cannot be pickled."""
         return {
             name: value
             for name, value in vars(self).items()
@@ -463,7 +463,7 @@ def _parameters_of(
 
 
 def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
-    """The lowest and the highest of each of so many controls. Raises InputError for what is no such pair."""
+    """The lowest and the highest of each of so many controls. Raises InputError for anything but such a pair."""
     limits = control_limits if control_limits is not None else (-np.inf, np.inf)
     try:
         low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)

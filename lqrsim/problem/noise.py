@@ -1,7 +1,6 @@
 """Noise that dynamics are driven by, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
 
-The same object is what a plan takes into account, `Problem(noise=...)`, and what a trial meets, as one of the
-disturbances of `simulate`.
+The same object serves for planning, as `Problem(noise=...)`, and in trials, as one of the disturbances of `simulate`.
 """
 
 import copy
@@ -45,7 +44,7 @@ class NoiseTerm:
       data: (any,) the parameters or the matrix, then the strength.
       rows: the states that noise acts on at once. size: of w.
       active: the entries of (x, u), states before controls, that M depends on.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: Source
@@ -175,7 +174,7 @@ class Noise:
         """The noise for a system.
 
         Args:
-          dynamics: of the system, with its states and controls.
+          dynamics: dynamics of the system, with its states and controls.
 
         Returns:
           What gets compiled, and the numbers that it reads.
@@ -263,7 +262,7 @@ class Noise:
         """M at given states and controls.
 
         Args:
-          dynamics: of the system, with its states and controls.
+          dynamics: dynamics of the system, with its states and controls.
           states: (K, n).
           controls: (K, m).
 

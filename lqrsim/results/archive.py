@@ -77,7 +77,7 @@ class Archive:
 
     Attributes:
       meta: the object of the JSON text, unchecked.
-      headers: of each array; the arrays have not been read yet.
+      headers: headers of each array; the arrays have not been read yet.
     """
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:

@@ -31,8 +31,8 @@ class Coordinates:
     """The meaning of the entries of a vector.
 
     Attributes:
-      names: of the entries.
-      units: of the entries; "" for none.
+      names: names of the entries.
+      units: units of the entries; "" for none.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
         without a position, and two of x, y and z for a planar one. By default it follows from names that end in these

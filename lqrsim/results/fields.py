@@ -44,8 +44,8 @@ class Declared(NamedTuple):
     """What an annotation says of a field.
 
     Attributes:
-      kinds: of which one is meant; what `typing` names them by.
-      dtype: of an array, float64 or int64; None for anything else.
+      kinds: the kinds that are allowed; `typing`'s names.
+      dtype: type of an array, float64 or int64; None for anything else.
       letters: the shape of an array, or the length of something else; empty where none is said.
       longest: characters of a text that is one printable line; None for any text.
       optional: whether it may be None.

@@ -42,8 +42,8 @@ class Funnel:
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: what the states are.
-      control_coordinates: what the controls are.
+      state_coordinates: names and units of the states.
+      control_coordinates: names and units of the controls.
       states: names of the d states that may be off the plan.
       shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
@@ -59,9 +59,9 @@ class Funnel:
       policy_digest: hash of the controller.
       goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
       disturbances: a description of each.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       options: the settings of the search.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
 
     Raises:
       InputError: the parts do not fit together, or the trials do not show the rate.
@@ -216,7 +216,7 @@ class Funnel:
         Args:
           knot: number of the knot.
           points: (..., d).
-          level: of the ellipsoid.
+          level: level of the ellipsoid.
 
         Returns:
           (..., n).

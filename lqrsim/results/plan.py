@@ -46,7 +46,7 @@ class Plan:
         check_fields(self)
         if self.cost_to_go is not None:
             check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
-        _ = self.target  # which refuses what is no goal
+        _ = self.target  # which refuses anything but a goal
         if self.status.success and not self.trajectory.finite:
             raise InputError(
                 f"{who}: trajectory: got NaN or infinity in a plan that is {self.status.name}, want numbers"
@@ -110,9 +110,9 @@ class Replan(Plan):
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
-      cost: of the plan, start and end included.
+      cost: cost of the plan, start and end included.
       before: cost of the rollout of the law that the solve began with.
-      violation: of the worst constraint at the steps; 0 where all are kept.
+      violation: violation of the worst constraint at the steps; 0 where all are kept.
       iterations: number of iterations.
       seconds: time that the solve took.
       iterating: part of `seconds` in iterations and in the first rollout.

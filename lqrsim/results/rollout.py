@@ -71,7 +71,7 @@ class Rollout:
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
         scaled error where the goal has no position.
-      radius: of the robot's collision circle or sphere, in metres.
+      radius: radius of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) states as measured, which the controller gets.
       commanded: (K, T, m) the controller's commands.
@@ -93,9 +93,9 @@ class Rollout:
       frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each.
-      seed: of the random numbers.
+      seed: seed of the random numbers.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.

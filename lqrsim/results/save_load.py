@@ -52,7 +52,7 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
       The path.
 
     Raises:
-      InputError: the file cannot be written; or what it would hold could not be read again.
+      InputError: the file cannot be written, or its content could not be read again.
     """
     path = check_path("output", path)
     kinds = ", ".join(f"{'an' if kind.__name__[0] in 'AO' else 'a'} {kind.__name__}" for kind in FORMATS)
@@ -82,7 +82,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
 
     Args:
       path: of a file that `save` wrote.
-      kind: what it has to be: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
+      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
         By default, whatever it is.
 
     Returns:

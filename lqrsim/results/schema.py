@@ -1,4 +1,4 @@
-"""Checks of JSON that anyone may have written; each reports in one line what is wrong.
+"""Checks of JSON from untrusted files; each reports in one line what is wrong.
 
 A check takes the name of a field and its value, and returns the value. `parse` reads the text, `canonical` writes it.
 """

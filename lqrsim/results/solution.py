@@ -32,11 +32,11 @@ class Solution(Plan):
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
         where the problem has no obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
-      gap: of the plan; see `Iteration.gap`. NaN if there is none.
+      gap: gap of the plan; see `Iteration.gap`. NaN if there is none.
       solver: name of the function that was called.
       options: its settings; with noise, a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       scenario: the scenario that the command line solved; empty where a program called the solver.
       candidates: the starts that were tried, if there were several.
     """

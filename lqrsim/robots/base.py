@@ -18,7 +18,7 @@ class Robot(abc.ABC):
     """Subclass it to add a robot; see `quadrotor.py` for an example and `docs/adding_a_robot.md` for the steps.
 
     Attributes:
-      name: what the command line calls it.
+      name: its name on the command line.
       body: the body in the MJCF that is the robot; its origin is where the states say that its position is. Obstacles
         are everything else that is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
@@ -26,10 +26,12 @@ class Robot(abc.ABC):
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
-      radius: of its collision circle (seen from above) or ball (the rest), in metres.
-      balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
+      radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
+      balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
+        None by
         default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
-      geoms: what collides, in place of both, where a simulator has distances: of a robot from an MJCF. None by default.
+      geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
+        None by default.
     """
 
     name: str

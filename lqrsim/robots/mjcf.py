@@ -69,20 +69,21 @@ class MjcfRobot(Robot):
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
       body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
         that moves and has mass.
-      position: the 2 or 3 states that are the body's place in the world, in metres; by default those of which MuJoCo's
-        kinematics says so. () for none.
-      radius: of a ball about the body's origin that has in it all that may collide; by default the least that is sure.
+      position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
+        MuJoCo's kinematics. () for none.
+      radius: radius of a ball about the body's origin that contains everything that may collide; by default the
+        smallest guaranteed one.
       outline: whether there are `balls`, fixed to the bodies, about all that collides; by default where there is no
-        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. They are what
-        pictures follow, and cheap bounds of what collides.
+        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. Pictures follow them,
+        and they are cheap bounds of the colliding geoms.
       floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
       obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. What is
         none collides as MuJoCo has it, in the plan, too.
 
     Attributes:
-      scene: what it moves in.
+      scene: the scene that it moves in.
       dynamics: MuJoCo's steps.
-      geoms: what collides of it. balls: an outline of it, or None.
+      geoms: its colliding geoms. balls: an outline of it, or None.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
@@ -243,7 +244,7 @@ class MjcfRobot(Robot):
           goal: (n,), a state.
           steps: the number of control periods.
           dt: the control period in seconds; by default about 0.02.
-          weights: of the final error, one number for all states, or (n,).
+          weights: weights of the final error, one number for all states, or (n,).
           effort: weights of the controls, (m,); by default such that a control at its limit costs 1/2.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
 

@@ -93,9 +93,9 @@ class MjcfDynamics(Dynamics):
     def numbers(self) -> dict[str, float]:
         """The numbers of the MJCF that `with_parameters` takes, and what they are.
 
-        `mass` in kg, of all that moves, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
-        `_frictionloss`; `<geom>_friction`, sliding, of what collides; `<actuator>_gear`, where there are several
-        numbers the largest; `density` and `viscosity` of what it moves in. In MuJoCo's units.
+        `mass` in kg, of all moving bodies, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
+        `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, where there are several
+        numbers the largest; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
         return {name: one.value for name, one in numbers_of(self.xml, self.physics.model).items()}
 
@@ -167,7 +167,7 @@ class MjcfDynamics(Dynamics):
 
     @contextlib.contextmanager
     def solving(self, threads: int) -> Iterator[None]:
-        """While it lasts, so many threads linearise together, and MuJoCo says nothing of what statuses tell.
+        """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
 
         More threads than processors would wait for each other, and are not begun.
         """

@@ -69,8 +69,8 @@ class SiteCost(Cost):
       position: (3,) where it is wanted, in the world, in metres; None for anywhere.
       orientation: (4,) the quaternion (w, x, y, z) of how it is wanted in the world; None for any. The angle is that of
         the turn from there, less than half a turn.
-      weight: of the place, a number or one an axis of the world, (3,).
-      turn_weight: of the turn, a number or one an axis of what is wanted, (3,).
+      weight: weight of the place, a number or one an axis of the world, (3,).
+      turn_weight: weight of the turn, a number or one an axis of what is wanted, (3,).
     """
 
     def __init__(

@@ -174,7 +174,7 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
 
     Args:
       query: number of the random start and goal, from 0; see `quadrotor_queries`.
-      seed: of the random starts and goals.
+      seed: seed of the random starts and goals.
 
     Returns:
       The Scenario.
@@ -217,7 +217,7 @@ def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndar
 
     Args:
       count: number of pairs.
-      seed: of the random numbers.
+      seed: seed of the random numbers.
 
     Returns:
       Starts and goals, each (count, 12).

@@ -32,8 +32,8 @@ class Holding:
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
     """The controls of actuators, in that order, with which nothing accelerates at rest.
 
-    Forces of actuators are taken to be affine in the controls, as those of motors and servos are: inverse dynamics say
-    what is wanted of them, and least squares within the controls' limits find it.
+    Actuator forces are assumed to be affine in the controls, like those of motors and servos: inverse dynamics give the
+    required forces, and least squares within the controls' limits finds the controls.
     """
     from scipy.optimize import lsq_linear
 

@@ -133,7 +133,7 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
 
 
 def _unit(model: mujoco.MjModel, number: int) -> str:
-    """The unit of a control: of plain motors and servos of joints; of the rest it depends on what they are for."""
+    """The unit of a control: of plain motors and servos of joints; that of other actuators depends on their use."""
     joint = int(model.actuator_trnid[number, 0])
     gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
     if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:
@@ -174,7 +174,7 @@ def is_linear(model: mujoco.MjModel, number: int) -> bool:
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
-    """The id of the body of that name; without one, of what moves first in the world. Raises InputError."""
+    """The id of the body of that name; without a name, of the first moving body in the world. Raises InputError."""
     if name is not None:
         names = [model.body(number).name for number in range(1, model.nbody)]
         return int(model.body(check_name(f"{what}: body", name, names)).id)
@@ -193,7 +193,7 @@ def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array,
 
 
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
-    """Which axis of the world (0 to 2) each degree of freedom is along which a body's origin is told by it alone.
+    """For each degree of freedom that alone moves a body's origin along an axis of the world: that axis (0 to 2).
 
     Found by moving it: the origin must be where the free joint or the slides say, whatever the other joints do.
     """

@@ -30,7 +30,7 @@ class Number:
 def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     """All of them, by the names that parameters have: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
 
-    Only of what is in the text by its name, and has the number: bodies that move, geoms that collide.
+    Only for elements that have a name and this number in the text: bodies that move, geoms that collide.
 
     Args:
       xml: an MJCF in which all has a name. model: compiled from it.

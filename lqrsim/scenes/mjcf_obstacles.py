@@ -78,7 +78,7 @@ def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
 def levers(model: mujoco.MjModel) -> Array:
     """How far any point of the robot moves at most for each degree of freedom, (nv,): in m/rad, or 1 for slides.
 
-    Wherever the joints are; slides between a joint and what it turns count with their range, or 1 m without one.
+    For any joint angles; slides between a joint and the body that it turns count with their range, or 1 m without one.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
     found = np.ones(model.nv)
@@ -139,7 +139,8 @@ def _touches(model: mujoco.MjModel, ground: int) -> bool:
 
 
 def _sinks(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of what carries it."""
+    """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of a body that carries
+    it."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     while body:

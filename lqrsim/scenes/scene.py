@@ -11,8 +11,8 @@ contype or conaffinity is not zero, and contacts are not switched off by a flag.
   from an MJCF has MuJoCo's distances, to all types;
 - a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
 
-`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out what is not in the way
-of that robot.
+`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out geoms that are not in
+the way of that robot.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ except Exception as error:
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
 _FLAGS = mujoco.mjtDisableBit
 DEEPEST = 490  # MuJoCo's reader refuses a little more
-_FLAT = 1e-9  # m, for what has no thickness
+_FLAT = 1e-9  # m, for geoms without a thickness
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
 MOST_COPIES = 1_000_000  # elements that <replicate> makes: some minutes of MuJoCo's, and GBs
@@ -62,7 +62,7 @@ class Scene:
     """A place for a robot to move in.
 
     Attributes:
-      name: of the packaged scene, or the stem of the file.
+      name: name of the packaged scene, or the stem of the file.
       xml: the whole MJCF as text, includes resolved. It alone makes the model again.
       model: compiled from `xml`.
       world: the obstacles, as the module's docstring defines them.
@@ -94,8 +94,8 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
 
     Args:
       name_or_path: a name in models/, or the path of an MJCF file.
-      obstacles: what is an obstacle of all that is fixed to the world: all that can collide; none, with False; names of
-        geoms, or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says
+      obstacles: which geoms fixed to the world are obstacles: all that can collide; none, with False; names of geoms,
+        or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says
         whether it is one.
 
     Returns:
@@ -207,9 +207,10 @@ _quiet, _count, _before = threading.Lock(), 0, None
 
 @contextlib.contextmanager
 def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console about what is told or recorded otherwise.
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
+    otherwise.
 
-    Several threads may be in it: the last to leave puts back what was there before the first.
+    Several threads may be in it: the last to leave restores the state before the first.
     """
     global _count, _before
     with _quiet:
@@ -228,7 +229,7 @@ def unlogged() -> Iterator[None]:
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """The name, with underscores after it if it is taken: for what has none in the MJCF."""
+    """A name for an element without one in the MJCF: this, with underscores after it if it is taken."""
     while name in taken:
         name += "_"
     return name
@@ -250,7 +251,7 @@ def geom_names(model: mujoco.MjModel) -> list[str]:
 
 
 def _check_elements(xml: str, what: str) -> None:
-    """Raises InputError for what MuJoCo would not survive or not say: too much of something, or NaN for unknown.
+    """Raises InputError where MuJoCo would crash or not complain: excessive counts, or NaN for unknown numbers.
 
     It takes a NaN for the mass or density of a geom as if there were none.
     """
@@ -286,7 +287,7 @@ def _check_elements(xml: str, what: str) -> None:
 
 
 def _whole(text: str) -> int:
-    """A count in an MJCF; 1 for what MuJoCo refuses itself."""
+    """A count in an MJCF; 1 if MuJoCo itself refuses it."""
     return int(text) if text.strip().isdecimal() else 1
 
 

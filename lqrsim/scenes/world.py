@@ -25,7 +25,7 @@ class Obstacle:
     """One primitive; sizes and axes as MuJoCo has them.
 
     Attributes:
-      name: of the geom in the MJCF.
+      name: name of the geom in the MJCF.
       kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` has one.
       position: (3,) in metres.
       rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
@@ -256,7 +256,7 @@ class World:
 
 
 def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
-    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for what is none."""
+    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for anything else."""
     array = real(field, points)
     if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
         raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")

@@ -63,7 +63,7 @@ def simulate(
         `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
       disturbances: in the order in which they act. Each has its own stream of random numbers. A `Noise` of a problem is
         one, too.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       trials: number of trials.
       first_trial: number of the first one; trial `i` of a seed is bit-identical whatever trials run beside it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.

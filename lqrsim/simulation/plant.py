@@ -42,7 +42,7 @@ class Plant:
       body: id of the robot's body.
       qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
-      timestep: of the physics, in seconds.
+      timestep: timestep of the physics, in seconds.
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
@@ -359,7 +359,7 @@ class Plant:
             spec.add_sensor(
                 name=sensor,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and what is attached to it
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and everything attached to it
                 objname=self.robot.body,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
                 refname=name,

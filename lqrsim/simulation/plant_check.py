@@ -33,8 +33,8 @@ class PlantCheck:
     """The differences between a robot's dynamics and MuJoCo over one control period.
 
     Attributes:
-      names: of the states.
-      units: of the states.
+      names: names of the states.
+      units: units of the states.
       errors: (n,) the largest difference of each state over the samples, in its unit.
       changes: (n,) the largest change of each state that the dynamics predict.
       period: in seconds.
@@ -148,7 +148,7 @@ def check_plant(
         wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
       tolerance: largest allowed error, relative to the largest change of the state.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
 
     Returns:
       The PlantCheck.

@@ -32,9 +32,9 @@ class ActiveSet:
     """Steps from one plan.
 
     Args:
-      stages: of the problem.
+      stages: stages of the problem.
       plan: states (T+1, n) and controls (T, m), not necessarily a motion; the first state is the start.
-      multipliers: of the constraints, (T+1, rows) each, or none.
+      multipliers: multipliers of the constraints, (T+1, rows) each, or none.
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
@@ -72,7 +72,7 @@ class ActiveSet:
         """Take steps until the measures are within tolerance; return whether they are.
 
         Args:
-          tolerance: of stationarity, gaps and complementarity.
+          tolerance: tolerance of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
           late: called with a duration in seconds before work that takes about that long; True abandons the step.
         """

@@ -25,11 +25,12 @@ from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess
 
-PENALTY = 8.0  # initial penalty, relative to what it costs to change the constraint's value
+PENALTY = 8.0  # initial penalty, relative to the cost of changing the constraint's value
 GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and in all before it is given up
 STUCK = 3  # how often in a row the penalty may grow to no avail
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
-ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
+# When a run has converged enough to update the multipliers, and the iterations after which they are updated anyway.
+ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap of damped iterations, which come to their minimum slowly
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
 
@@ -47,12 +48,12 @@ def finish(run: SolveRun) -> RunResult:
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
-    """Another run, with what is left of the budget."""
+    """Another run, with the rest of the budget."""
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
 
 
 def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
-    """Go on from what was found without the constraints; also which run has the answer in its memory."""
+    """Continue from the result without the constraints; also returns which run has the answer in its memory."""
     if run.budget.over:
         if found.success and not run.work.keeps(run.work.constraint_values(found.states, found.controls)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
@@ -64,7 +65,8 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
 
 
 def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
-    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
+    """Continue from the result without the constraints, or, if there is none, from the multipliers of another
+    solution."""
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
@@ -98,7 +100,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
         if kept.success and not budget.over:
             kept = satisfy(without, kept)
     if not kept.success or budget.over:
-        # Of the plan, only what the constraints say is known: its certificate tells the cost.
+        # Only the constraints of the plan are known; its certificate has the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
         return run, dataclasses.replace(kept, status=status, final=not kept.success, values={})
     initial_guess = dataclasses.replace(
@@ -282,12 +284,12 @@ class AugmentedLagrangian:
         self.nearly = not self.kept and beyond <= 0
 
     def start(self) -> None:
-        """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
+        """No multipliers, and for each constraint a penalty that fits the cost of changing it."""
         self._restart()
         for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
             array[declarations.HEADER :] = 0.0
             if not self._first[which] > 0:
-                # Only now: once there is a penalty, it is what the passes say of curvature.
+                # Only now: once there is a penalty, the passes' curvature contains it.
                 self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
             array[0] = self._first[which]
 
@@ -358,7 +360,7 @@ class AugmentedLagrangian:
         return int(values.argmin())
 
     def _curvature(self, which: int) -> float:
-        """What it costs to change what is missed most: of an equality the most that it costs for any of its numbers."""
+        """The cost of changing the worst violation; for an equality, the largest cost for any of its entries."""
         step, row = divmod(self._worst_of(which), self._terms[which].rows)
         rows = range(self._terms[which].rows) if self._terms[which].equality else (row,)
         return max(self._curvature_of(which, step, row) for row in rows)

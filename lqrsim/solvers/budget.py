@@ -49,7 +49,7 @@ class Budget:
 
     Attributes:
       log: the iterations so far, by whatever method.
-      stop: the deadline, or what the callback raised.
+      stop: the deadline, or the exception of the callback.
       attentive: whether compiled code returns now and then, to heed Ctrl-C. Where many problems are solved at once, it
         does not.
     """

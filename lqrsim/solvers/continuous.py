@@ -135,15 +135,16 @@ def smooth_continuous(
     """Compute a locally optimal feedback policy by iterated LQR smoothing in continuous time. Paper: Sec. V.
 
     The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
-    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step is
-    given the one in which the time lies, and at least 1: what is off at the first instant costs nothing there. Controls
+    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step
+    gets the step in which the time lies, but at least 1, because some costs do not act at step 0. Controls
     have no limits here.
 
     Args:
       problem: with an initial cost, the paper's soft start.
-      tolerance: of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol` counts as
+      tolerance: tolerance of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol`
+        counts as
         that.
-      gap_tolerance: of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
+      gap_tolerance: tolerance of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
       max_iterations: when to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
         InitialPrior, which adds to that. It has a say in which local optimum is found.
@@ -248,7 +249,7 @@ class _Smoother:
     """Runs the iterations, and keeps the state between them.
 
     Attributes:
-      forward, backward: the passes of the last iteration of which both were completed; None before.
+      forward, backward: the passes of the last iteration that completed both; None before.
       where: the pass that is under way.
       cost, gap: of the last rollout; see `Iteration`.
     """

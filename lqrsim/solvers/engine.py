@@ -76,9 +76,9 @@ class Ending:
     """How iterations ended: the kernel's outcome, and what users read of it.
 
     Attributes:
-      outcome: of `kernels/declarations.py`. done: how many iterations there are, those before included.
+      outcome: outcome of `kernels/declarations.py`. done: how many iterations there are, those before included.
       failed: the step of the pass that failed, or -1. backward: whether that was a backward pass.
-      raised: what a user's function raised, if one did.
+      raised: the exception of a user's function, if there was one.
     """
 
     outcome: int
@@ -103,7 +103,7 @@ class Ending:
         )  # fmt: skip
 
     def detail(self, steps: int) -> str:
-        """Where it ended, of so many steps, and what a user's function raised there."""
+        """The step at which it ended, of this number of steps, and the exception of a user's function there."""
         raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
         return ": ".join(part for part in (self._place(steps), raised) if part)
 
@@ -142,7 +142,7 @@ def iterate(
       budget: whose log the iterations join. Compiled code returns after each iteration where there is a callback, a
         deadline or a constraint to look at, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
         an iteration are the average of those between two returns.
-      violation: by how much the constraints are missed by what `run` found last.
+      violation: violation of the constraints by the last result of `run`.
     """
     functions, stop = functions_of(problem), budget.stop
     single = (
@@ -215,7 +215,7 @@ class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 
     Attributes:
-      cost: of the plan, as the log has it; infinite where there is no plan.
+      cost: cost of the plan, as the log has it; infinite where there is no plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
       final: whether another start cannot do better.
     """
@@ -251,7 +251,7 @@ class SolveRun:
       initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
       ending: how smoothing stands; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method has the last iterations. final, rough: the tolerances of the answer, and of
-        what smoothing comes to; see `SmootherSettings`.
+        the smoothing before it; see `SmootherSettings`.
     """
 
     def __init__(
@@ -271,7 +271,7 @@ class SolveRun:
     ) -> "SolveRun":
         """A run in memory that an earlier solve gave back, if there is some: allocating takes time.
 
-        It overwrites what the earlier solve returned, which therefore has to be copied before.
+        It overwrites the result of the earlier solve, which therefore has to be copied before.
         """
         core, steps = compiled.core(problem, settings.form), problem.steps
         if settings.first_pass == "forward":
@@ -388,7 +388,7 @@ class SolveRun:
         )
 
     def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
-        """Newton's method from the best plan so far; `added` is what constraints add to its cost."""
+        """Newton's method from the best plan so far; `added` is the constraints' share of its cost."""
         work, last = self.work, self.budget.left
         rows, trial = np.zeros(max(last, 1), LOG), Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
@@ -654,9 +654,9 @@ class Workspace:
     """The memory of a run: what its iterations read and write.
 
     Attributes:
-      arrays: what is in `records.SmootherArrays`. model: the problem's numbers.
-      memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
-      multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
+      arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
+      memory: the safeguard's state between two iterations, a row of `MEMORY`; memory_rows: (1,) that row.
+      multipliers: multipliers of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
       core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
     """
 
@@ -668,7 +668,7 @@ class Workspace:
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
-        kept = steps if self.dual else 1  # the primal form finds its way back without
+        kept = steps if self.dual else 1  # the primal form recovers without it
 
         def plan() -> Motion:
             return Motion(zeros((steps + 1, n)), zeros((steps, m)))
@@ -755,7 +755,7 @@ class Workspace:
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
     def homotopy_scaled(self, share: float) -> CostModel:
-        """The stage cost with that share of what the homotopy scales; see `CostTerm.factor`."""
+        """The stage cost with its homotopy-scaled terms at that fraction; see `CostTerm.factor`."""
         if share == 1:
             return self.model.stage
         data = list(self.model.stage.data)

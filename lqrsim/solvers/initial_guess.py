@@ -117,7 +117,7 @@ class InitialGuess:
       trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
       summary: its entry in the options of a solution.
       prior: added to the cost in the first iterations.
-      multipliers: of the constraints, if known.
+      multipliers: multipliers of the constraints, if known.
       found: a result that the interior point already has, after the iterations in `log`; it is only finished.
     """
 

@@ -51,7 +51,7 @@ def restore(
     """Descend from a motion (states (T+1, n), controls (T, m)).
 
     Args:
-      price: of violating a constraint by its typical size, in units of the typical cost. most: iterations.
+      price: price of violating a constraint by its typical size, in units of the typical cost. most: iterations.
       watch: called after each iteration with cost, violation and relative promised decrease; True ends the descent.
       stationary: asked, once the promised decrease is negligible, whether the violation of a motion is stationary. It
         gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.

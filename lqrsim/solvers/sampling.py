@@ -21,9 +21,9 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
 
     Args:
       problem: with noise.
-      solution: of that problem, or of another one with as many states, controls and steps.
+      solution: solution of that problem, or of another one with as many states, controls and steps.
       trials: number of runs K.
-      seed: of the noise.
+      seed: seed of the noise.
 
     Returns:
       (K,) the costs.

@@ -57,14 +57,16 @@ def smooth(
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
         the paper's test, which looks at the change of cost alone and can pass early.
-      tolerance: of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and 1e-4
+      tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and
+        1e-4
         without Newton's method.
-      gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: the most iterations that lead to the answer, by whatever method. Of a search, each start has as
+      gap_tolerance: tolerance of the gap (see `Iteration`).
+      max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
+        has as
         many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. It is looked at between iterations.
-      start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
+      start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
         multipliers it takes up. Or a function of the problem that returns one. Controls are cut off at their limits.
@@ -122,7 +124,7 @@ def smooth_many(
     plain Python take turns, and gain nothing from threads.
 
     Args:
-      problems: of one structure or of many; each structure is compiled once.
+      problems: problems of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
       progress: called with the numbers of solved and of all problems, as each solve ends.
       noise: as in `smooth`, for all problems.

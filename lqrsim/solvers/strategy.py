@@ -48,7 +48,7 @@ from lqrsim.solvers.settings import SmootherSettings
 IDLE = 1e-6
 # Factors on the weights of obstacles and goal that find another way round.
 HEAVIER = (10.0, 100.0)
-# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
+# For a free duration: how often a shorter one is tried, by which factor, and with how many iterations.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
@@ -96,7 +96,7 @@ def solve(
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
-    """Run from one start to the end; certified. `known` is what other runs of the same problem found."""
+    """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
     if run.initial_guess.found is not None:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
@@ -133,7 +133,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs, of which the most promising are finished.
+    """Several runs; the most promising ones are finished.
 
     Attributes:
       best: the run with the best result so far, and that result.

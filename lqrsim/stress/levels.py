@@ -63,7 +63,7 @@ def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
                 f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
                 f" {MOST_TRIALS:,} trials, want one of them smaller"
             )
-    low = failures  # trials, all of which fail
+    low = failures  # trials that all fail
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if proves(middle) else (middle, high)

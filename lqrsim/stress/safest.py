@@ -91,7 +91,7 @@ def smooth_safest(
       disturbances: as in `simulate`.
       trials: number of trials of each plan, and of fresh trials of the chosen plan.
       starts: as for `smooth`.
-      seed: of the disturbances.
+      seed: seed of the disturbances.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       threads: of the search and of the simulations.

@@ -111,7 +111,7 @@ class Campaign:
       design_disturbances: the disturbances for which "track" and "offset_free" are designed, whatever a trial then
         meets. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
       trials: number of trials of each cell.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
       goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
@@ -214,10 +214,10 @@ class Campaign:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """Make a campaign from what `as_json` returned. Resolve its scenario first: that may define disturbances.
+        """Make a campaign from the result of `as_json`. Resolve its scenario first: that may define disturbances.
 
         Args:
-          fields: what `as_json` returned.
+          fields: the result of `as_json`.
 
         Returns:
           A Campaign equal to the one described.

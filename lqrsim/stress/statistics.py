@@ -177,7 +177,7 @@ def bootstrap(
       samples: numbers (K,); row i of each belongs to the same trial.
       confidence: of the interval.
       resamples: number of bootstrap samples.
-      seed: of the resampling.
+      seed: seed of the resampling.
 
     Raises:
       InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such

@@ -98,7 +98,7 @@ class PrescribedDraws:
 
 
 def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
-    """The shape of what NumPy's generators draw with these arguments."""
+    """The shape of the numbers that NumPy's generators draw with these arguments."""
     return size if size is not None else (np.broadcast_shapes(*(np.shape(one) for one in arguments)) or None)
 
 
@@ -158,7 +158,7 @@ class TrialScore:
     A trial fails if its score is positive. Standard normal numbers give trials distributed as those of `simulate`.
 
     Args:
-      plant: what is run.
+      plant: the simulated robot.
       solution: the plan, and the policy unless there is a controller.
       disturbances: as in `simulate`.
       controller: as in `simulate`.

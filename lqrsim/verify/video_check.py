@@ -110,7 +110,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
     Args:
       frames: number of frames that were decoded.
       off: largest error of the time of a frame, in seconds.
-      area: of the smallest mark, in pixels.
+      area: area of the smallest mark, in pixels.
     """
     return (
         Criterion(

@@ -165,7 +165,7 @@ class Picture:
 
     Attributes:
       runs: the rollouts, each once.
-      panes: what is where.
+      panes: the panes and their places.
       size: width and height in pixels.
       end: of the last run, in seconds.
     """

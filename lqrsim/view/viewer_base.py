@@ -48,14 +48,14 @@ class Viewer(abc.ABC):
 
     Args:
       model: to be shown.
-      plan: of the run.
+      plan: plan of the run.
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.
-      radius: of the robot, in metres.
+      radius: radius of the robot, in metres.
       balls: with the planned places, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.
-      speed: of the time shown; 1 is real time.
+      speed: speed of the time shown; 1 is real time.
       seconds: after which the viewer closes; never by default.
 
     Attributes:

@@ -84,7 +84,7 @@ class Gusts(Wind):
     """Gusts that rise and fade: an Ornstein-Uhlenbeck process on each axis, in its stationary state from the start.
 
     Args:
-      std: of the wind in m/s; one number, or three along the world's axes.
+      std: standard deviation of the wind in m/s; one number, or three along the world's axes.
       time_constant: seconds in which the correlation falls to 1/e.
     """
 
