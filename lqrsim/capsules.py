@@ -82,10 +82,10 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
         Args:
           start: one end of the segment, 2 or 3 coordinates in metres.
-          end: the other end, as many coordinates.
+          end: the other end, with the same number of coordinates.
 
         Returns:
-          `count` lists of as many coordinates.
+          `count` lists with the same number of coordinates.
 
         Raises:
           InputError: they are not two points of the same size.

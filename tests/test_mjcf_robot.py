@@ -389,7 +389,7 @@ def test_bad_arguments_are_named() -> None:
     robot = ls.MjcfRobot(scene)
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"body": "hull"}, "body: got 'hull', want one of: cart, pole"),
-        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that say where the body is, of: slider"),
+        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that are the body's position, among: slider"),
         ({"position": ("nose",)}, "position: got 'nose'"),
         ({"radius": -1.0}, "radius: got -1"),
         ({"floors": 3}, "floors: got 3"),

@@ -46,7 +46,7 @@ from lqrsim.results.hashing import sha256
 
 logger = logging.getLogger("lqrsim")
 
-# What was compiled in this process, and not loaded from disk.
+# Functions that were compiled in this process, and not loaded from disk.
 compilations: list[str] = []
 compiling = threading.RLock()
 

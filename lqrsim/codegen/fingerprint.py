@@ -21,7 +21,7 @@ from lqrsim import capsules, rotations
 from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
-# What formulas may use without being covered itself: the hash includes the versions.
+# Modules that formulas may use; the hash includes their versions instead of their code.
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
 # Names that read files, other names or random numbers: a function that uses them has no hash. `getattr` is allowed,

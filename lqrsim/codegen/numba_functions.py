@@ -34,7 +34,7 @@ _loaded: dict[str, tuple[Any, int]] = {}
 def compiled(
     function: Callable[..., Any], adapter: str, names: dict[str, Any], pointers: int, what: str
 ) -> tuple[Any, int]:
-    """Compile a function to a C function of so many pointers to float64.
+    """Compile a function to a C function of this number of pointers to float64.
 
     Args:
       function: a numba function, or one that numba can compile.
@@ -42,7 +42,7 @@ def compiled(
       names: others that the adapter uses, among them the named tuple `Parameters`. what: how messages call it.
 
     Returns:
-      What must be kept alive, and the address.
+      The object that must be kept alive, and the address.
 
     Raises:
       InputError: numba is missing, or cannot compile it.

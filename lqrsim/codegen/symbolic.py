@@ -47,7 +47,7 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(
     function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
 ) -> dict[str, Any]:
-    """What `make` derives from a user's function, or the same from the cache, without importing SymPy.
+    """The result of `make` for a user's function, or the same from the cache, without importing SymPy.
 
     A function without a fingerprint is not cached.
 
@@ -124,7 +124,7 @@ def trace(
             " for NumPy's functions and for branches there is level='compiled' or 'plain'"
         ) from None
     if returned is None:
-        raise InputError(f"{called}: got None, want what it computes: is a return missing?")
+        raise InputError(f"{called}: got None, want expressions: is a return missing?")
     if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
         returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]

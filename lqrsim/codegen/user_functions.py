@@ -129,7 +129,7 @@ class UserFunction:
                 returned = plain(*given, parameters_class(tuple(p))(*p.values()), *written)
                 if self.writes and returned is not None:
                     last = "argument" if len(self.writes) == 1 else "two arguments"
-                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last {last}")
+                    raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
@@ -199,7 +199,7 @@ class UserFunction:
 
     @property
     def raised(self) -> BaseException | None:
-        """What it raised in this thread when called back; it is not called again before `forget`."""
+        """The exception that it raised in this thread when called back; it is not called again before `forget`."""
         return getattr(self._thread, "raised", None)
 
     def forget(self) -> None:

@@ -90,9 +90,8 @@ def smooth_chance_constrained(
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
     It ends when the chance is between half of the requested one and the requested one, or when the plan without any
-    clearance is safe enough. Where nothing is, it returns the safest plan that it found, with `success` False: say with
-    print(plan) how
-    far it got, and allow more, estimate better, or have another way round.
+    clearance is safe enough. If no plan is safe enough, it returns the safest one found, with `success` False:
+    print(plan) says how far it got; allow a higher chance, estimate better, or permit another way round.
 
     Args:
       problem: with obstacles in its costs or constraints.
@@ -143,7 +142,8 @@ class _Search:
         self.margin = np.zeros((1, 1))  # that the last of them kept, (T+1, O)
         self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
-        # Of standard deviations: the most that are too few, the fewest that are enough, the fewest without a plan.
+        # Numbers of standard deviations: the largest that is too small, the smallest that is enough, the smallest
+        # without a plan.
         self.too_few, self.enough, self.impossible = 0.0, np.inf, np.inf
         self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances then
 
@@ -192,7 +192,7 @@ class _Search:
         return law
 
     def _spread(self, plan: SafePlan) -> Spread:
-        """Of the clearances along the plan, (T+1, O)."""
+        """Standard deviations of the clearances along the plan, (T+1, O)."""
         tube = plan.tube
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
@@ -223,7 +223,7 @@ class _Search:
         return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
-        """Of how many standard deviations the plan would be as safe as asked.
+        """The number of standard deviations at which the plan would be exactly as safe as requested.
 
         If all that is nearer moved out there, and what only keeps the margin that it must moved in.
         """
@@ -238,7 +238,7 @@ class _Search:
         return high
 
     def _best(self) -> SafePlan:
-        """Of those that are safe enough the cheapest, or else the safest."""
+        """The cheapest plan that is safe enough, or else the safest."""
         safe = [plan for plan in self.plans if plan.success]
         if safe:
             return min(safe, key=lambda plan: plan.solution.cost)

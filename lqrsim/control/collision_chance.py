@@ -1,9 +1,9 @@
 """Chance of collision, from mean and covariance of the states along a plan.
 
-Of each obstacle, the clearance is taken to be linear about the mean, so that it is normal. A collision is counted when
-it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring steps
-are nearly the same number, so to add up or to multiply the chances of single steps would count each collision many
-times.
+The clearance of each obstacle is linearised about the mean, so that it is normally distributed. A collision is counted
+when it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring
+steps are nearly the same number, so to add up or to multiply the chances of single steps would count each collision
+many times.
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class Surroundings:
     Attributes:
       dynamics: dynamics of the problem.
       worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
-      seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
+      seen: the worlds as the robot sees them. places: for those that are kept from balls, the places of the balls.
       place: the states that are its position. position: the same, or, with balls, all states that move it.
       std: standard deviation of an obstacle's position, in m.
     """
@@ -104,7 +104,7 @@ class Surroundings:
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
         """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,).
 
-        Of balls it is the clearance of that which is nearest to the obstacle.
+        With balls it is the clearance of the ball nearest to the obstacle.
         """
         if not self.worlds:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)

@@ -1,4 +1,4 @@
-"""Whatever decides on the controls: a policy, a function or a `Controller`; and one run of it.
+"""Controllers of a run: a policy, a function or a `Controller`; and the state of one run.
 
 Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone.
 `AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
@@ -52,7 +52,7 @@ def _laws(n: int, m: int) -> CompiledModule:
 
 
 def turning_of(space: Coordinates) -> AngularStates:
-    """Which states are to be turned to the nearest, as `kernels/policy_evaluation.py` takes it."""
+    """The states that are to be turned to the nearest, in the form that `kernels/policy_evaluation.py` takes."""
     angles, rotations = (np.array(one, dtype=np.float64) for one in (space.angles, space.rotation_vectors))
     return AngularStates(angles, len(angles), rotations, len(rotations))
 
@@ -89,12 +89,12 @@ class ControllerRun(abc.ABC):
         return {}
 
     def summary(self) -> str:
-        """What there is to say of the run, in a line; empty if nothing."""
+        """A remark on the run, in one line, or empty."""
         return ""
 
 
 class Controller(abc.ABC):
-    """What decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
+    """Decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
 
     Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
@@ -119,7 +119,7 @@ class Controller(abc.ABC):
     @property
     @abc.abstractmethod
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        """Of the states that it wants to be shown, and of its controls."""
+        """Coordinates of the states that it needs, and of its controls."""
 
     @property
     def plan(self) -> Plan | None:
@@ -127,7 +127,7 @@ class Controller(abc.ABC):
         return None
 
 
-# What `simulate` and all that runs trials take as `controller`.
+# The argument `controller` of `simulate` and of everything else that runs trials.
 ControllerLike = Controller | AffinePolicy | OutputFeedbackPolicy | ControlFunction
 WANTED = "a policy, a Controller or a function of state (n,) and time in s that returns controls (m,)"
 
@@ -148,7 +148,7 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
         plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:
         raise InputError(
-            "plan: got none, want what the run begins at and is compared with, such as smooth(problem); only"
+            "plan: got none, want the plan that the run follows, such as smooth(problem); only"
             " controllers with a plan of their own, such as an OffsetFree, run without"
         )
     match given:

@@ -82,14 +82,14 @@ class FilterRun(ControllerRun):
     Attributes:
       law: in force.
       first: the step that its plan begins at.
-      z: the estimates now, (K, Z), of the knot that the newest measurement is of.
+      z: the current estimates, (K, Z), at the knot of the newest measurement.
       estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.
       innovations: likewise, (T+1, K, Y).
     """
 
     def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
         self.law, self.first = law, 0
-        self.model = law.model  # for predictions, whatever a later plan assumes of the unknowns
+        self.model = law.model  # for predictions, independent of what a later plan assumes about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
         # If the first measurement is lost, the plan's first state is shown.

@@ -83,6 +83,6 @@ def check_observable(who: str, model: PlanModel) -> None:
         if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
-                f"{who}: unknowns: got {unknown.name}, which changes nothing of what is measured ({measured}),"
+                f"{who}: unknowns: got {unknown.name}, which no measurement sees ({measured}),"
                 " want sensors that see its effect"
             )

@@ -66,7 +66,7 @@ class OffsetFree(Controller):
     A run of it, which is a rollout's `controller_run`, has these attributes:
 
     - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot: NaN
-      where none was taken in, which is so of the last knot, and of as many more as measurements are late. Their errors
+    at knots whose measurement was not used: the last one, and one more for each period of latency. Their errors
       have the covariances `filter.corrected`. Else None.
     - `innovations`: likewise the differences of measurements from their predictions, (T+1, K, Y), of the covariances
       `filter.innovation`; NaN where a measurement got lost, too. Both covariances are of the first plan: with

@@ -177,7 +177,7 @@ class PlanModel:
 
     @cached_property
     def lagging(self) -> int:
-        """How many entries of z the actuators take."""
+        """Number of entries of z for the actuators."""
         return self.m if self.uncertainty.lag > 0 else 0
 
     @cached_property
@@ -191,7 +191,7 @@ class PlanModel:
 
     @cached_property
     def own_states(self) -> list[range]:
-        """Which of the unknowns' states are those of each remembered one."""
+        """For each remembered unknown, the indices of its states."""
         ends = np.cumsum([0, *(len(part.output) for part in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]
 
@@ -200,7 +200,7 @@ class PlanModel:
         """Of z."""
         return self.n + self.lagging + len(self.transition)
 
-    # What the unknowns do.
+    # Effects of the unknowns.
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -214,7 +214,7 @@ class PlanModel:
 
     @cached_property
     def transition(self) -> Array:
-        """Of the unknowns' states, (D, D)."""
+        """Transition matrix of the unknowns' states, (D, D)."""
         return _diagonal([part.transition for part in self._filters])
 
     @cached_property
@@ -292,7 +292,7 @@ class PlanModel:
 
     @cached_property
     def effects(self) -> Array:
-        """Of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
+        """Effect of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
         plan, count = self.plan, len(self.parameters)
         B = self.jacobian[:, :, self.n :]
         slopes = np.empty((plan.steps, self.n, count))
@@ -307,7 +307,7 @@ class PlanModel:
 
     @cached_property
     def E(self) -> Array:
-        """Of the unknowns' states on the next state, (T, n, D)."""
+        """Effect of the unknowns' states on the next state, (T, n, D)."""
         return self.effects @ self.output
 
     @cached_property
@@ -333,7 +333,7 @@ class PlanModel:
 
     @cached_property
     def reached(self) -> Array:
-        """What the actuators reach at each knot when they are given the planned controls, (T+1, m or none)."""
+        """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
         plan, a = self.plan, self.lagging
         reached = np.zeros((plan.steps + 1, a))
         reached[0] = plan.controls[0, :a]
@@ -362,14 +362,14 @@ class PlanModel:
 
     @cached_property
     def start_root(self) -> Array:
-        """Of the covariance of z at the start, (Z, Z)."""
+        """Square root of the covariance of z at the start, (Z, Z)."""
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
         return _diagonal([np.diag(std), at_rest, *(part.start for part in self._filters)])
 
     @cached_property
     def process_root(self) -> Array:
-        """Of the covariance of w, (T, Z, Z), lower triangular."""
+        """Square root of the covariance of w, (T, Z, Z), lower triangular."""
         n, first, steps = self.n, self.n + self.lagging, self.plan.steps
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         commanded = self.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
@@ -396,7 +396,7 @@ class PlanModel:
 
     @cached_property
     def measurement_root(self) -> Array:
-        """Of the covariance of v, (T+1, Y, n)."""
+        """Square root of the covariance of v, (T+1, Y, n)."""
         return self.H * self.shown_std
 
 

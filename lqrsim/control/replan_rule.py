@@ -43,7 +43,7 @@ class ActivePlan:
     first: int
 
     def row(self, step: int) -> int:
-        """Which of its laws is in force at a step: after its horizon the last one.
+        """The index of its law at a step; after its horizon, the last one.
 
         Args:
           step: number of the control period.
@@ -56,7 +56,7 @@ class ActivePlan:
 
 @dataclass(frozen=True)
 class SolveRequest:
-    """What is to be solved: at a step, for a plan that begins at another, from a state (n,) and with a law."""
+    """A solve to be done: at a step, for a plan that begins at a later one, from a state (n,) and with a law."""
 
     step: int
     first: int
@@ -171,7 +171,7 @@ class ReplanLog:
         return line
 
 
-# What a plan in force is stepped by: field -> what of it has to stay.
+# Fields of the problem that the plan in force depends on, with the part of each that must not change.
 _FIXED: dict[str, Callable[[Problem], object]] = {
     "dt": lambda problem: problem.dt,
     "steps": lambda problem: problem.steps,
@@ -183,7 +183,7 @@ _FIXED: dict[str, Callable[[Problem], object]] = {
 
 
 class ReplanRule:
-    """What is solved, when and from where. Runs do not change it.
+    """The problem that is solved, when, and from which state. Runs do not change it.
 
     Args:
       who: for messages. problem: that was solved. solution: its solution.
@@ -286,7 +286,7 @@ class ReplanRule:
     def request(
         self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0
     ) -> SolveRequest:
-        """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""
+        """The solve for a control period, from a state (n,) that was measured `late` seconds after the period began."""
         plan, first = active.plan, step + self.delay
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
@@ -296,7 +296,7 @@ class ReplanRule:
         return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
 
     def _ahead(self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float) -> Array:
-        """Where the law in force leads by the deadline, by the model."""
+        """The state that the law in force reaches by the deadline, according to the model."""
         policy, dt = active.plan.policy, problem.dt
         rows = [active.row(step + i) for i in range(self.delay)]
         if late > 1e-9 * dt:

@@ -2,10 +2,10 @@
 
 At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
 constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved from
-there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it is of less cost, and
-as near to obstacles as its constraints let it. The estimates continue unchanged; the law acts on their difference from
-the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of the controls and
-the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
+there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower cost, and
+goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their difference
+from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of the controls
+and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
 simulation.
 """
 
@@ -121,7 +121,7 @@ class ReplannedRun(ControllerRun):
 
 
 def constants(model: PlanModel) -> Array:
-    """Which of the unknowns' states are constants, (D,): they keep their value to the end of the horizon."""
+    """Whether each of the unknowns' states is constant, (D,): they keep their value to the end of the horizon."""
     found = np.zeros(len(model.transition), dtype=bool)
     for one, own in zip(model.remembered, model.own_states, strict=True):
         found[list(own)] = one.constant
@@ -129,7 +129,7 @@ def constants(model: PlanModel) -> Array:
 
 
 def in_parameters(model: PlanModel) -> Array:
-    """Which of the unknowns' states change only parameters of the dynamics, (D,)."""
+    """Whether each of the unknowns' states changes only parameters of the dynamics, (D,)."""
     moved = (model.output != 0).any(axis=0)
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
     return moved & ~beyond

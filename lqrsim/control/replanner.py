@@ -51,7 +51,7 @@ class LiveReplanner:
 
     `step` only evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
     period in which one is due. Its answer comes into force at the deadline. What is not ready then is not used, and the
-    law before goes on. All is compiled before the first step.
+    previous law continues. All is compiled before the first step.
 
     Args:
       rule: what is solved, when and from where.
@@ -72,7 +72,8 @@ class LiveReplanner:
         check_kind("LiveReplanner: rule", rule, ReplanRule, "that of a Replanner")
         if not rule.delay:
             raise InputError(
-                "Replanner.live: deadline: got 0 s, want more: a solve takes time, in which the law before goes on"
+                "Replanner.live: deadline: got 0 s, want more: a solve takes time, during which the previous law"
+                " continues"
             )
         check_function("Replanner.live: clock", clock, "a function that returns seconds", arguments=0, optional=False)
         self._rule, self._clock = rule, clock
@@ -104,9 +105,8 @@ class LiveReplanner:
     def change(self, **parts: Any) -> None:
         """Change the problem from the next solve on: `live.change(final_cost=...)`; see `dataclasses.replace`.
 
-        Goals, weights, obstacles, parameters and limits can change. So that a new estimate of what disturbs the robot
-        can, plan with `dynamics.disturbed` from the beginning. What plans are stepped by (dt, steps, states and
-        controls) cannot.
+        Goals, weights, obstacles, parameters and limits can change. To change an estimate of a disturbance, plan with
+        `dynamics.disturbed` from the beginning. dt, steps, states and controls cannot.
 
         Args:
           **parts: field of `Problem` -> new value.
@@ -172,7 +172,7 @@ class LiveReplanner:
         if solve is None or step < solve.request.first:
             return
         if solve.answer is None and solve.error is None:
-            solve.missed = True  # its thread goes on until it is done with it, and the next solve waits for that
+            solve.missed = True  # its thread continues until the solve is done, and the next solve waits for it
             return
         self._solve = None
         if solve.answer is None:
@@ -195,7 +195,7 @@ Computing = float | str | Callable[[np.random.Generator], float]
 
 
 class Replanner(Controller):
-    """Solves again and again from where the robot will be when the answer comes; until then the law before goes on.
+    """Solves again and again from where the robot will be when the answer comes; until then the previous law continues.
 
         rollout = ls.simulate(plant, controller=replanner)  # in a simulation
 
@@ -203,8 +203,9 @@ class Replanner(Controller):
             while (t := robot.time()) < 20:
                 robot.apply(live.step(robot.state(), t))
 
-    Each solve begins with the law in force, and its plan is no worse than to go on with that; see `Replan`. What is not
-    ready by the deadline is not used. Costs that depend on the step's number are not supported. A re-planner is not
+    Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
+    plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported. A
+    re-planner is not
     changed by running it, so several runs can have the same one.
 
     In a simulation a solve takes as long as `computing` says. With a number or a function the results are the same to
@@ -221,10 +222,10 @@ class Replanner(Controller):
       predict: whether to solve from where the law in force leads by the deadline, by the model. Without it, plans begin
         where the robot was, not where it is.
       changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
-        goals, obstacles or parameters. What plans are stepped by (dt, steps, states and controls) cannot change, nor
-        what would have to be compiled.
+        goals, obstacles or parameters. dt, steps, states and controls cannot change, nor anything that would have to be
+        compiled.
       when: a funnel of the solution, for the horizon "shrinking": solve only for states that are outside at the time,
-        about the plan in force. What is certified is the first plan's; about a later one, or after a change, the same
+        about the plan in force. The certificate is for the first plan; about a later one, or after a change, the same
         ellipsoids are a rule of thumb.
       share: share of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and
         loses
@@ -364,7 +365,7 @@ class ReplannerRun(ControllerRun):
         elif isinstance(computing, float):
             took = computing
         else:
-            # From what this trial is shown, so that it draws the same whatever other trials there are.
+            # Seeded by the state of this trial, so that other trials do not change its draws.
             drawn = int.from_bytes(bytes.fromhex(sha256(state)[:16]), "big")
             assert callable(computing)
             given = computing(np.random.default_rng([self._of.seed, step, drawn]))

@@ -78,7 +78,7 @@ def choose_tolerances(
         Choice(tolerate, periods * model.plan.dt, weights, prediction)
         for (periods, tolerate), weights, prediction in zip(tried.items(), each, predicted(all_weights), strict=True)
     ]
-    # What is a thousandth of the plan's extent is narrow enough.
+    # A thousandth of the plan's extent is narrow enough.
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
     narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
 
@@ -158,7 +158,7 @@ def with_filter(
         planned = model.plan.controls[t]
         slope, level, left = limited(planned + offset[:, t] + (law @ mean[:, :, None])[:, :, 0], std, *limits)
         beyond += (1 - slope) / steps
-        # M estimate M' of M = F + G slope law. Of G only the rows of the state and the actuators are not zero.
+        # M estimate M' of M = F + G slope law. Only the rows of G for the state and the actuators are not zero.
         law = slope[:, :, None] * law
         moved = F @ estimate
         moved[:, :own] += G @ (slope[:, :, None] * response)

@@ -27,7 +27,7 @@ from lqrsim.results.solution_parts import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class Tube:
-    """Where the closed loop will be about its plan.
+    """Predicted distribution of the closed loop about its plan.
 
     Attributes:
       plan: nominal states and controls.
@@ -100,7 +100,7 @@ class Tube:
 def predict_tube(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: ControllerLike | None = None
 ) -> Tube:
-    """Where a run will be about its plan, and how likely it is to collide, before any run.
+    """Predict the distribution of a run about its plan, and its chance of collision.
 
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
@@ -139,7 +139,7 @@ def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
         if getattr(model.uncertainty, field):
             raise InputError(
                 f"Uncertainty: {field}: got {getattr(model.uncertainty, field)} control periods, want 0 for a tube:"
-                " it takes measurements and commands as they come"
+                " it has neither latency nor delay"
             )
     moments = loop.moments()
     n, size = model.n, model.size

@@ -79,12 +79,12 @@ class Unknown:
 
     @property
     def shares(self) -> dict[str, float]:
-        """What it is of -> its share."""
+        """Parameters or disturbances, with their shares."""
         return {self.of: 1.0} if isinstance(self.of, str) else dict(self.of)
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return " and ".join(self.shares)
 
     @property
@@ -289,7 +289,7 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
 def triangular_root(root: Array) -> Array:
     """The lower triangular (..., n, n) whose product with its transpose is that of root (..., n, k).
 
-    By an orthogonal transformation: nothing is squared, so that each row keeps its own precision, whatever its size.
+    By an orthogonal transformation: nothing is squared, so that each row keeps its own relative precision.
     """
     rows, columns = root.shape[-2:]
     if columns < rows:

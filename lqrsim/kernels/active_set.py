@@ -1,4 +1,4 @@
-"""What an iteration with an active set evaluates, and its pivots. The kernels' subset.
+"""The evaluations of an iteration with an active set, and its pivots. The kernels' subset.
 
 The rows are those of all constraints, then the limits of the controls; the active set holds some of them at zero.
 `solvers/active_set.py` has the method.

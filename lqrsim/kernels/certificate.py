@@ -41,7 +41,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         size[i] = 1.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    # What constraints add is never part of the sum: a large penalty would leave its rounding.
+    # Constraint terms are never part of the sum: a large penalty would leave its rounding errors.
     cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
     augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)

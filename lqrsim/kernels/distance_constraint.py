@@ -1,4 +1,4 @@
-"""What distances that a model brings leave to spare beyond margins. The kernels' subset.
+"""Distances from a model, minus margins. The kernels' subset.
 
 `data` has what the distances read, and from AT on for how many steps there are margins, of which the last hold from
 there on, how many at a step, of each row the number of its obstacle, and the margins, a step after the other.
@@ -11,7 +11,7 @@ ROWS = 1  # how many there are
 
 
 def value(at, u, t, row, data):
-    """What the row's distance leaves to spare, of all distances."""
+    """The row's distance minus its margin, given all distances."""
     steps, each = int(data[AT]), int(data[AT + 1])
     return at[row] - data[AT + 2 + ROWS + min(t, steps - 1) * each + int(data[AT + 2 + row]) % each]
 

@@ -1,4 +1,4 @@
-"""What an iteration of the interior point evaluates, and the step that it makes. The kernels' subset.
+"""The evaluations of an interior-point iteration, and its step. The kernels' subset.
 
 The plan need not satisfy the dynamics: between where a step leads and the next state there is a gap, which the
 iterations close. `solvers/interior_point.py` has the method.

@@ -53,7 +53,7 @@ def distances_jacobian(x, data, out, slopes):
 def distances_of(count, states, each, displaced, moved, data, out, which, segments):
     """Write the distances, row by row, at states (count, N).
 
-    If obstacles have moved, each of so many states has the same displaced, three numbers a row.
+    If obstacles have moved, the same displacements, three numbers a row, hold for `each` consecutive states.
     """
     rows = int(data[1])
     for i in range(count):
@@ -111,7 +111,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
 def look(p, one, data, displaced, moved, first, out, which, segments):
     """As `find`, of an MjData that has its positions.
 
-    Where obstacles have moved, which is told by moved from 0 on, it is by displaced[moved + 3 row] and what follows.
+    If `moved` is not negative, obstacles are displaced by the three numbers from displaced[moved + 3 row] on.
     """
     middles, axes, segment = at(one[GEOM_XPOS]), at(one[GEOM_XMAT]), stack(6)
     for row in range(int(data[1])):

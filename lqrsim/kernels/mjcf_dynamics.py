@@ -24,7 +24,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
-# Where p has what. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
+# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
 # slot, where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step,
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
@@ -36,7 +36,7 @@ WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
 RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, TABLE = 22, 23, 24, 25, 26, 27
 
-# What a slot has of each of its two MjData: addresses.
+# Addresses that a slot has for each of its two MjData.
 SLOT, SIZE = 24, 12
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
@@ -144,12 +144,12 @@ def help_out(p):
 
 
 def job_columns(p):
-    """Where the columns of a job go: rows of W numbers."""
+    """Destination of a job's columns: rows of W numbers."""
     return rows_at(p[JOB] + 8 * (1 + W + 6), W)
 
 
 def run(z, p, wrench, substeps, two, out):
-    """Write where so many physics steps lead."""
+    """Write the state after this number of physics steps."""
     write_to(z, p, two)
     begin(p, wrench, two)
     for _ in range(substeps):
@@ -171,7 +171,8 @@ def linearize_here(z, p, wrench, address, warm):
 def column(k, z, p, wrench, substeps, address, warm, jacobian):
     """Write a column of the Jacobian: the k-th, of the controls first, which leave the stage of velocities as it is.
 
-    What a perturbed velocity or control does not change of the first physics step, the stage of positions, is kept.
+    A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
+    reused.
     MuJoCo's solver starts at the solution of the step that is not perturbed, so that both sides end equally near to
     their own: its tolerance is not divided by the difference.
     """

@@ -40,7 +40,7 @@ def cost_value(x, u, t, cost):
 
 
 def cost_added(x, u, t, cost):
-    """What the augmented Lagrangian adds to the cost for constraints."""
+    """The terms of the augmented Lagrangian for constraints."""
     total, constraints = 0.0, cost.constraints
     for k in range(constraints.size):
         total += call_for_value(

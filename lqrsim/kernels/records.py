@@ -116,7 +116,7 @@ class CostToCome(NamedTuple):
 
 
 class SmootherGains(NamedTuple):
-    """What leads from the smoothed state at t + 1 to the state and control at t.
+    """The maps from the smoothed state at t + 1 to the state and control at t.
 
     In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`. In the
     primal form the control is `control_gain x + control`, the inverse policy, and the others are not used.
@@ -173,7 +173,8 @@ class LinearStep(NamedTuple):
 
 
 class NextStep(NamedTuple):
-    """What follows a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there, Hessian (N, N) and
+    """The rest of the problem after a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there,
+    Hessian (N, N) and
     gradient at the origin (N,).
     """
 
@@ -342,7 +343,7 @@ class IlqrArrays(NamedTuple):
 
 
 class Predictor(NamedTuple):
-    """What predicts estimates over a control period; see `estimation.py`.
+    """The model that predicts estimates over a control period; see `estimation.py`.
 
     Attributes:
       dynamics, dt: as in `ProblemModel`. places: (P,) indices of the unknown parameters.
@@ -403,5 +404,5 @@ MEMORY = _row(
 # A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")
 
-# What `certificate.certify` writes; see there.
+# The results of `certificate.certify`.
 CERTIFICATE = _row("cost", "scale", "dynamics_residual", "policy_residual", "beyond_limits", "decrease")

@@ -45,7 +45,7 @@ class GeomDistances:
 
 
 class CollisionGeoms(abc.ABC):
-    """What collides of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
+    """The colliding geoms of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
 
     `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all of it clear.
     """

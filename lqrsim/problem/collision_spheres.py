@@ -35,7 +35,7 @@ from lqrsim.scenes.world import SPACE, World
 
 @dataclass(frozen=True)
 class SphereCenters:
-    """Where balls are, made for one system: what gets compiled, and the numbers it reads.
+    """Places of balls, made for one system: the source to compile, and its data.
 
     Attributes:
       source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
@@ -120,7 +120,7 @@ class CollisionSpheres:
 
     Raises:
       InputError: a radius is negative, there are no balls, names are not one a ball and different, or the level does
-        not fit the function. What `places` returns is looked at when it is first needed.
+        not fit the function. The result of `places` is checked when it is first needed.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class CollisionSpheres:
             self.depends_on = check_items("CollisionSpheres: depends_on", depends_on, str, "a tuple of names of states")
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
-        """What each ball has, checked."""
+        """The attributes of each ball, checked."""
         self.radii = check_array("CollisionSpheres: radii", radii, (None,))
         count = len(self.radii)
         if not count:
@@ -185,7 +185,7 @@ class CollisionSpheres:
 
     @property
     def name(self) -> str:
-        """What messages call the function."""
+        """The function's name in messages."""
         return f"{name_of(self.function)}(x, p)"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
@@ -294,7 +294,7 @@ class CollisionSpheres:
     def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
         """The middle of each ball, (..., K, 3), at states (..., n), in the world and in metres.
 
-        Of places in a plane that is seen from above, the height is 0.
+        Places in a plane that is seen from above have height 0.
 
         Args:
           dynamics: dynamics of the system whose states move the balls.
@@ -349,7 +349,7 @@ def bind_outline(
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
-    """Where so many balls are, compiled: (..., count, 3) at states (..., n), as `places` has it."""
+    """Places of this number of balls, compiled: (..., count, 3) at states (..., n), as `places` has it."""
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))
@@ -358,7 +358,8 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
 
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
-    """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
+    """Places of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states (K,
+    n)."""
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
     _call(places, "jacobians_of", flat, out, slopes)
@@ -389,9 +390,10 @@ def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states
 
 
 def _points(returned: Any, count: int) -> list[list[Any]]:
-    """What a function returned, as points. Raises InputError unless they are so many, of 2 or 3 coordinates alike."""
+    """The points that a function returned. Raises InputError unless their number is right and all have 2, or all 3,
+    coordinates."""
     if returned is None:
-        raise InputError("got None, want the middle of each ball: is a return missing?")
+        raise InputError("got None, want the centre of each ball: is a return missing?")
     listed = returned.tolist() if hasattr(returned, "tolist") else returned
     try:
         points = [point.tolist() if hasattr(point, "tolist") else list(point) for point in listed]

@@ -1,4 +1,4 @@
-"""What a plan must keep to, besides the limits of the controls: numbers that are not to be negative, or to be zero.
+"""Constraints on a plan besides the limits of the controls: numbers that must be nonnegative, or zero.
 
 To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Constraint` and write `bind`.
 """
@@ -37,7 +37,7 @@ STEPS = ("all", "final")  # at which a constraint can act
 
 @dataclass(frozen=True)
 class ConstraintTerm:
-    """A constraint, made for one system: so many numbers at each step that are not to be negative, or are to be zero.
+    """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
 
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
@@ -190,7 +190,7 @@ class SymbolicConstraint(Constraint):
     def _trace(self, n: int, m: int) -> dict[str, Any]:
         traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
         if not traced:
-            raise InputError(f"{self.name}: got no entries, want at least one: what is not to be negative, or zero")
+            raise InputError(f"{self.name}: got no entries, want at least one: each must be nonnegative, or zero")
         parts, choices = [], {"value": [], "slope": []}
         for row, entry in enumerate(traced):
             if not entry.free_symbols & {*x, *u}:
@@ -215,7 +215,8 @@ class GoalState(Constraint):
     """The final state equals a goal, exactly; where a cost only draws it there.
 
     Args:
-      goal: (n,) the state, or with `states` as many numbers, in the states' units. Angles count whole turns, as for a
+      goal: (n,) the state, or with `states` one number for each, in the states' units. Angles count whole turns, as for
+        a
         QuadraticCost.
       states: names of the states that it is for; all by default.
     """
@@ -269,7 +270,7 @@ class StateBounds(Constraint):
         return self._bind_to_goal(dynamics, {}, 0)
 
     def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
-        """As `bind`, where some states, by their indices, must be at a goal after so many steps.
+        """As `bind`, where some states, by their indices, must be at a goal after this number of steps.
 
         Raises:
           InputError: a goal is outside the bounds.
@@ -317,13 +318,14 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:
-    """By how much the worst of a constraint's values is missed; 0 where none is, infinite if one is NaN."""
+    """The largest violation of a constraint, given its values; 0 if there is none, infinite if one is NaN."""
     missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
     return missed if not np.isnan(missed) else np.inf
 
 
 def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
-    """The violation that is none. Where `tolerance` is aimed at to spare, inequalities may not be missed at all."""
+    """The largest violation that counts as none. Where `tolerance` is a margin, inequalities may not be violated at
+    all."""
     if term.equality:
         return min(tolerance, EQUALITY_TOLERANCE)
     return 0.0 if spared else tolerance

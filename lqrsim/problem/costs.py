@@ -93,7 +93,7 @@ class Cost(abc.ABC):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return type(self).__name__
 
     @abc.abstractmethod
@@ -124,7 +124,7 @@ class Cost(abc.ABC):
 
 
 class CostSum(Cost):
-    """What `+` makes: the terms, in order."""
+    """The result of `+`: the terms, in order."""
 
     def __init__(self, terms: tuple[Cost, ...]) -> None:
         self.terms = terms
@@ -185,7 +185,8 @@ class ObstacleCost(Cost):
     Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
     the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
 
-    Of a robot of several balls it is the sum over these, too. The Hessian is then that in the balls' places, taken to
+    For a robot of several balls it is also the sum over the balls. The Hessian is then that in the balls' places, taken
+    to
     the states by the first derivatives of the places; their second derivatives are left out.
 
     Args:
@@ -193,8 +194,8 @@ class ObstacleCost(Cost):
       radius: radius of the robot at its position, in metres.
       balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
       geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances: the sum is over its
-        bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. One of radius, balls and
-        geoms.
+        bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. Give one of radius, balls
+        and geoms.
       sharpness: in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """

@@ -87,7 +87,7 @@ def evaluate(term: CostTerm, dynamics: Dynamics, x: Array, u: Array) -> tuple[fl
 
 
 def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
-    """What a term's source defines, as plain Python, and the data that it is given."""
+    """A term's functions as plain Python, and its data."""
     first = term.functions[:1]
     parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
     wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]

@@ -51,7 +51,7 @@ class Dynamics:
 
     The same function can be stated at three levels, which differ in speed and in what the function may contain:
 
-      symbolic  called once with SymPy symbols; exact derivatives follow. As fast as it gets, and the default.
+      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default.
       compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
                 differences, good to some eight digits, and an iteration takes longer.
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
@@ -68,7 +68,7 @@ class Dynamics:
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane: in which plane a position of 2 states is, as "xz"; see `Coordinates`. By default that of the names, if they
+      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they
         are two of x, y and z.
       offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
@@ -79,8 +79,8 @@ class Dynamics:
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
 
     Raises:
-      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. What f
-        returns is looked at when it is first needed.
+      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. The result
+        of f is checked when it is first needed.
     """
 
     # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
@@ -176,7 +176,7 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        """What messages call the dynamics: the name of `f`."""
+        """The name of the dynamics in messages: that of `f`."""
         return name_of(self.f)
 
     def with_parameters(self, **values: float) -> "Dynamics":
@@ -215,7 +215,8 @@ class Dynamics:
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
     def _functions(self) -> tuple[UserFunction, ...]:
-        """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
+        """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there
+        is one."""
         if self.level == "symbolic":
             return ()
         n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
@@ -310,7 +311,7 @@ class Dynamics:
     def _trace_curvature(self) -> dict[str, Any]:
         """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
 
-        Of a formula of more than LONGEST operations there is no source: deriving it would take minutes.
+        A formula of more than LONGEST operations has no source: deriving it would take minutes.
         """
         import sympy
 
@@ -447,7 +448,7 @@ class Dynamics:
         return plain_functions(self.step_source, {"N": n, "M": m, "W": n + m}, names, calls)
 
     def _numbers(self) -> Array:
-        """What `p` is in the compiled functions, with the places of the functions for their addresses."""
+        """The `p` of the compiled functions, with places for the addresses of functions."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
 
 
@@ -463,7 +464,8 @@ def _parameters_of(
 
 
 def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
-    """The lowest and the highest of each of so many controls. Raises InputError for anything but such a pair."""
+    """The lowest and the highest value of each of this number of controls. Raises InputError for anything but such a
+    pair."""
     limits = control_limits if control_limits is not None else (-np.inf, np.inf)
     try:
         low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)

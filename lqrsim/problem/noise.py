@@ -36,7 +36,7 @@ MOST = 100  # independent normal numbers
 
 @dataclass(frozen=True)
 class NoiseTerm:
-    """A noise, made for one system: what gets compiled, and the numbers it reads.
+    """A noise, made for one system: the source to compile, and its data.
 
     Attributes:
       source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
@@ -90,7 +90,7 @@ class Noise:
       level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
 
     Raises:
-      InputError: an argument is not as described. What the function returns is looked at when it is first needed.
+      InputError: an argument is not as described. The result of the function is checked when it is first needed.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Noise:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return "a matrix" if self.matrix is not None else f"{name_of(self.function)}(x, u, p)"
 
     def __repr__(self) -> str:
@@ -177,7 +177,7 @@ class Noise:
           dynamics: dynamics of the system, with its states and controls.
 
         Returns:
-          What gets compiled, and the numbers that it reads.
+          The source to compile, and its data.
 
         Raises:
           InputError: the noise does not fit the system.
@@ -227,7 +227,7 @@ class Noise:
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
-        """What the function returned, as n rows. Raises InputError for another shape."""
+        """The result of the function, as n rows. Raises InputError for another shape."""
         wanted = f"{n} rows, one a state, of {self.size} entries"
         if returned is None:
             raise InputError(f"got None, want {wanted}: is a return missing?")
@@ -291,5 +291,5 @@ class Noise:
 
 
 def numbers_of(term: NoiseTerm) -> Array:
-    """What its source reads: the addresses of its functions, then its own numbers."""
+    """The data of its source: the addresses of its functions, then its own numbers."""
     return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)

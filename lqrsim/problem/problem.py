@@ -424,8 +424,8 @@ class Problem:
             if distances.min() < -TOUCHING:
                 name = world.names[int(distances.argmin())]
                 raise InputError(
-                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or, where"
-                    f" that is none, obstacles= of the robot without it"
+                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or,"
+                    " if that geom is no obstacle, obstacles= of the robot without it"
                 )
 
 
@@ -435,6 +435,6 @@ def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:
     for name, low, high, lowest, highest in sides:
         if not max(low, lowest) < min(high, highest):
             raise InputError(
-                f"control_limits: got {low:g} to {high:g} for {name}, want some of what the actuator can do,"
+                f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the actuator's,"
                 f" {lowest:g} to {highest:g}"
             )

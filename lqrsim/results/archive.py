@@ -112,7 +112,7 @@ class Archive:
             length = int.from_bytes(start[8:10], "little")
             match = _HEADER.fullmatch(file.read(length)) if start[:8] == b"\x93NUMPY\x01\x00" else None
         if match is None:
-            raise InputError(f"{excerpt(name)}: got no array as lqrsim writes it, want one")
+            raise InputError(f"{excerpt(name)}: got an array in another format, want one that lqrsim wrote")
         shape = tuple(int(length) for length in (match[2] or b"").decode().replace(",", " ").split())
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])

@@ -41,7 +41,7 @@ class Bounds(NamedTuple):
 
 
 class Declared(NamedTuple):
-    """What an annotation says of a field.
+    """The content of a field's annotation.
 
     Attributes:
       kinds: the kinds that are allowed; `typing`'s names.
@@ -80,14 +80,14 @@ def check_fields(record: Any) -> Sizes:
 
 @cache
 def declarations(kind: type) -> dict[str, Declared]:
-    """What is declared of each field of a record, but for those that are no part of its value (`compare=False`)."""
+    """The declaration of each field of a record, except those that are no part of its value (`compare=False`)."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: declared(hints[field.name]) for field in fields(kind) if field.compare}
 
 
 @cache
 def declared(annotation: Any) -> Declared:
-    """What an annotation says."""
+    """The content of an annotation."""
     said: list[Any] = []
     optional = False
     kinds: tuple[Any, ...] = (annotation,)
@@ -200,7 +200,7 @@ def _length_of(letter: str, sizes: Sizes) -> str:
 
 
 def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:
-    """Raises InputError unless something has as many entries as the letter says."""
+    """Raises InputError unless something has the number of entries that the letter stands for."""
     if length != (want := sizes.setdefault(letter, length)):
         raise InputError(f"{field}: got {length} entries, want {want}")
 
@@ -234,7 +234,7 @@ def _number(field: str, value: Any) -> float:
 
 
 def check_string(field: str, value: Any, longest: int | None = None) -> str:
-    """`value` if it is text that a file can hold; with `longest`, one printable line of so many characters.
+    """`value` if it is text that a file can hold; with `longest`, one printable line of at most that many characters.
 
     Lines are printed as they are, and a terminal obeys control characters.
 

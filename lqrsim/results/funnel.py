@@ -35,8 +35,8 @@ class Funnel:
 
     The ellipsoid at a knot is `{plan + e: e' shape^-1 e <= level^2}`. The rate is the share of runs that succeed, over
     states drawn uniformly from the volume of the ellipsoid and over the disturbances. With the stated confidence it is
-    at least `rate` at all knots at once. It says nothing of a single state, nor of other knots, where the level is
-    interpolated; see `level`.
+    at least `rate` at all knots at once. It says nothing about a single state, nor about other knots, where the level
+    is interpolated; see `level`.
 
     T steps, n states, k knots; d of the states may be off the plan, all others are on it.
 
@@ -298,7 +298,7 @@ class Funnel:
 
 
 def flat(shape: Array) -> bool:
-    """Whether an ellipsoid of this shape (d, d) has no volume, whatever the units of its states."""
+    """Whether an ellipsoid of this shape (d, d) has no volume, in any units of its states."""
     size = np.sqrt(np.maximum(np.diagonal(shape), 0.0))
     if not (np.isfinite(shape).all() and (size > 0).all()):
         return True
@@ -306,7 +306,7 @@ def flat(shape: Array) -> bool:
 
 
 def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:
-    """The chance of at most so many failures in independent trials that succeed at this rate."""
+    """The chance of at most this number of failures in independent trials that succeed at this rate."""
     i = np.arange(failures)
     ratios = np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)  # of successive terms
     return float(np.exp(trials * np.log(rate) + np.concatenate([[0.0], np.cumsum(ratios)])).sum())

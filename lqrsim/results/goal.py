@@ -148,8 +148,8 @@ def endings(
     """How trials ended, and when. The first event ends a trial; later ones do not count.
 
     Args:
-      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. Of events at the same time
-        the one that is named first counts.
+      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. If events happen at the same
+        time, the one named first counts.
       distance: (K,) from the target at the end. radius: within which it counts as reached. horizon: in seconds.
 
     Returns:

@@ -106,7 +106,7 @@ class Replan(Plan):
     """The result of a prepared solver: a plan from a given state, no worse than the rollout of the law it began with.
 
     No worse means: its violation is no larger, and if both keep the constraints, its cost is no higher. It can be used
-    whatever its status, unless `cost` is not finite.
+    with any status, unless `cost` is not finite.
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.

@@ -18,7 +18,7 @@ from lqrsim.results.solution_parts import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class BallRecord:
-    """Where the balls of a robot were in its runs, and where they should have been: what pictures of it need.
+    """Places of a robot's balls in its runs, and in the plan, for pictures.
 
     K trials of T control periods, B balls; the last ball stands for a robot without a position.
 
@@ -312,7 +312,8 @@ class Rollout:
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Which knots count, (K, T+1): those before the trial ended, the last if no event ended it, and always the
+        """Mask of the knots that count, (K, T+1): those before the trial ended, the last if no event ended it, and
+        always the
         first.
 
         They do not depend on whether obstacles stop the robot.

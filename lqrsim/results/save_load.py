@@ -83,7 +83,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
     Args:
       path: of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
-        By default, whatever it is.
+        By default, any.
 
     Returns:
       What was saved.
@@ -132,7 +132,7 @@ def _check_arrays(kind: type, headers: Mapping[str, Header]) -> None:
     for name, header in headers.items():
         said = _declared_at(kind, name)
         if said is None or said.dtype is None:
-            raise InputError(f"{excerpt(name)}: got an unknown array, want only those of its format")
+            raise InputError(f"{excerpt(name)}: got an unknown array, want only arrays of this format")
         if header.dtype != (dtype := np.dtype(said.dtype).str):
             raise InputError(f"{name}: got numbers of type {header.dtype}, want {dtype}")
         check_sizes(name, header.shape, said.letters, {} if said.letters.startswith("...") else sizes)
@@ -157,7 +157,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         raise InputError(f"{path}: got {excerpt(tree)}, want an object")
     known = declarations(kind)
     if unknown := sorted(tree.keys() - known.keys()):
-        raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want no other than {', '.join(known)}")
+        raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want only {', '.join(known)}")
     found = {}
     for name, said in known.items():
         field = _join(path, name)
@@ -168,7 +168,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         else:
             raise InputError(f"{field}: got none, want it")
     if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
-        raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in it or in offset, want finite numbers")
+        raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
     try:
         return kind(**found)
     except InputError as error:

@@ -110,7 +110,7 @@ def record(checks: Mapping[str, Check]) -> Check:
         if missing := sorted(checks.keys() - value.keys()):
             raise InputError(f"{field}: got none of {excerpt(missing[0])}, want it")
         if unknown := sorted(value.keys() - checks.keys()):
-            raise InputError(f"{field}: got {excerpt(unknown[0])}, want no other than {', '.join(checks)}")
+            raise InputError(f"{field}: got {excerpt(unknown[0])}, want only {', '.join(checks)}")
         return {name: check(f"{field}.{name}", value[name]) for name, check in checks.items()}
 
     return each

@@ -73,7 +73,7 @@ class Solution(Plan):
         later = vars(self).get("_later", {})
         if name not in later:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return vars(self).setdefault(name, later[name]())  # of two threads that read it both get the same
+        return vars(self).setdefault(name, later[name]())  # two threads that read it get the same object
 
     def __getstate__(self) -> dict[str, Any]:
         """With all parts made."""
@@ -128,7 +128,7 @@ class Solution(Plan):
         }  # fmt: skip
 
     def open_loop(self) -> "Solution":
-        """The same plan with zero gains, to compare with: the planned controls, whatever the state."""
+        """The same plan with zero gains, for comparison: the planned controls, independent of the state."""
         policy = replace(self.policy, gain=np.zeros_like(self.policy.gain), offset=self.trajectory.controls)
         return replace(self, policy=policy, inverse_policy=None)
 

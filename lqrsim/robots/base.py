@@ -1,4 +1,4 @@
-"""What a robot is: its constants, its analytic dynamics, its MJCF names, and the maps between the two."""
+"""Robots: constants, analytic dynamics, MJCF names, and the maps between the two."""
 
 import abc
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class Robot(abc.ABC):
 
     @property
     def shape(self) -> "dict[str, Any]":
-        """What collides, as a keyword for ObstacleCost and Clearance: geoms, else balls, else radius."""
+        """The collision shape as a keyword for ObstacleCost and Clearance: geoms, else balls, else radius."""
         if self.geoms is not None:
             return {"geoms": self.geoms}
         return {"balls": self.balls} if self.balls is not None else {"radius": self.radius}

@@ -57,7 +57,8 @@ class MjcfRobot(Robot):
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
     `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
-    actuators' names, limited by their ctrlrange. What has no name in the MJCF gets one, as `unnamed_joint_0`.
+    actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
+    `unnamed_joint_0`.
 
     Where the file has no camera, or no light, it gets one named overview.
 
@@ -77,8 +78,8 @@ class MjcfRobot(Robot):
         position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. Pictures follow them,
         and they are cheap bounds of the colliding geoms.
       floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
-      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. What is
-        none collides as MuJoCo has it, in the plan, too.
+      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. Geoms
+        that are not obstacles collide by MuJoCo's contacts, in the plan, too.
 
     Attributes:
       scene: the scene that it moves in.
@@ -162,7 +163,7 @@ class MjcfRobot(Robot):
     def _position(
         self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
     ) -> tuple[tuple[int, ...], str]:
-        """Which states are the position, and in which plane."""
+        """The states that are the position, and its plane."""
         if asked is None:
             found = sorted(axes, key=lambda dof: axes[dof])
             if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
@@ -172,11 +173,11 @@ class MjcfRobot(Robot):
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
-            raise InputError(f"{who}: position: got {got}, want 2 or 3 that say where the body is, of: {told}")
+            raise InputError(f"{who}: position: got {got}, want 2 or 3 that are the body's position, among: {told}")
         return tuple(found), plane if len(found) == 2 else ""
 
     def _balls_at(self, state: Array) -> Array:
-        """Where the balls are, (K, 3), by MuJoCo's bindings."""
+        """Places of the balls, (K, 3), by MuJoCo's bindings."""
         assert isinstance(self.balls, MjcfBalls)
         outline = self.balls.outline
         return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)

@@ -22,7 +22,7 @@ from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics
 from lqrsim.scenes.scene import unlogged
 
-# What may push the robot's body, in the world's axes: names that `uncertainty_of` knows.
+# Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
 _forming = threading.Lock()  # of teams

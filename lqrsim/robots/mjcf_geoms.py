@@ -1,4 +1,4 @@
-"""What collides of a robot from an MJCF, at MuJoCo's own distances."""
+"""The colliding geoms of a robot from an MJCF, with MuJoCo's own distances."""
 
 from typing import Any
 
@@ -116,7 +116,7 @@ class MjcfGeoms(CollisionGeoms):
         return dynamics, np.array(found, dtype=np.int64)
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
-        """What the kernel reads, but the address of p."""
+        """The kernel's data, except the address of p."""
         columns = [
             rows, self._pairs[chosen, 0], self._bodies[chosen], self._pairs[chosen, 1], self._bounds[chosen],
             self._plane[chosen],

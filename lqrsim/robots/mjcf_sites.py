@@ -17,7 +17,7 @@ _AXES = "xyz"
 
 
 class _Pose:
-    """Where a site is wanted, checked.
+    """The wanted place of a site, checked.
 
     Args:
       what: messages call it. site: name of it. position: (3,) or None. orientation: (4,) or None.
@@ -37,7 +37,7 @@ class _Pose:
 
     @property
     def rows(self) -> list[str]:
-        """What messages call each row."""
+        """The name of each row in messages."""
         placed = [f"{self.site} at its {axis}" for axis in _AXES] if self.position is not None else []
         return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
 
@@ -111,7 +111,7 @@ class SiteConstraint(Constraint):
       site: its name in the MJCF.
       position: (3,) as in a SiteCost.
       orientation: (4,) as in a SiteCost.
-      at: "final", or "all" steps, but a start that is given exactly.
+      at: "final", or "all" steps except a start that is given exactly.
     """
 
     def __init__(

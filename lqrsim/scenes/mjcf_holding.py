@@ -73,7 +73,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 
 
 def _carried(model: mujoco.MjModel) -> Array:
-    """What forces on all joints come to on those that are free to move, (free, nv), through coupled ones."""
+    """The map from forces on all joints to those on the free ones, (free, nv), through couplings."""
     moves, coupled = np.eye(model.nv), couplings_of(model)
     for one in coupled:
         moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0

@@ -1,4 +1,4 @@
-"""What the joints, actuators and keyframes of an MJCF are, as a robot's states and controls need it."""
+"""Joints, actuators and keyframes of an MJCF, for a robot's states and controls."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -195,7 +195,8 @@ def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array,
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
     """For each degree of freedom that alone moves a body's origin along an axis of the world: that axis (0 to 2).
 
-    Found by moving it: the origin must be where the free joint or the slides say, whatever the other joints do.
+    Found by moving it: the origin must be where the free joint or the slides put it, for any positions of the other
+    joints.
     """
     data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
     candidates = {
@@ -214,7 +215,7 @@ def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
 
 
 def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
-    """Where points (K, 3) in the axes of bodies (K,) are in the world, at MuJoCo's positions (nq,)."""
+    """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)

@@ -116,7 +116,7 @@ def _state_masses(
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
-    """What has a name, by kind and name. Replicas have other names in the model, and are not found by these."""
+    """The named elements, by kind and name. Replicas have other names in the model, and are not found by these."""
     found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
     for world in root.iter("worldbody"):
         for element in world.iter():
@@ -138,7 +138,7 @@ def _heavy(model: mujoco.MjModel) -> list[str]:
 
 
 def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
-    """What comes after the number that is linear in the text: damping and stiffness may be polynomials."""
+    """The rest of the attribute after its linear coefficient: damping and stiffness may be polynomials."""
     joint = model.joint(one.part).id
     if one.what == "stiffness":
         return model.jnt_stiffnesspoly[joint].tolist()

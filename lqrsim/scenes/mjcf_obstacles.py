@@ -1,4 +1,4 @@
-"""What is in the way of a robot that is all that moves in an MJCF, and which of its geoms can touch it."""
+"""The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
 import mujoco
 import numpy as np

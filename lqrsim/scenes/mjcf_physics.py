@@ -25,7 +25,7 @@ _PARTS = {
 
 
 class MjcfPhysics:
-    """What `kernels/mjcf_dynamics.py` needs of an MJCF.
+    """The data of an MJCF for `kernels/mjcf_dynamics.py`.
 
     The model is the MJCF's own, but that
 

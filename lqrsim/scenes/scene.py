@@ -5,7 +5,7 @@ collide is an obstacle.** Fixed to the world: no joint and no mocap between the 
 contype or conaffinity is not zero, and contacts are not switched off by a flag. So
 
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
-- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
+- planes are walls, floors and ceilings, infinite, at any drawn size, and solid behind. One that is parallel
   to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
 - plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out. A robot
   from an MJCF has MuJoCo's distances, to all types;
@@ -33,7 +33,7 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 try:
     import mujoco
 except Exception as error:
-    # MuJoCo chooses its OpenGL while it is imported: told to take one that is not there, it raises what comes along.
+    # MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it can raise anything.
     if "MUJOCO_GL" not in os.environ:
         raise
     raise InputError(

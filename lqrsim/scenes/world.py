@@ -11,12 +11,12 @@ from lqrsim.errors import Array, InputError, check_array, check_items, check_nam
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance
 
-# What a position may be of: space, or a plane by its two axes in their order.
+# Spaces of a position: "xyz", or a plane by its two axes in their order.
 SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
-# Of MuJoCo's, without a distance here: those of a robot from an MJCF are MuJoCo's own.
+# MuJoCo's types without a distance here; distances of a robot from an MJCF are MuJoCo's own.
 OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 
@@ -33,7 +33,7 @@ class Obstacle:
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths, and for other kinds those of the bounding box; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
-        it into account; the scene that MuJoCo simulates is another matter, and stands still.
+        it into account; in the scene that MuJoCo simulates it stands still.
     """
 
     name: str
@@ -237,7 +237,7 @@ class World:
         return np.array(flat).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Which obstacle is nearest, (...), at points (..., 2 or 3).
+        """The index of the nearest obstacle, (...), at points (..., 2 or 3).
 
         Args:
           points: (..., 3), or (..., 2) in a plane, in metres.

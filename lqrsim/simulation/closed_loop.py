@@ -65,7 +65,7 @@ def simulate(
         one, too.
       seed: seed of all random numbers.
       trials: number of trials.
-      first_trial: number of the first one; trial `i` of a seed is bit-identical whatever trials run beside it.
+      first_trial: number of the first one; trial `i` of a seed is bit-identical, independent of the trials beside it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` has the details.
@@ -224,7 +224,7 @@ class ClosedLoop:
             self.collisions.touch(int(row), plan.horizon, touching[row])
 
     def so_far(self) -> Rollout:
-        """A Rollout of the records so far, as if the controller had failed now. The loop can go on."""
+        """A Rollout of the records so far, as if the controller had failed now. The loop can continue."""
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
         if self.step < self.settings.trajectory.steps:

@@ -363,7 +363,7 @@ class Plant:
                 objname=self.robot.body,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
                 refname=name,
-                # What to report, how to sort, how many.
+                # The items to report, their order, and their number.
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
         return spec.compile()
@@ -372,7 +372,7 @@ class Plant:
 def extent(plant: Plant) -> float:
     """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
 
-    From above for a robot that is seen from above; else in space, whatever its plane. Moving parts count in all places
+    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places
     that their joints allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics

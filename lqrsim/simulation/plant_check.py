@@ -134,7 +134,7 @@ def check_plant(
     """Compare a robot's dynamics with its MJCF over one control period, from random states.
 
     A different mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
-    What runs do not count as an obstacle stays: the floor that the robot stands on, or planes parallel to its own.
+    Geoms that are no obstacles in runs stay: the floor that the robot stands on, or planes parallel to its own.
     Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:

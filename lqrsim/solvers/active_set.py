@@ -7,7 +7,7 @@ neighbouring steps only the worst, since holding one usually keeps them all. Whe
 fall, they change one at a time, which terminates for convex models.
 
 Second-order models have a minimum only with the right rows held. Where the known rows do not suffice, convex models
-choose the rows first; the step itself uses as much of the second order as leaves a minimum.
+choose the rows first; the step itself uses the largest share of the second order that leaves a minimum.
 """
 
 import time

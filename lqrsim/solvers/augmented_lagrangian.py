@@ -41,7 +41,7 @@ def finish(run: SolveRun) -> RunResult:
         found = satisfy(run, None)
         if found.success or run.budget.over:
             return run.certified(found)
-        # What is known of another problem does not help here.
+        # Knowledge of another problem does not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
     run, found = _with_constraints(run, run.solve())
     return run.certified(found)
@@ -175,7 +175,7 @@ def _damped(
 def refine(run: SolveRun) -> RunResult:
     """Run to the end by steps that lower the cost alone, from where the first policy leads; certified.
 
-    So it stays on the way round that it begins with, which undamped iterations would leave.
+    So it stays in the homotopy class that it begins with, which undamped iterations would leave.
     """
     run.roll_out()
     cost = float(run.work.memory["plan_cost"])
@@ -226,7 +226,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
 
 
 def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
-    """What the multipliers become: lambda - mu d, of inequalities not below 0; 0 where they do not act."""
+    """The new multipliers: lambda - mu d, for inequalities not below 0; 0 where they do not act."""
     acting = np.where(np.isinf(values), 0.0, values)
     forces = np.clip(array[declarations.HEADER :] - array[0] * acting, -array[4] if term.equality else 0.0, array[4])
     return np.where(np.isinf(values), 0.0, forces)
@@ -257,7 +257,7 @@ class AugmentedLagrangian:
         self._problem, self._work = run.problem, run.work
         self._terms = run.problem.constraint_terms
         self._near = tolerance = run.settings.violation_tolerance(run.problem)
-        # Of inequalities and of equalities, if there are any.
+        # The tolerances of inequalities and of equalities, if there are any.
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
@@ -314,7 +314,7 @@ class AugmentedLagrangian:
         self._last = missed
 
     def added(self) -> float:
-        """What the augmented Lagrangian adds to the cost of the plan."""
+        """The augmented Lagrangian's terms in the cost of the plan."""
 
         def one(term: ConstraintTerm, array: Array, values: Array) -> float:
             known, acting = array[declarations.HEADER :], np.where(np.isinf(values), 0.0, values)
@@ -332,7 +332,7 @@ class AugmentedLagrangian:
         return tuple(self._each(one))
 
     def worst(self) -> str:
-        """Which constraint is missed most, by how much and when."""
+        """The worst violated constraint, by how much, and when."""
         if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
@@ -346,14 +346,15 @@ class AugmentedLagrangian:
         return f"{self._terms[which].describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
 
     def _constraints(self) -> Iterator[tuple[ConstraintTerm, Array, Array]]:
-        """Of each what it is, its multipliers, and its numbers as they are aimed at."""
+        """For each constraint: its term, its multipliers, and its values relative to its target."""
         return zip(self._terms, self._work.multipliers, self._values, strict=True)
 
     def _each(self, function: Callable[[ConstraintTerm, Array, Array], "float | Multipliers"]) -> list:
         return [function(*one) for one in self._constraints()]
 
     def _worst_of(self, which: int) -> int:
-        """Which of a constraint's numbers is missed most; of equals the first, or an equality's last, which acts."""
+        """The worst violated entry of a constraint; of equal ones the first, or for an equality the last, which
+        acts."""
         values = self._values[which]
         if self._terms[which].equality:
             return len(values) - 1 - int(np.abs(values[::-1]).argmax())
@@ -366,7 +367,7 @@ class AugmentedLagrangian:
         return max(self._curvature_of(which, step, row) for row in rows)
 
     def _curvature_of(self, which: int, step: int, row: int) -> float:
-        """What it costs to change one of a constraint's numbers: twice the total cost of a change by 1 unit.
+        """The cost of changing one entry of a constraint: twice the total cost of a change by 1 unit.
 
         `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
         """

@@ -169,7 +169,7 @@ def smooth_continuous(
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
     if problem.noise is not None:
-        raise InputError("noise: got some, which is per control period, want none in continuous time; smooth has it")
+        raise InputError("noise: got some, want none in continuous time: noise is per control period; smooth takes it")
     if problem.dynamics.discrete:
         raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
     limits = _Limits(
@@ -208,7 +208,7 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
     """The control (m,) of the first pass, and the prior. Raises InputError."""
     prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
     if prior is not None and prior.obstacles:
-        raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
+        raise InputError(f"start: got a prior with obstacles={prior.obstacles}, want one without in continuous time")
     wanted = start.controls if isinstance(start, InitialPrior) else start
     if wanted is None:
         return problem.nominal_control, prior

@@ -184,7 +184,7 @@ def iterate(
 
 
 def raised_by(functions: Iterable[UserFunction]) -> str:
-    """What the functions have raised, in words."""
+    """The exceptions of the functions, as text."""
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return "; ".join(raised)
 
@@ -245,7 +245,7 @@ class RunResult:
 
 
 class SolveRun:
-    """Iterated LQR smoothing from one start, in whatever state it is.
+    """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
       initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
@@ -342,7 +342,7 @@ class SolveRun:
         return ending
 
     def _count(self, begin: int) -> int:
-        """How many iterations of smoothing have joined the log, which had `begin`."""
+        """Number of smoothing iterations that were added to a log of `begin` entries."""
         added = len(self.budget.log) - begin
         if added:
             self._last = self.budget.log[-1]
@@ -380,7 +380,7 @@ class SolveRun:
         """How smoothing ended; NOT_FINITE if a function is not finite at the start.
 
         Raises:
-          InputError: a function is not finite at the start, and the budget is attentive.
+          InputError: a function is not finite at the start, and `budget.attentive` is set.
         """
         start, control = self.work.start, self.initial_guess.offset[0]
         return check_finite_at_start(
@@ -405,7 +405,7 @@ class SolveRun:
         return [array.copy() for array in self._going_on]
 
     def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
-        """Have smoothing go on from a checkpoint, and not stop in the valley.
+        """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
 
         Iterations of other methods that came to nothing count as smoothing's: it is to make progress from there.
         """
@@ -688,7 +688,7 @@ class Workspace:
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        """Begin a solve, also after another one of the same size with as many steps."""
+        """Begin a solve, also after another one of the same size and number of steps."""
         self._problem, self._tolerance, steps = problem, settings.violation_tolerance(problem), problem.steps
         self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)

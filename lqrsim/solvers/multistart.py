@@ -1,4 +1,4 @@
-"""Where `smooth` starts unless the caller says, and which of several starts it goes on with.
+"""The starts of `smooth` without one from the caller, and the choice among several starts.
 
 A homotopy draws the first iteration along a smooth path from start to goal, without obstacles, and then raises the
 obstacles' cost to its full weight. It ends in a good optimum far more often than a start from the nominal control does.
@@ -56,7 +56,8 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
 
 
 def reweighted(problem: Problem, times: float) -> Problem:
-    """The problem with heavier obstacles and goal, whose plans go round and arrive whatever the controls cost.
+    """The problem with larger weights of obstacles and goal, whose plans go round obstacles and arrive even if controls
+    are expensive.
 
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """
@@ -86,8 +87,8 @@ def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is asked for where there is nothing to go round."""
     if count is not None and count > 1 and pull(problem) == 0:
         raise InputError(
-            f"starts: got {count}, want 1 without an ObstacleCost, a start and a goal some way apart: there is nothing"
-            " to go round; or give a start"
+            f"starts: got {count}, want 1 without an ObstacleCost, or with start and goal close together: there is"
+            " nothing to go round; or give a start"
         )
 
 

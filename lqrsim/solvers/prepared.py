@@ -79,7 +79,7 @@ class PreparedSolver:
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
         check_problem(problem)
         if problem.duration is not None:
-            raise InputError("problem: got one with a duration that is free, want None where it is solved in real time")
+            raise InputError("problem: got one with a free duration, want a fixed one for solves in real time")
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates

@@ -30,7 +30,8 @@ WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to co
 DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same for a damping of 1; bounds of the damping
 LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step above or below which the damping falls or grows, and the factor
 WIDE = 1e3  # factor by which a multiplier may differ from the one that the barrier implies
-# A violation, relative to the rows' sizes, and a change of cost that end the descent, so many times in a row.
+# The descent ends after a violation (relative to the rows' sizes) and a change of cost this small, this many times in a
+# row.
 CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
 LEVEL, FINER = 1e-4, 0.1  # negligible promised decrease, relative to the merit; factor by which it falls
 

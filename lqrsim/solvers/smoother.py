@@ -44,8 +44,8 @@ def smooth(
     Once these states are near the rollout, Newton's method takes over; problems with constraints are finished by an
     interior point.
 
-    Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
-    tried for a few iterations each, and the most promising goes on; see `solvers/strategy.py`.
+    Which local optimum it ends in depends on the start. With an ObstacleCost and no start, several starts are tried for
+    a few iterations each, and the most promising one is continued; see `solvers/strategy.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
@@ -53,7 +53,7 @@ def smooth(
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
         From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
         which cannot, it runs forwards.
-      safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
+      safeguard: where the method fails, continue from the best plan so far with steps that lower its cost; see
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
         the paper's test, which looks at the change of cost alone and can pass early.
@@ -119,7 +119,7 @@ def smooth_many(
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
-    The solutions are those of `smooth`, to the last bit, whatever the number of threads; only the seconds of an
+    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an
     iteration are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are
     plain Python take turns, and gain nothing from threads.
 

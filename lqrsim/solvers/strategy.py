@@ -1,7 +1,8 @@
 """What `smooth` tries, top to bottom, until something converges.
 
 `solve`
-  1. Which way round: a few iterations from each start, and the most promising goes on to its end (`Search.run`). With
+  1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
+  With
      constraints, the others follow as long as they may cost less.
   2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
      ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
@@ -268,7 +269,7 @@ class Search:
         self._finished.insert(0 if other else len(self._finished), (run, found))
 
     def retry_without_risk(self) -> None:
-        """If the risk was too high on the way: solve without risk, and go on from that plan."""
+        """If the risk was too high on the way: solve without risk, and continue from that plan."""
         if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)

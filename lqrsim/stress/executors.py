@@ -1,4 +1,4 @@
-"""Worker processes on this machine for a campaign. They may die or hang; the campaign goes on.
+"""Worker processes on this machine for a campaign. They may die or hang; the campaign continues.
 
 Weighed against libraries:
 
@@ -153,7 +153,7 @@ class _Worker:
         return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
 
     def end(self) -> None:
-        """Stop the process, whatever it is doing."""
+        """Stop the process, also in the middle of a task."""
         self.connection.close()
         self.process.kill()
         self.process.join()

@@ -197,7 +197,8 @@ class ReliabilityProblem:
           The failure, its distance, and the contribution of each disturbance.
 
         Raises:
-          InputError: an option is out of range, the policy fails without any disturbance, or as `score` does.
+          InputError: an option is out of range, the policy fails without any disturbance, or for the reasons of
+            `score`.
           NoFailure: none was found.
         """
         seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)

@@ -108,8 +108,8 @@ class Campaign:
       policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
         of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
         smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
-      design_disturbances: the disturbances for which "track" and "offset_free" are designed, whatever a trial then
-        meets. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of those in a
+        trial. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
       trials: number of trials of each cell.
       seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
@@ -238,7 +238,7 @@ class Campaign:
         except InputError:
             raise
         except Exception as error:  # a disturbance may raise anything for settings that are not its own
-            raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
+            raise InputError(f"campaign: got {excerpt(fields)}, want one that lqrsim wrote ({error})") from None
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:

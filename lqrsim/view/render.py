@@ -84,7 +84,7 @@ def render(
       funnel: about the plan of the run, for funnel; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
-      fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
+      fps: frames a second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.
 

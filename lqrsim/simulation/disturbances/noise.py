@@ -33,7 +33,7 @@ class StateError(GaussianDisturbance):
     what: ClassVar[str]
 
     def _coordinates(self, plant: Plant) -> Coordinates:
-        """What the error is added to."""
+        """The quantity to which the error is added."""
         return plant.robot.dynamics.state_coordinates
 
     def describe(self, plant: Plant) -> str:
