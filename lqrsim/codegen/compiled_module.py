@@ -356,7 +356,8 @@ def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
 @functools.cache
 def _toolchain() -> str:
     """A hash of everything besides the source that machine code depends on: all kernels, and the compiler's own
-    modules."""
+    modules.
+    """
     own = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
     paths = [Path(str(importlib.import_module(name).__file__)) for name in own]
     paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))

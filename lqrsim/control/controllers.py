@@ -1,7 +1,7 @@
 """Controllers of a run: a policy, a function or a `Controller`; and the state of one run.
 
-Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone.
-`AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
+Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone. `AffinePolicy`
+has the same law in NumPy, for a robot; its module's docstring says why there are two.
 """
 
 import abc

@@ -48,8 +48,7 @@ class OffsetFree(Controller):
       problem: the problem that was solved.
       solution: its solution, or any with a plan of the same system.
       uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
-        and
-        constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
+        and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
       effort: as in `track`.
       at_end: as in `track`.
@@ -83,8 +82,8 @@ class OffsetFree(Controller):
       nominal: z in an undisturbed run, (T+1, Z).
 
     Raises:
-      InputError: something does not fit the system; an unknown changes no measurement; or `replan_every`
-        is shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
+      InputError: something does not fit the system; an unknown changes no measurement; or `replan_every` is shorter
+        than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
     def __init__(

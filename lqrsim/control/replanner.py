@@ -205,8 +205,7 @@ class Replanner(Controller):
 
     Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
     plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported. A
-    re-planner is not
-    changed by running it, so several runs can have the same one.
+    re-planner is not changed by running it, so several runs can have the same one.
 
     In a simulation a solve takes as long as `computing` says. With a number or a function the results are the same to
     the last bit wherever they are computed; "measured" is as fast as this machine is. The rollout's `controller_run`
@@ -228,8 +227,7 @@ class Replanner(Controller):
         about the plan in force. The certificate is for the first plan; about a later one, or after a change, the same
         ellipsoids are a rule of thumb.
       share: share of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and
-        loses
-        fewer trials, for a plan that begins at the boundary often comes too late.
+        loses fewer trials, for a plan that begins at the boundary often comes too late.
       computing: how long a solve takes in simulations, in seconds: a number; a function of a `numpy.random.Generator`,
         which draws it; or "measured".
       seed: seed of the random numbers for `computing`.

@@ -133,7 +133,8 @@ def predict_tube(
 
 def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
     """The tube of a closed loop among obstacles. Raises InputError for a controller that the linear model does not
-    cover."""
+    cover.
+    """
     model = loop.model
     for field in ("latency", "delay"):
         if getattr(model.uncertainty, field):

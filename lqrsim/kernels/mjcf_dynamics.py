@@ -24,12 +24,12 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
-# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
-# slot, where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step,
-# mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
-# physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
-# is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# the function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
+# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which slot,
+# where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step, mj_forwardSkip
+# and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the physics, in s.
+# NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those is that the
+# controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of the
+# function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
 # mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and
 # places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12

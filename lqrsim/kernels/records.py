@@ -155,8 +155,7 @@ class ModelOrder(NamedTuple):
     Attributes:
       damping: weight on changes of the controls.
       share: share of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
-        Newton's,
-        with true Hessians of the costs, and those of the dynamics times the costate.
+        Newton's, with true Hessians of the costs, and those of the dynamics times the costate.
       known: the cost-to-go that weighs noise, if `share` is above 0.
     """
 
@@ -174,8 +173,7 @@ class LinearStep(NamedTuple):
 
 class NextStep(NamedTuple):
     """The rest of the problem after a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there,
-    Hessian (N, N) and
-    gradient at the origin (N,).
+    Hessian (N, N) and gradient at the origin (N,).
     """
 
     jacobian: Arrays

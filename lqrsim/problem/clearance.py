@@ -14,7 +14,9 @@ from lqrsim.scenes.world import World
 
 
 class Clearance(Constraint):
-    """A distance of at least `margin` between the robot and each obstacle, walls included, at the steps.
+    """`distance(x_t, obstacle) - radius >= margin` for each obstacle, walls included, at the steps.
+
+        ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
 
     It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
     the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,

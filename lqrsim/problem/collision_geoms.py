@@ -77,8 +77,7 @@ class CollisionGeoms(abc.ABC):
 
         Args:
           dynamics: dynamics of the robot. world: the obstacles. states: (..., n). displaced: (K, O, 3), by how much
-            obstacles
-            are elsewhere in each trial, in metres; states are then (K, ..., n).
+            obstacles are elsewhere in each trial, in metres; states are then (K, ..., n).
 
         Returns:
           (..., O) in metres.

@@ -359,7 +359,8 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
     """Places of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states (K,
-    n)."""
+    n).
+    """
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
     _call(places, "jacobians_of", flat, out, slopes)
@@ -391,7 +392,8 @@ def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states
 
 def _points(returned: Any, count: int) -> list[list[Any]]:
     """The points that a function returned. Raises InputError unless their number is right and all have 2, or all 3,
-    coordinates."""
+    coordinates.
+    """
     if returned is None:
         raise InputError("got None, want the centre of each ball: is a return missing?")
     listed = returned.tolist() if hasattr(returned, "tolist") else returned

@@ -125,7 +125,12 @@ class Constraint(abc.ABC):
 
 
 class SymbolicConstraint(Constraint):
-    """A constraint stated as a formula.
+    """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
+
+        def slower_than_2(x, u, p):  # a planar speed, in m/s
+            return p.speed**2 - x[2] ** 2 - x[3] ** 2
+
+        ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 
     One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
     the last, too, but not at a start that is given exactly, which cannot change.
@@ -212,12 +217,13 @@ class SymbolicConstraint(Constraint):
 
 
 class GoalState(Constraint):
-    """The final state equals a goal, exactly; where a cost only draws it there.
+    """The final state equals a goal: `x_T = goal`. A final cost only draws it there.
+
+        ls.GoalState([1.0, 0.0], states=("x", "velocity"))
 
     Args:
       goal: (n,) the state, or with `states` one number for each, in the states' units. Angles count whole turns, as for
-        a
-        QuadraticCost.
+        a QuadraticCost.
       states: names of the states that it is for; all by default.
     """
 
@@ -248,7 +254,9 @@ class GoalState(Constraint):
 
 
 class StateBounds(Constraint):
-    """Bounds on states, kept at each step; only at a start that is given exactly they do not act.
+    """Bounds on states, `low <= x_t <= high`, at each step; only at a start that is given exactly they do not act.
+
+        ls.StateBounds(low={"height": 0.1}, high={"height": 2.0, "velocity": 1.5})
 
     Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
@@ -291,7 +299,8 @@ class StateBounds(Constraint):
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
     """The values that all GoalStates require, by the index of the state. Raises InputError if two contradict each
-    other."""
+    other.
+    """
     goals: dict[int, float] = {}
     for constraint in constraints:
         for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
@@ -325,7 +334,8 @@ def violation_of(term: ConstraintTerm, values: Array) -> float:
 
 def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
     """The largest violation that counts as none. Where `tolerance` is a margin, inequalities may not be violated at
-    all."""
+    all.
+    """
     if term.equality:
         return min(tolerance, EQUALITY_TOLERANCE)
     return 0.0 if spared else tolerance

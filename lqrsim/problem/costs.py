@@ -186,8 +186,7 @@ class ObstacleCost(Cost):
     the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
 
     For a robot of several balls it is also the sum over the balls. The Hessian is then that in the balls' places, taken
-    to
-    the states by the first derivatives of the places; their second derivatives are left out.
+    to the states by the first derivatives of the places; their second derivatives are left out.
 
     Args:
       world: the obstacles.

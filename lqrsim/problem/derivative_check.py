@@ -1,5 +1,6 @@
 """Checks the values and derivatives of a user's functions: before the first iteration, and where derivatives are in
-doubt."""
+doubt.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -51,8 +51,8 @@ class Dynamics:
 
     The same function can be stated at three levels, which differ in speed and in what the function may contain:
 
-      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default.
-      compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
+      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default. compiled  a
+      numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
                 differences, good to some eight digits, and an iteration takes longer.
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
@@ -63,13 +63,13 @@ class Dynamics:
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: quantities unknown when planning, such as a wind or the remaining share of a motor's force: name ->
-        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants
-        and are not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
+        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants and are
+        not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they
-        are two of x, y and z.
+      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they are
+        two of x, y and z.
       offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
@@ -216,7 +216,8 @@ class Dynamics:
 
     def _functions(self) -> tuple[UserFunction, ...]:
         """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there
-        is one."""
+        is one.
+        """
         if self.level == "symbolic":
             return ()
         n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
@@ -465,7 +466,8 @@ def _parameters_of(
 
 def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
     """The lowest and the highest value of each of this number of controls. Raises InputError for anything but such a
-    pair."""
+    pair.
+    """
     limits = control_limits if control_limits is not None else (-np.inf, np.inf)
     try:
         low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)

@@ -18,8 +18,7 @@ class Stage:
         cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
 
     A leading axis of T, if there is one, is time: one stage a step; an array without it is the same at every step.
-    Everything but
-    A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
+    Everything but A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
 
     Attributes:
       A: (..., n, n).

@@ -64,25 +64,24 @@ class Problem:
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
-      control_limits: (lowest, highest) control, each a number or (m,); by default the actuators' range. Infinite
-        ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
+      control_limits: (lowest, highest) control, each a number or (m,); by default the actuators' range. Infinite ones
+        plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
-        `StateBounds` and
-        `Clearance`.
+        `StateBounds` and `Clearance`.
       begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
       noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
         worked out to second order about the plan. None for none.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
         runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
       duration: (shortest, longest) in s: the final time is free. A solve begins with `dt` and `steps`; the solution has
-        as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is.
-        None for the duration that dt and steps say.
+        as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is. None for the
+        duration that dt and steps say.
       time_weight: cost of a second of a free duration. It is not in the solution's cost, whose duration is settled.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits out of order or beyond the actuators' range, or a start
-        that collides.
+        cost that depends on the control, control limits out of order or beyond the actuators' range, or a start that
+        collides.
     """
 
     dynamics: Dynamics

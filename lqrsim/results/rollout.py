@@ -313,8 +313,7 @@ class Rollout:
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
         """Mask of the knots that count, (K, T+1): those before the trial ended, the last if no event ended it, and
-        always the
-        first.
+        always the first.
 
         They do not depend on whether obstacles stop the robot.
         """

@@ -150,8 +150,7 @@ class Iteration:
 
     Attributes:
       cost: cost of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the
-        constraints
-        are to be met.
+        constraints are to be met.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. In damped iterations with
         constraints this and the optimality refer to the augmented Lagrangian.
       gap: largest difference between the states of minimal total cost and the rollout, each state relative to its
@@ -166,8 +165,7 @@ class Iteration:
         is, and evaluated where the optimality is. The plan itself is a rollout and has no defect. In the interior point
         method it equals the gap.
       violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
-        are no
-        equalities, which have rounding errors at least; NaN where it was not evaluated.
+        are no equalities, which have rounding errors at least; NaN where it was not evaluated.
       seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
         "restoration", a descent on cost and penalised violation; in the safeguard "damped", or "ilqr" where its step is
@@ -227,9 +225,8 @@ class Certificate:
         `L x + l`.
       limits: how far a control is beyond its limits, in its unit.
       violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
-        are no
-        equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6, unless
-        constraints are elastic.
+        are no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
+        unless constraints are elastic.
       optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
         relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient.
     """

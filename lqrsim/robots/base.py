@@ -28,8 +28,7 @@ class Robot(abc.ABC):
       activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
       radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
       balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
-        None by
-        default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
+        None by default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
       geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
         None by default.
     """

@@ -33,8 +33,7 @@ def mjcf(
         "pole": 3.14}. Other states are at rest, as in the MJCF.
       goal: in the same form.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
-        others
-        then have none.
+        others then have none.
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a
         control at its limit, or at 1 without one, costs 1; see `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.

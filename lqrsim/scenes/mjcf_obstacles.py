@@ -140,7 +140,8 @@ def _touches(model: mujoco.MjModel, ground: int) -> bool:
 
 def _sinks(model: mujoco.MjModel, body: int) -> bool:
     """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of a body that carries
-    it."""
+    it.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     while body:

@@ -95,8 +95,8 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
     Args:
       name_or_path: a name in models/, or the path of an MJCF file.
       obstacles: which geoms fixed to the world are obstacles: all that can collide; none, with False; names of geoms,
-        or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says
-        whether it is one.
+        or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says whether it
+        is one.
 
     Returns:
       The Scene.

@@ -372,8 +372,8 @@ class Plant:
 def extent(plant: Plant) -> float:
     """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
 
-    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places
-    that their joints allow without limits.
+    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places that
+    their joints allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
     space, rng = dynamics.state_coordinates, np.random.default_rng(0)

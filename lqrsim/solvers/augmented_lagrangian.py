@@ -66,7 +66,8 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
 
 def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
     """Continue from the result without the constraints, or, if there is none, from the multipliers of another
-    solution."""
+    solution.
+    """
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
@@ -354,7 +355,8 @@ class AugmentedLagrangian:
 
     def _worst_of(self, which: int) -> int:
         """The worst violated entry of a constraint; of equal ones the first, or for an equality the last, which
-        acts."""
+        acts.
+        """
         values = self._values[which]
         if self._terms[which].equality:
             return len(values) - 1 - int(np.abs(values[::-1]).argmax())

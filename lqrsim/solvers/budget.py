@@ -18,8 +18,7 @@ class Stop:
     """Why a solve ends early: a deadline on the clock of `time.perf_counter`, or an exception.
 
     An exception of the callback, and Ctrl-C, end a solve as a deadline does: with the best plan so far. `finish` raises
-    the
-    exception again, with that plan as its `solution`.
+    the exception again, with that plan as its `solution`.
     """
 
     deadline: float = np.inf
@@ -52,8 +51,7 @@ class Budget:
       log: the iterations so far, by any method.
       stop: the deadline, or the exception of the callback.
       attentive: whether compiled code returns regularly, so that Ctrl-C ends it. Where many problems are solved at
-        once, it
-        does not.
+        once, it does not.
     """
 
     def __init__(

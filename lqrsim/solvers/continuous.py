@@ -136,14 +136,13 @@ def smooth_continuous(
 
     The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
     dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step
-    gets the step in which the time lies, but at least 1, because some costs do not act at step 0. Controls
-    have no limits here.
+    gets the step in which the time lies, but at least 1, because some costs do not act at step 0. Controls have no
+    limits here.
 
     Args:
       problem: with an initial cost, the paper's soft start.
       tolerance: tolerance of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol`
-        counts as
-        that.
+        counts as that.
       gap_tolerance: tolerance of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
       max_iterations: when to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an

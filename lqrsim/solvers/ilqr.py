@@ -60,8 +60,8 @@ def ilqr(
       tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
       max_iterations: the most iterations.
       time_limit: as in `smooth`.
-      start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the
-        controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
+      start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the controls of
+        a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
       callback: as in `smooth`.
       noise: as in `smooth`; with noise this is iLQG.
       risk: as in `smooth`.

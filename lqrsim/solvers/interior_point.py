@@ -63,10 +63,8 @@ class Measures(NamedTuple):
 
     Attributes:
       cost: cost of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative
-        to
-        the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
-        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to
-        the cost.
+        to the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
+        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to the cost.
     """
 
     cost: float
@@ -91,8 +89,7 @@ class Found:
     Attributes:
       plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
       multipliers: multipliers of each constraint (T+1, rows); of the limits (T, m), positive where a control presses
-        against the
-        upper one. solved: whether all measures are within tolerance. iterations: how many there were.
+        against the upper one. solved: whether all measures are within tolerance. iterations: how many there were.
       control_size, row_size: typical sizes of controls (m,) and rows (R,). scale: the cost that measures are relative
         to.
     """
@@ -855,8 +852,7 @@ class InteriorPoint:
         """Backtrack along a step until the filter accepts; the first trial also with a second-order correction.
 
         The correction reduces the residuals after the whole step, which remain because rows and dynamics are not
-        linear. Without a
-        Hessian there is none.
+        linear. Without a Hessian there is none.
         """
         part, first = self._longest(self.point.slack, step.slack), True
         while part > SHORTEST:

@@ -45,9 +45,8 @@ def smooth_lq(
     Returns:
       A Solution with one iteration. The trajectory is the rollout of the policy. CONVERGED says that its cost equals
       the predicted cost-to-go to a relative accuracy of ACCURACY (that is its optimality); NOT_POSITIVE_DEFINITE that
-      there is no
-      unique minimum, or none to working precision, and the detail says where. Where the states of least total cost are
-      further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
+      there is no unique minimum, or none to working precision, and the detail says where. Where the states of least
+      total cost are further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
 
     Raises:
       InputError: arrays that do not fit together, or that the form does not take.

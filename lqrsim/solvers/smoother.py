@@ -58,12 +58,10 @@ def smooth(
       stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
         the paper's test, which looks at the change of cost alone and can pass early.
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and
-        1e-4
-        without Newton's method.
+        1e-4 without Newton's method.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
-        has as
-        many.
+        has as many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. It is looked at between iterations.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
@@ -119,9 +117,9 @@ def smooth_many(
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
-    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an
-    iteration are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are
-    plain Python take turns, and gain nothing from threads.
+    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an iteration
+    are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are plain
+    Python take turns, and gain nothing from threads.
 
     Args:
       problems: problems of one structure or of many; each structure is compiled once.

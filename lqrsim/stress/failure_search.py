@@ -133,7 +133,8 @@ class ReliabilityProblem:
 
     def summary(self) -> str:
         """Lines that describe the run, what counts as failure, and where the plan ends. Raises InputError as
-        `score`."""
+        `score`.
+        """
         score = self.score
         words = "; ".join(one.describe(score.plant) for one in self.disturbances)
         lines = [

@@ -1,7 +1,7 @@
 """Trials as a function of their random numbers: a vector of standard normal numbers determines a trial.
 
-Rare failures can then be searched for in the space of these vectors, for any disturbances. It is the standard
-normal space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
+Rare failures can then be searched for in the space of these vectors, for any disturbances. It is the standard normal
+space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
 """
 
 from collections.abc import Callable, Iterable, Sequence
