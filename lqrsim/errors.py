@@ -100,9 +100,7 @@ def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> A
 
 
 def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
-    """Weights (size,), given as one number for all or as an array. Raises InputError unless they are finite and >=
-    0.
-    """
+    """Weights (size,), from one number for all or an array. Raises InputError unless they are finite and >= 0."""
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.full(size, check_number(field, value, at_least=0.0))
     weights = check_array(field, value, (size,))

@@ -158,7 +158,7 @@ def write_function(
     Args:
       name, arguments: its signature. data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
-      of: how messages call the user's function.
+      of: the name of the user's function in messages.
       returns: the target, among `assignments`, whose value is returned.
 
     Raises:

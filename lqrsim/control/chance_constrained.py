@@ -41,10 +41,10 @@ class SafePlan:
     """A plan with its predicted chance of collision.
 
     Attributes:
-      problem: with the clearances that were found as constraints.
+      problem: the problem, with the clearances that were found as constraints.
       solution: solution of it.
       controller: the controller that follows the plan, an OffsetFree or a policy.
-      tube: where that will be; `tube.collision_chance` is the chance.
+      tube: the prediction of its runs; `tube.collision_chance` is the chance.
       asked: the chance that was asked for.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
     """
@@ -94,7 +94,7 @@ def smooth_chance_constrained(
     print(plan) says how far it got; allow a higher chance, estimate better, or permit another way round.
 
     Args:
-      problem: with obstacles in its costs or constraints.
+      problem: a problem with obstacles in its costs or constraints.
       uncertainty: the uncertainty in a run; see `uncertainty_of`.
       chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
@@ -150,7 +150,8 @@ class _Search:
     def solve(self, deviations: float | None) -> None:
         """Plan with a margin of that many standard deviations, and predict the outcome."""
         problem, start, margin = self.problem, None, self.margin
-        second = len(self.plans) == 1  # of which all steps have the same clearance: where the first is matters little
+        # Whose clearances are the same at all steps: the place of the first matters little.
+        second = len(self.plans) == 1
         if deviations is not None:
             base = self.plans[-1]
             margin = deviations * self._spread(base).std

@@ -43,7 +43,7 @@ class Surroundings:
 
     Attributes:
       dynamics: dynamics of the problem.
-      worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
+      worlds: each world with the costs and constraints that keep the robot away from it, each kind once.
       seen: the worlds as the robot sees them. places: for those that are kept from balls, the places of the balls.
       place: the states that are its position. position: the same, or, with balls, all states that move it.
       std: standard deviation of an obstacle's position, in m.

@@ -67,7 +67,7 @@ class ControllerRun(abc.ABC):
     def control(self, step: int, measured: Array) -> Array:
         """The controls of a control period.
 
-        Each trial gets the controls that it gets alone, to the last bit.
+        Each trial gets the same bits as it would alone.
 
         Args:
           step: number of the control period; called once for each, in order.

@@ -26,7 +26,7 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: that it follows, as solved.
+      plan: the plan that it follows, as solved.
       model: the linear model about it, which the filter assumes.
       filter: its gains and covariances.
       weights: weights of deviations from the plan.

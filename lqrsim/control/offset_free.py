@@ -201,7 +201,7 @@ def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
     """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
 
     Args:
-      model: with the uncertainty as stated.
+      model: the model with the uncertainty as stated.
       memory: seconds.
       effort: effort of the controls, (m,).
     """

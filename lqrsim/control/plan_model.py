@@ -121,7 +121,7 @@ class Lag:
     """A first-order lag of the actuators over a control period.
 
     Attributes:
-      left: how much of the distance to the command is left at its end. mean: in the mean over it.
+      left: the remaining share of the distance to the command at its end. mean: the same, averaged over it.
     """
 
     left: float
@@ -140,7 +140,7 @@ class PlanModel:
     """A plan and its uncertainty, linearised.
 
     Attributes:
-      dynamics: with the disturbances as parameters.
+      dynamics: the dynamics with the disturbances as parameters.
       plan: nominal states (T+1, n) and controls (T, m).
       uncertainty: the uncertainty in a run. sensor: the measured quantities.
     """

@@ -35,7 +35,7 @@ class ActivePlan:
     """A plan in force, or that will be.
 
     Attributes:
-      plan: with its law.
+      plan: the plan, with its law.
       first: the control period that it begins at.
     """
 
@@ -153,7 +153,7 @@ class ReplanLog:
         """How often it was solved, and why the law before went on where it did, in a line.
 
         Args:
-          times: whether to say how long solves took, too.
+          times: whether to include how long solves took.
 
         Returns:
           A line of text.
@@ -186,7 +186,7 @@ class ReplanRule:
     """The problem that is solved, when, and from which state. Runs do not change it.
 
     Args:
-      who: for messages. problem: that was solved. solution: its solution.
+      who: name for messages. problem: the problem that was solved. solution: its solution.
       every: seconds between two solves. deadline: seconds until its answer comes into force, by default a control
         period, or `at_least` as long. Both are rounded to control periods, the deadline up.
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.

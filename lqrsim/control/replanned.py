@@ -32,7 +32,7 @@ class ReplannedRun(ControllerRun):
     """A run in which each trial has its own law.
 
     Args:
-      rule: when it is looked at whether to solve.
+      rule: the periods in which to check whether a solve is needed.
       law: to begin with.
       trials: K.
       records: as of `FilterRun`, of all trials.

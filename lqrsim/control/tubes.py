@@ -104,7 +104,7 @@ def predict_tube(
 
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
-      solution: with the plan.
+      solution: the solution whose plan is run.
       uncertainty: the uncertainty in a run.
       controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
 

@@ -47,7 +47,7 @@ class Unknown:
         anew in each control period.
       order: 1, or 2 for noise filtered by (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and
         upward.
-      drift: by how much a constant wanders off, as a random walk, per root of a second; others have none.
+      drift: random walk of a constant, per square root of a second; other unknowns have none.
 
     Raises:
       InputError: a number is out of range.

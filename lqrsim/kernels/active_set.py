@@ -25,7 +25,7 @@ from lqrsim.kernels.rollouts import larger
 # the control, 1 for the lower one and -1 for the upper one, and its value.
 KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
-ROUNDING = 1e-10  # of a row's size: a model may violate it by that much
+ROUNDING = 1e-10  # relative to a row's size: the violation that a model may have
 
 
 def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows, out, active):

@@ -1,7 +1,7 @@
 """Certification of a plan, computed from the problem on a short path of its own. The kernels' subset.
 
-Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's functions, their
-derivatives, and a Cholesky factor. The cost is the value that comes with the derivatives, not what rollouts added up.
+It uses only the problem's functions, their derivatives and a Cholesky factor: nothing from the passes, rollouts and
+line searches that found the plan. The cost is the value that comes with the derivatives, not what rollouts added up.
 `certify.py` compares the results with a solver's claims.
 """
 

@@ -1,7 +1,7 @@
 """Distances from a model, minus margins. The kernels' subset.
 
-`data` has what the distances read, and from AT on for how many steps there are margins, of which the last hold from
-there on, how many at a step, of each row the number of its obstacle, and the margins, a step after the other.
+`data` has the data of the distances. From AT on it has the number of steps with margins (the last ones hold from there
+on), the number of margins at a step, the number of each row's obstacle, and the margins, step by step.
 """
 
 from lqrsim.kernels.declarations import N

@@ -177,7 +177,8 @@ def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
 
     Args:
       stage: (W, W) and slope: (W,) of the model at the plan; overwritten. jacobian: (N, W). gap: (N,).
-      policy: offsets are the changes of the controls where the state does not change. to_go: of changes of the state.
+      policy: its offsets are the changes of the controls for an unchanged state. to_go: the cost-to-go of changes of
+        the state.
 
     Returns:
       Whether the control block is positive definite.

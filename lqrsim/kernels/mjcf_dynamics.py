@@ -117,7 +117,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
 def help_out(p):
     """Compute columns for the threads that linearise, until told to stop.
 
-    A column is taken first and its job looked at then: as long as it is not done, nobody writes another job.
+    A thread takes a column first, and reads its job afterwards: until the column is done, nobody writes another job.
     """
     team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
     address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)

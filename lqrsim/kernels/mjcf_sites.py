@@ -30,7 +30,7 @@ from lqrsim.kernels.rotation_ratios import cotangent_ratio
 
 PLACED = 1  # whether there are rows of the place
 TURNED = 1  # whether there are rows of the orientation
-BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # where data has what
+BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # layout of data
 
 
 def errors(x, data, out):

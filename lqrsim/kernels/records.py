@@ -236,7 +236,7 @@ class ActiveRows(NamedTuple):
       table: (size, 6) properties of each row; see `active_set.py`.
       live, held: ((T+1) size,) 1 for rows that act, and for those in the active set, else 0.
       numbers: their values. force: their multipliers. pressing: their multipliers after a step.
-      wrong: how far a row is on the wrong side after a step, relative, negative; else 0.
+      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
     """
 
     size: int

@@ -1,4 +1,4 @@
-"""`1/2 sum of weight * error^2` of errors that a model brings. The kernels' subset.
+"""`1/2 sum of weight * error^2` for errors from a model. The kernels' subset.
 
 `data` has the data of the errors, and from AT on a weight for each. `places` and `places_jacobian` are the errors here.
 """

@@ -23,7 +23,7 @@ class GeomDistances:
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle; -1
         for the nearest of all.
-      moved: how many of the states the distances depend on, from the first on.
+      moved: number of states, from the first one on, that the distances depend on.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 

@@ -43,7 +43,8 @@ class SphereCenters:
         not zero, to zeros. As the source of a `costs.CostTerm`.
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
-      in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
+      in_plane: whether the places are in the plane of the robot's position, with third coordinate 0, instead of in
+        space.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 

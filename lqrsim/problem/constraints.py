@@ -44,11 +44,11 @@ class ConstraintTerm:
         gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.CostTerm`.
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
-      rows: how many numbers there are at a step.
+      rows: number of entries at a step.
       describe: returns the name of a row for messages.
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
-      equality: whether they are to be zero.
-      final_only: whether they act at the last step alone.
+      equality: whether the entries must be zero.
+      final_only: whether they act only at the last step.
       shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
         source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
         these numbers (shared,) and their derivatives (shared, n) in place of x and u.
@@ -141,7 +141,7 @@ class SymbolicConstraint(Constraint):
         units are best such that numbers about 1 matter.
       parameters: name -> value, as in `Dynamics`.
       equality: the expressions are to be zero, and are to 1e-6, or to `constraint_tolerance` where that is smaller.
-      at: "all" steps, or the "final" one alone, where it must not depend on u.
+      at: "all" steps, or only the "final" one, where it must not depend on u.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class CostTerm:
       factor: index in `data` of a number that the whole term is proportional to, if it may be reduced in the first
         iterations; see `InitialPrior`. None where there is none.
       functions: functions that the source calls with `call`; their addresses come first in its data.
-      exact_hessian: whether the Hessian is all of it. Where a part is left out on purpose, `check_derivatives` does not
+      exact_hessian: whether the Hessian is complete. Where a part is left out on purpose, `check_derivatives` does not
         compare it with differences.
     """
 

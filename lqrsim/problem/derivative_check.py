@@ -187,7 +187,7 @@ def check_derivatives(
     central differences themselves.
 
     Args:
-      subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
+      subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
       samples: how many points.
       spread: their standard deviation, in the units of states and controls.
       tolerance: tolerance of the error, relative to each entry.

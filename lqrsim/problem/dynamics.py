@@ -30,7 +30,8 @@ from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functi
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
-LONGEST = 1500  # operations of a formula whose second derivatives are derived: that takes up to some five seconds
+# Most operations of a formula whose second derivatives are derived, which takes up to about five seconds.
+LONGEST = 1500
 
 
 class Dynamics:

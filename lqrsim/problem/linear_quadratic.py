@@ -66,7 +66,7 @@ class Stage:
                 if field.name in ("A", "R"):
                     raise InputError(f"Stage: {field.name}: got None, want an array of shape {shapes[field.name]}")
                 value = np.zeros(want)
-            with contextlib.suppress(Exception):  # ragged or no array: it has no shape, and is refused below
+            with contextlib.suppress(Exception):  # ragged, or no array: refused below for its shape
                 if time and np.ndim(value) == len(want):  # the same at each step
                     value = np.broadcast_to(value, (*time, *np.shape(value)))
             array = check_array(f"Stage: {field.name}", value, (*time, *want))

@@ -31,7 +31,7 @@ def mjcf(
       path: of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
-      goal: in the same form.
+      goal: the goal, in the same form.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
         others then have none.
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a

@@ -33,7 +33,7 @@ class Scenario:
       problem: the problem to solve; change it with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
       disturbances: those of the demo: clearly visible, but within the reach of the policy.
-      start: for the solver, as in `smooth`, whenever the scenario is solved; by default several starts are tried.
+      start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several are tried.
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.

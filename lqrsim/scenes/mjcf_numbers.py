@@ -1,6 +1,6 @@
 """The numbers of an MJCF that may be others: masses, damping, friction, gears; read from a model, changed in the text.
 
-In the text, for it alone makes the model again: what MuJoCo derives of a number, it derives when it compiles that.
+The text is changed because MuJoCo derives other numbers when it compiles the text.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -63,7 +63,7 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
     gear keep their ratios.
 
     Args:
-      what: it is, for messages.
+      what: the MJCF's name in messages.
 
     Raises:
       InputError: a value is out of range, or both the whole mass and that of a body are there.

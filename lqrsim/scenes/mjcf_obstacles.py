@@ -55,7 +55,7 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs whose distances matter: those that can touch, and of an obstacle that nothing can touch, all.
+    """The pairs whose distances matter: those that can touch, and all pairs of an obstacle that nothing can touch.
 
     Such an obstacle was asked for by name, or by a rule.
     """
@@ -139,9 +139,7 @@ def _touches(model: mujoco.MjModel, ground: int) -> bool:
 
 
 def _sinks(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of a body that carries
-    it.
-    """
+    """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     while body:

@@ -131,7 +131,7 @@ def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
     """The model of an MJCF given as text, without includes.
 
     Args:
-      what: it is, for messages.
+      what: its name in messages.
 
     Raises:
       InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
@@ -173,7 +173,7 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
     """Ids of the geoms that are obstacles by a choice, as `load_scene` has it.
 
     Args:
-      default: those with True. what: it is, for messages.
+      default: those with True. what: its name in messages.
 
     Raises:
       InputError: no geom or body that is fixed to the world has such a name, or it is no choice.

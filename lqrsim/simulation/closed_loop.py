@@ -69,7 +69,7 @@ def simulate(
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` has the details.
-      frames: whether to record what drawing needs, between the control periods, too; without it there is no video.
+      frames: whether to record the data for drawing, also between the control periods; without it there is no video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
         through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome.
       threads: of MuJoCo; by default one per processor.

@@ -30,8 +30,8 @@ class Plant:
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot: with the dynamics and the limits.
-      scene: with the MJCF and the obstacles.
+      robot: the robot, with its dynamics and limits.
+      scene: the scene, with its MJCF and obstacles.
       geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
       balls, places: the robot's balls and their centres; None if it is one ball at its position.
       world: the obstacles for the robot's geoms, its balls or its position; none without any.

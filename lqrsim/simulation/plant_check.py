@@ -138,8 +138,8 @@ def check_plant(
     Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
-      robot: with the dynamics.
-      scene: with the robot in its MJCF.
+      robot: the robot, with its dynamics.
+      scene: a scene whose MJCF has the robot.
       period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
       around: (n,) mean of the random states, zero by default.
       spread: their standard deviation, in each state's unit.

@@ -144,7 +144,7 @@ class ActiveSet:
         return True
 
     def _due(self) -> bool:
-        """Whether a pivot and new models would end too late, with the time of another such pair to spare."""
+        """Whether a pivot and new models would end too late, with the time of another such pair as a margin."""
         return self._late(2 * self.looking)
 
     def _from_convex(self) -> bool:

@@ -31,7 +31,7 @@ STUCK = 3  # how often in a row the penalty may grow to no avail
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 # When a run has converged enough to update the multipliers, and the iterations after which they are updated anyway.
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
-ROUGHEST_GAP = 3e-2  # the same gap of damped iterations, which come to their minimum slowly
+ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
 
 
@@ -65,9 +65,7 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
 
 
 def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
-    """Continue from the result without the constraints, or, if there is none, from the multipliers of another
-    solution.
-    """
+    """Continue from the result without the constraints or, without one, from another solution's multipliers."""
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
@@ -174,7 +172,7 @@ def _damped(
 
 
 def refine(run: SolveRun) -> RunResult:
-    """Run to the end by steps that lower the cost alone, from where the first policy leads; certified.
+    """Run to the end, only by steps that lower the cost, from the rollout of the first policy; certified.
 
     So it stays in the homotopy class that it begins with, which undamped iterations would leave.
     """
@@ -186,7 +184,7 @@ def refine(run: SolveRun) -> RunResult:
     if not run.problem.constraints:
         run.work.memory["merit"] = cost
         damped = run.damped()
-        if run.second_order and damped.success and not run.budget.over:  # damped ones do not come to all digits
+        if run.second_order and damped.success and not run.budget.over:  # damped ones do not reach all digits
             return run.certified(run.newton())
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
@@ -247,11 +245,11 @@ class AugmentedLagrangian:
     Inequalities and equalities each have a tolerance, and their penalties grow on their own.
 
     Attributes:
-      kept: whether the plan that was evaluated last keeps the constraints.
+      kept: whether the last evaluated plan keeps the constraints.
       solved: whether it does so as well as is aimed at: inequalities with the tolerance to spare, and where more than
         that is left, with a multiplier that is not off by more: `|min(d, lambda / mu)|`; equalities `|d|`.
-      nearly: whether it would if equalities could be missed by as much as inequalities have to spare.
-      grown: by how much a penalty has grown. stuck: how often in a row that did not help.
+      nearly: whether it would with the inequalities' tolerance for equalities, too.
+      grown: factor by which a penalty has grown. stuck: number of times in a row that this did not help.
     """
 
     def __init__(self, run: SolveRun) -> None:
@@ -354,9 +352,7 @@ class AugmentedLagrangian:
         return [function(*one) for one in self._constraints()]
 
     def _worst_of(self, which: int) -> int:
-        """The worst violated entry of a constraint; of equal ones the first, or for an equality the last, which
-        acts.
-        """
+        """The worst violated entry of a constraint: the first of equal ones, or an equality's last, which acts."""
         values = self._values[which]
         if self._terms[which].equality:
             return len(values) - 1 - int(np.abs(values[::-1]).argmax())

@@ -178,7 +178,7 @@ class Ladder:
         return self._after_multipliers(found)
 
     def _after_multipliers(self, found: RunResult) -> RunResult | None:
-        """The interior point from the plan that the method of multipliers came to."""
+        """The interior point from the last plan of the method of multipliers."""
         plan = _plan(found)
         self._without_multipliers()
         if self._budget.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():

@@ -1,6 +1,6 @@
 """LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
 
-`riccati_ode.py` has the equations and integrates them; `continuous_solution.py` has what comes out.
+`riccati_ode.py` has the equations and integrates them; `continuous_solution.py` has the result.
 """
 
 import math
@@ -140,11 +140,11 @@ def smooth_continuous(
     limits here.
 
     Args:
-      problem: with an initial cost, the paper's soft start.
+      problem: a problem with an initial cost, the paper's soft start.
       tolerance: tolerance of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol`
         counts as that.
-      gap_tolerance: tolerance of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
-      max_iterations: when to give up.
+      gap_tolerance: tolerance of the gap (see `Iteration`), checked every dt. The dynamics residual is not evaluated.
+      max_iterations: number of iterations after which to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
         InitialPrior, which adds to that. It has a say in which local optimum is found.
       rtol: relative tolerance of all integrations.

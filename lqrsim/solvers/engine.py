@@ -248,9 +248,9 @@ class SolveRun:
     """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
-      ending: how smoothing stands; the outcome is RUNNING until it has ended.
-      second_order: whether Newton's method has the last iterations. final, rough: the tolerances of the answer, and of
+      initial_guess: its start. work: its memory. budget: its iterations and its time.
+      ending: the state of smoothing; the outcome is RUNNING until it has ended.
+      second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
         the smoothing before it; see `SmootherSettings`.
     """
 
@@ -407,7 +407,7 @@ class SolveRun:
     def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
         """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
 
-        Iterations of other methods that came to nothing count as smoothing's: it is to make progress from there.
+        Iterations of other methods that failed count as smoothing's: it has to make progress from there.
         """
         for array, copy in zip(self._going_on, checkpoint, strict=True):
             array[...] = copy

@@ -55,7 +55,7 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
-      problem: with a start that is given exactly, or by the initial cost.
+      problem: a problem whose start is given exactly, or by the initial cost.
       stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
       tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
       max_iterations: the most iterations.

@@ -86,7 +86,7 @@ class InitialPrior:
         """Check that the prior fits a problem.
 
         Args:
-          problem: to be solved with it.
+          problem: the problem to be solved with it.
 
         Returns:
           The prior itself, with one entry per state.

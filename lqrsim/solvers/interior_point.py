@@ -382,7 +382,7 @@ class InteriorPoint:
     """Runs the interior point from one plan.
 
     Args:
-      problem: with constraints, limits, or neither.
+      problem: a problem with constraints, limits, or neither.
       plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
       barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
       room: what slacks are at first, at least: relative to a row's size, or to a control's range.

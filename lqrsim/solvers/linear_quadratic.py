@@ -117,7 +117,7 @@ class _Passes(NamedTuple):
       law, inverse_law: gain (T, m, n) and offset (T, m).
       cost_to_go, cost_to_come: the fields of a `Quadratic`; of `Moments` for the latter in the dual form.
       x_hat: (T+1, n), the states of least total cost.
-      failure: which pass failed, and where; empty if none did.
+      failure: the pass that failed, and where; empty if none did.
     """
 
     law: tuple[Array, Array]

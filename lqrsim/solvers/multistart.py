@@ -17,7 +17,7 @@ from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.parallel import workers
 
-# `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
+# `python experiments/benchmark_quality.py --sections ingredients` shows the gain from each of these choices.
 STARTS = 7
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
 PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact

@@ -63,7 +63,7 @@ def smooth(
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
         has as many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
-        comes first, does not count. It is looked at between iterations.
+        comes first, does not count. It is checked between iterations.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
@@ -72,8 +72,8 @@ def smooth(
       starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
         The candidates are in the solution.
       constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
-        equalities no more than that. Where the augmented Lagrangian keeps them (see `finish`), inequalities are solved
-        for with so much to spare, by default 1e-3.
+        equalities no more than that. Where the augmented Lagrangian handles them (see `finish`), inequalities are
+        solved with this margin, by default 1e-3.
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
         they then act from the first iteration. It needs a start.
       finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;

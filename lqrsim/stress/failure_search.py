@@ -132,9 +132,7 @@ class ReliabilityProblem:
         return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
 
     def summary(self) -> str:
-        """Lines that describe the run, what counts as failure, and where the plan ends. Raises InputError as
-        `score`.
-        """
+        """Lines that describe the run, the failure, and the plan's end. Raises InputError as `score`."""
         score = self.score
         words = "; ".join(one.describe(score.plant) for one in self.disturbances)
         lines = [

@@ -47,7 +47,7 @@ class Viewer(abc.ABC):
     """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      model: to be shown.
+      model: the model to be shown.
       plan: plan of the run.
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.

@@ -216,7 +216,7 @@ class StateNoise(Disturbance):
     w is drawn anew each time; x is the state at the beginning of the period, u the control that reached the actuators.
 
     Args:
-      noise: with the matrix M.
+      noise: the noise, with its matrix M.
     """
 
     noise: Noise

@@ -122,7 +122,7 @@ class Dryden(Wind):
     Args:
       wind: mean wind at 20 ft in m/s, or "light", "moderate" or "severe": 15, 30 or 45 knots.
       altitude: above the ground in m; below 10 ft it counts as 10 ft.
-      direction: in which the mean wind blows, rad from the world's x axis towards its y axis.
+      direction: direction towards which the mean wind blows, in rad from the world's x axis towards its y axis.
     """
 
     wind: float | str = "light"
