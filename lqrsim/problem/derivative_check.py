@@ -4,18 +4,19 @@ doubt.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.user_functions import UserFunction, address_of, brief, plain_calls
-from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
+from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.fields import Line, check_fields
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
@@ -144,24 +145,18 @@ class DerivativeCheck:
       tolerance: the largest acceptable error.
     """
 
-    what: str
+    what: Line
     error: float
-    row: str
-    column: str
+    row: Line
+    column: Line
     stated: float
     difference: float
-    state: Array
-    control: Array
+    state: Annotated[Array, "n"]
+    control: Annotated[Array, "m"]
     tolerance: float
 
     def __post_init__(self) -> None:
-        for name in ("what", "row", "column"):
-            check_text(f"DerivativeCheck: {name}", getattr(self, name), at_most=1000)
-        for name in ("error", "stated", "difference", "tolerance"):
-            object.__setattr__(self, name, float(shaped(f"DerivativeCheck: {name}", getattr(self, name), ())))
-        for name in ("state", "control"):
-            numbers = real(f"DerivativeCheck: {name}", getattr(self, name))
-            object.__setattr__(self, name, shaped(f"DerivativeCheck: {name}", numbers, (None,)))
+        check_fields(self)
 
     @property
     def good(self) -> bool:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,12 +13,11 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_count,
-    check_items,
     check_number,
     check_seed,
     excerpt,
-    shaped,
 )
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.physics import UNSTABLE
@@ -48,39 +47,27 @@ class PlantCheck:
         not know of these contacts.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    errors: Array
-    changes: Array
-    period: float
-    state: Array
-    control: Array
-    simulated: Array
-    predicted: Array
-    tolerance: float
+    names: Annotated[tuple[Line, ...], "n"]
+    units: Annotated[tuple[Line, ...], "n"]
+    errors: Annotated[Array, "n"]
+    changes: Annotated[Array, "n"]
+    period: Annotated[float, Bounds(above=0.0)]
+    state: Annotated[Array, "n"]
+    control: Annotated[Array, "m"]
+    simulated: Annotated[Array, "n"]
+    predicted: Annotated[Array, "n"]
+    tolerance: Annotated[float, Bounds(above=0.0)]
     samples: int
-    contacts: tuple[tuple[str, str, int], ...] = ()
+    contacts: tuple[tuple[object, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("names", "units"):
-            found = check_items(f"PlantCheck: {name}", getattr(self, name), str, "texts, one a state")
-            object.__setattr__(self, name, found)
-        n = len(self.names)
-        if not n or len(self.units) != n:
-            raise InputError(f"PlantCheck: units: got {len(self.units)} for {n} names, want one a state, at least one")
-        for name in ("errors", "changes", "state", "simulated", "predicted", "control"):
-            size = None if name == "control" else n
-            object.__setattr__(self, name, shaped(f"PlantCheck: {name}", getattr(self, name), (size,)))
-        for name in ("period", "tolerance"):
-            object.__setattr__(self, name, check_number(f"PlantCheck: {name}", getattr(self, name), above=0.0))
-        object.__setattr__(self, "samples", check_count("PlantCheck: samples", self.samples))
-        wanted = "(geom, geom, in how many samples) of each pair that touched"
-        pairs = check_items("PlantCheck: contacts", self.contacts, tuple, wanted)
-        for pair in pairs:
-            if len(pair) != 3 or not all(isinstance(name, str) for name in pair[:2]):
-                raise InputError(f"PlantCheck: contacts: got {excerpt(pair)}, want {wanted}")
+        if not check_fields(self)["n"]:
+            raise InputError("PlantCheck: names: got none, want at least one state")
+        check_count("PlantCheck: samples", self.samples)
+        for pair in self.contacts:
+            if [isinstance(name, str) for name in pair] != [True, True, False]:
+                raise InputError(f"PlantCheck: contacts: got {excerpt(pair)}, want (geom, geom, number of samples)")
             check_count("PlantCheck: contacts: count", pair[2], at_most=self.samples)
-        object.__setattr__(self, "contacts", pairs)
 
     @property
     def relative(self) -> Array:

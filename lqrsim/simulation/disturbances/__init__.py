@@ -31,9 +31,10 @@ from lqrsim.simulation.disturbances.noise import (
     MeasurementNoise,
     Push,
     TorqueNoise,
-    as_disturbances,
 )
-from lqrsim.simulation.disturbances.presets import PRESETS, preset
+from lqrsim.simulation.disturbances.noise import as_disturbances as as_disturbances
+from lqrsim.simulation.disturbances.presets import PRESETS as PRESETS
+from lqrsim.simulation.disturbances.presets import preset
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
 
 KINDS: dict[str, type[Disturbance]] = {
@@ -43,8 +44,6 @@ KINDS: dict[str, type[Disturbance]] = {
 }
 
 __all__ = [
-    "KINDS",
-    "PRESETS",
     "ActuatorLoss",
     "AxleMismatch",
     "CommandDropouts",
@@ -72,6 +71,5 @@ __all__ = [
     "ThrustMismatch",
     "TorqueNoise",
     "WheelRadiusMismatch",
-    "as_disturbances",
     "preset",
 ]
