@@ -63,7 +63,7 @@ def compiled(
     found = _unpacked(kept) if kept is not None else None
     if found is None:
         note_helpers(function)
-        # numba compiled helpers with their globals of then: if these have changed, the result is not cached.
+        # numba compiled helpers with the globals of that time: if these have changed, the result is not cached.
         lasting = bool(key) and not stale(function)
         compilations.append(what)
         logger.debug(f"compiling {what} ...")

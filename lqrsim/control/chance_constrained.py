@@ -45,7 +45,7 @@ class SafePlan:
       solution: solution of it.
       controller: the controller that follows the plan, an OffsetFree or a policy.
       tube: the prediction of its runs; `tube.collision_chance` is the chance.
-      asked: the chance that was asked for.
+      asked: the requested chance.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
     """
 
@@ -198,7 +198,7 @@ class _Search:
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
     def next_deviations(self) -> float | None:
-        """How many standard deviations to try next; None where there is no use in more."""
+        """How many standard deviations to try next; None where more would not help."""
         plan = self.plans[-1]
         chance = plan.tube.collision_chance
         first = len(self.plans) == 1 and self.impossible == np.inf

@@ -102,7 +102,7 @@ class Surroundings:
         return kept
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
-        """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,).
+        """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p), and its variance (O,).
 
         With balls it is the clearance of the ball nearest to the obstacle.
         """

@@ -21,7 +21,7 @@ class LoopMoments(NamedTuple):
     Attributes:
       mean: mean of X, (T+1, X).
       covariance: covariance of X, (T+1, X, X).
-      across: of the deviation of the states with that of the knot before, (T, n, n).
+      across: covariance of the deviation of the states with that at the knot before, (T, n, n).
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
     """

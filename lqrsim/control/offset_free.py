@@ -78,7 +78,7 @@ class OffsetFree(Controller):
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan.
       gain: gain of the law, (T, m, Z).
-      offset: of the law, (T, m).
+      offset: offset of the law, (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
 
     Raises:

@@ -49,7 +49,7 @@ class Sensor(NamedTuple):
 
     Attributes:
       source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
-      data: their parameters. size: Y, how many numbers there are. names: what messages call them.
+      data: their parameters. size: Y, the number of measured values. names: their names in messages.
     """
 
     source: Source

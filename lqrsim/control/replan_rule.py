@@ -150,7 +150,7 @@ class ReplanLog:
         self.kept[reason] += 1
 
     def summary(self, *, times: bool = False) -> str:
-        """How often it was solved, and why the law before went on where it did, in a line.
+        """The number of solves, and the reasons why the previous law continued, in a line.
 
         Args:
           times: whether to include how long solves took.

@@ -1,12 +1,12 @@
 """Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
-At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
-constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved from
-there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower cost, and
-goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their difference
-from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of the controls
-and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
-simulation.
+At each of these steps, and for each trial, the law is simulated with the model from the estimated state, with the
+unknown constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved
+from there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower
+cost, and goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their
+difference from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of
+the controls and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no
+time in the simulation.
 """
 
 from collections.abc import Mapping
@@ -100,7 +100,7 @@ class ReplannedRun(ControllerRun):
         except InputError as error:  # an estimate is not finite
             self.log.refuse(str(error))
             return
-        # By that model the actuators have no lag, and no gains and offsets.
+        # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
         rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)

@@ -199,10 +199,11 @@ def track(
         the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
         under the uncertainty.
       effort: the most that may be added to each control to return to the plan; by default a quarter of its range.
-      at_end: the tolerances of the position at the plan's end, relative to before; of all states where there is none.
+      at_end: the tolerances of the position at the plan's end, relative to before; of all states if there is no
+        position.
       uncertainty: the uncertainty in a run, as from `uncertainty_of`; only for choosing tolerances.
-      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise, as that is along
-        the plan; above 0 large deviations are dreaded. Tolerances must then be given.
+      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise along the plan;
+        above 0 it penalises large deviations more. Tolerances must then be given.
 
     Returns:
       The policy.

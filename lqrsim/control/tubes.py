@@ -34,7 +34,7 @@ class Tube:
       state_coordinates: names and units of the states.
       mean: mean of the deviation of the state, (T+1, n).
       covariance: covariance of that deviation, (T+1, n, n).
-      across: of the deviation with that of the knot before, (T, n, n).
+      across: covariance of the deviation with that at the knot before, (T, n, n).
       estimate_covariance: covariance of the error of the estimate, before each measurement, (T+1, n, n); None without a
         filter.
       command: standard deviation of each command, before it is limited, (T, m).

@@ -1,7 +1,7 @@
 """The uncertainty in a run that its plan does not know, in numbers: the basis of filters, tracking laws and tubes.
 
-All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one of disturbances as `simulate` takes them; a
-person with a robot of their own can write one down.
+All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one from the disturbances of `simulate`; for a robot
+of your own you can state one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

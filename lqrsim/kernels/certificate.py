@@ -23,7 +23,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
 
     Args:
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy as it is with controls at their limits,
-        and write them to `to_go`: a Riccati pass's assume that controls respond that cannot.
+        and write them to `to_go`: those of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       found: row of CERTIFICATE, written.
         scale: the curved part of the cost, if nothing in it cancelled; rounding errors are relative to it.

@@ -324,7 +324,7 @@ def write_quaternion(x, first, qpos, q):
 
 
 def rotation_vector_near(qpos, q, near, first, out):
-    """Write the rotation vector of a quaternion to out[first], of all those the one nearest to that of `near`."""
+    """Write the rotation vector of a quaternion to out[first]: the one nearest to that of `near`."""
     sine, along, length = 0.0, 0.0, 0.0
     for i in range(3):
         sine += qpos[q + 1 + i] * qpos[q + 1 + i]

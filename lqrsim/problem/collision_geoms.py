@@ -105,7 +105,7 @@ class CollisionGeoms(abc.ABC):
         """Whether these are the geoms of that scene, with its obstacles.
 
         Args:
-          scene: of a plant.
+          scene: the scene of a plant.
 
         Returns:
           Whether they are.

@@ -111,8 +111,8 @@ class CollisionSpheres:
         parameters as attributes.
       radii: (K,) of the balls, in metres.
       names: names of the balls, by which messages call them; by default "ball 0", "ball 1", ....
-      sites: of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that the
-        middle of each is where the formula has it.
+      sites: names of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that
+        the middle of each is where the formula has it.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
         to slopes (K, 3 or 2, n), which it gets as zeros. Without it they are central differences.
       depends_on: names of the states that the places depend on, for the compiled and the plain level; all by default.

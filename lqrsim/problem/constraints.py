@@ -137,10 +137,10 @@ class SymbolicConstraint(Constraint):
 
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
-        are not to be negative. All of them depend on u, or none does. They are solved for to one tolerance, so their
-        units are best such that numbers about 1 matter.
+        must be nonnegative. All of them depend on u, or none does. They are solved for to one tolerance, so their units
+        are best such that numbers about 1 matter.
       parameters: name -> value, as in `Dynamics`.
-      equality: the expressions are to be zero, and are to 1e-6, or to `constraint_tolerance` where that is smaller.
+      equality: whether the expressions must be zero; they are to 1e-6, or to `constraint_tolerance` if that is smaller.
       at: "all" steps, or only the "final" one, where it must not depend on u.
     """
 

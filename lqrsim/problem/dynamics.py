@@ -457,7 +457,7 @@ class Dynamics:
 def _parameters_of(
     parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Both, checked; where nothing is gained from taking disturbances for constants, they are among the parameters."""
+    """Parameters and disturbances, checked; disturbances that would gain nothing as constants become parameters."""
     own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
     twice = own.keys() & unknown.keys()
     if twice:

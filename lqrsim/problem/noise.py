@@ -42,7 +42,7 @@ class NoiseTerm:
       source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
         `kernels/declarations.py`.
       data: (any,) the parameters or the matrix, then the strength.
-      rows: the states that noise acts on at once. size: of w.
+      rows: the states that noise acts on at once. size: number of entries of w.
       active: the entries of (x, u), states before controls, that M depends on.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """

@@ -234,7 +234,7 @@ class Problem:
     def _with(self, **changed: Any) -> "Problem":
         """The same with other parts, without a check.
 
-        All of it was checked when it was stated, and this is done at every solve of a robot that plans as it goes.
+        Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
         """
         other = copy.copy(self)
         for name, value in changed.items():

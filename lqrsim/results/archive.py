@@ -45,7 +45,7 @@ class Header(NamedTuple):
 
 
 class Other(InputError):
-    """A file that is intact, but of another format or version."""
+    """An intact file of another format or version."""
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:

@@ -235,7 +235,7 @@ class Funnel:
         """(T+1, p, p) in m^2: its one-sigma ellipsoids are the funnel's projection onto the position.
 
         Raises:
-          InputError: the robot has no position, or some of it is not among `states`.
+          InputError: the robot has no position, or not all of it is among `states`.
         """
         place = self.state_coordinates.position
         names = [self.state_coordinates.names[i] for i in place]

@@ -159,7 +159,7 @@ class Rollout:
         self._check_endings()
 
     def _check_tube(self) -> None:
-        """Raises InputError unless a predicted tube is covariances of the position."""
+        """Raises InputError unless a predicted tube consists of covariances of the position."""
         if self.tube is not None:
             size = len(self.state_coordinates.position)
             if self.tube.shape[1] != size or not size:

@@ -81,7 +81,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         solution = ls.load("plan.npz", ls.Solution)
 
     Args:
-      path: of a file that `save` wrote.
+      path: path of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
         By default, any.
 

@@ -62,9 +62,10 @@ class MjcfRobot(Robot):
 
     Where the file has no camera, or no light, it gets one named overview.
 
-    Obstacles are the geoms that are fixed to the world and can touch the robot, but its own base, which carries it, and
-    the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of them, at
-    MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are MuJoCo's.
+    Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
+    and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
+    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are
+    MuJoCo's.
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
@@ -88,7 +89,7 @@ class MjcfRobot(Robot):
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: equality constraints but those that couple joints linearly, delays, plugins with states.
+        describe: equality constraints except those that couple joints linearly, delays, plugins with states.
     """
 
     def __init__(

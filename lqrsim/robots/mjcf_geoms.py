@@ -25,7 +25,7 @@ class MjcfGeoms(CollisionGeoms):
     """All that moves and collides in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
 
     Args:
-      scene: of the robot, in which all geoms have names.
+      scene: the robot's scene, in which all geoms have names.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -28,7 +28,7 @@ def mjcf(
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
 
     Args:
-      path: of the MJCF.
+      path: path of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
       goal: the goal, in the same form.

@@ -49,7 +49,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 
     Args:
       scenario: to solve.
-      path: of a solution, a policy, or a rollout or funnel, for its plan.
+      path: path of a solution, of a policy, or of a rollout or funnel, for its plan.
 
     Returns:
       The solution, the policy or the plan.

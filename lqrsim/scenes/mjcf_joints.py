@@ -50,8 +50,8 @@ class Coupling:
     """A joint that an equality constraint moves with another one: by how much it is linear.
 
     Attributes:
-      dof: of the joint. other: of the one that it follows; -1 where it stands still. offset: of its position, where the
-        other's is 0, in m or rad. ratio: of both.
+      dof: index of the joint's velocity. other: that of the joint it follows; -1 where it stands still. offset: its
+        position where the other's is 0, in m or rad. ratio: of both.
     """
 
     dof: int

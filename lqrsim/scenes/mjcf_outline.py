@@ -31,7 +31,7 @@ class Outline:
 
 
 def outline_of(model: mujoco.MjModel) -> Outline:
-    """Spheres as they are, capsules as chains, the rest as the ball about its middle that it is in.
+    """Spheres as they are, capsules as chains, other geoms as a ball about their middle that contains them.
 
     Geoms that are only drawn count if nothing collides. The last ball is in the middle of a geom.
     """

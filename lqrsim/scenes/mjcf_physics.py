@@ -36,7 +36,7 @@ class MjcfPhysics:
 
     Args:
       xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
-      actuators: ids of those that the controls are for, in order. obstacles: ids of the geoms that are obstacles.
+      actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
 
     Attributes:
       model: MuJoCo's. numbers: what the kernel takes, with no wrench. team: the words that its threads share.

@@ -72,7 +72,7 @@ def simulate(
       frames: whether to record the data for drawing, also between the control periods; without it there is no video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
         through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome.
-      threads: of MuJoCo; by default one per processor.
+      threads: number of MuJoCo's threads; by default one per processor.
       generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
       progress: called after each control period with the number of finished periods and that of all.
       watch: called with each frame: its time, MuJoCo's qpos (K, nq), and which trials are unstable (K,).

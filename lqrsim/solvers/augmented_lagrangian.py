@@ -260,7 +260,7 @@ class AugmentedLagrangian:
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
+        self._first = [array[0] for array in self._work.multipliers]  # zero, except those of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)

@@ -87,7 +87,7 @@ class Found:
     """Result of a run.
 
     Attributes:
-      plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
+      plan: states and controls, a motion except for gaps. gain: (T, m, n) about it. measures: its measures.
       multipliers: multipliers of each constraint (T+1, rows); of the limits (T, m), positive where a control presses
         against the upper one. solved: whether all measures are within tolerance. iterations: how many there were.
       control_size, row_size: typical sizes of controls (m,) and rows (R,). scale: the cost that measures are relative

@@ -159,7 +159,7 @@ def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -
 
 
 def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, price: float) -> bool:
-    """Find a descent direction, with as much of the exact Hessian as leaves the model a minimum."""
+    """Find a descent direction, with the largest share of the exact Hessian for which the model has a minimum."""
     models, none = stages.models, np.zeros((stages.steps, stages.n))
     for mix in MIXES:
         if stages.direction((1 - mix) * models.hessian + mix * models.convex + barrier, gradient, none):

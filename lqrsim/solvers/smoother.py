@@ -118,8 +118,8 @@ def smooth_many(
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
     The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an iteration
-    are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are plain
-    Python take turns, and gain nothing from threads.
+    are an average. Constraints are checked after each iteration. Dynamics and costs that are plain Python take turns,
+    and gain nothing from threads.
 
     Args:
       problems: problems of one structure or of many; each structure is compiled once.

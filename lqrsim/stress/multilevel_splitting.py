@@ -90,7 +90,7 @@ def failure_probability(
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       seed: seed of all random numbers.
-      confidence: of the interval.
+      confidence: confidence of the interval.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds.
       progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
@@ -164,7 +164,8 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
 
 
 class CountedScore:
-    """Counts the evaluations of a score and checks its results. Raises InputError unless it is a number each."""
+    """Counts the evaluations of a score and checks its results. Raises InputError unless it is one number for each
+    vector."""
 
     def __init__(self, score: Score) -> None:
         self.score, self.evaluations = score, 0

@@ -94,7 +94,7 @@ def smooth_safest(
       seed: seed of the disturbances.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
-      threads: of the search and of the simulations.
+      threads: number of threads of the search and of the simulations.
 
     Returns:
       A SafestPlan.

@@ -175,7 +175,7 @@ def bootstrap(
       statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example
         `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
       samples: numbers (K,); row i of each belongs to the same trial.
-      confidence: of the interval.
+      confidence: confidence of the interval.
       resamples: number of bootstrap samples.
       seed: seed of the resampling.
 

@@ -113,7 +113,7 @@ class Legend:
 
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
         named = dict(entry for one in overlays for entry in one.legend_entries())
-        # Of two labels where one begins with the other, as tubes drawn in part and in full have, the longer one stays.
+        # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
         entries: dict[str, text_tiles.Colour | None] = {
             text: colour
             for text, colour in named.items()

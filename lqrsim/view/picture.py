@@ -167,7 +167,7 @@ class Picture:
       runs: the rollouts, each once.
       panes: the panes and their places.
       size: width and height in pixels.
-      end: of the last run, in seconds.
+      end: end of the last run, in seconds.
     """
 
     def __init__(

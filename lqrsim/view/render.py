@@ -81,7 +81,7 @@ def render(
         too wide. cost_tube: ellipsoids of low total cost. funnel: its shadow on the position, pale between
         its knots. caption: time, tracking error, clearance, disturbances, whether the run is in the funnel.
       solution: the solution that was run, for `cost_tube`; one for all runs, or one each.
-      funnel: about the plan of the run, for funnel; one for all, or one each.
+      funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames a second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.

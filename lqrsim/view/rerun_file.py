@@ -35,7 +35,7 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
 
     Args:
       rollout: the result of `simulate`, with frames.
-      path: of the file.
+      path: path of the file.
       trial: row of the rollout.
       funnel: about the plan of the run.
 

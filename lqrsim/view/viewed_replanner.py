@@ -30,7 +30,7 @@ class MovableGoal:
     """The goal position of a problem's final cost, which can be moved.
 
     Attributes:
-      place: in the problem, (2 or 3,).
+      place: the goal in the problem, (2 or 3,).
 
     Raises:
       InputError: the final cost has no goal position, or several.
