@@ -177,7 +177,7 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
 
     Plackett's integral over the correlation's angle, by Gauss and Legendre's rule.
     """
-    # Near 1 the integrand is steep: from there it is done from the other end, where it is min(a, b).
+    # Near 1 the integrand is steep: there the integral begins at the other end, where it is min(a, b).
     angle = np.arcsin(correlation)
     start = np.where(np.abs(correlation) > 0.95, np.sign(correlation) * np.pi / 2, 0.0)
     at = start[..., None] + (angle - start)[..., None] * (NODES + 1) / 2

@@ -1,7 +1,7 @@
 """The linear model about a plan that tracking laws, filters and tubes are made of.
 
-A deviation from the plan is z = (e, a, d): of the state (n), of what the actuators have reached (m of them if they lag,
-else none), and the states of the unknowns (D). With u the deviation of the command,
+A deviation from the plan is z = (e, a, d): of the state (n), of the actuators' states (m if they lag, else none), and
+the states of the unknowns (D). With u the deviation of the command,
 
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 

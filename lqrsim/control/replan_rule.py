@@ -102,7 +102,7 @@ class ReplanLog:
     Attributes:
       records: a `ReplanRecord` of each.
       solved: how many were used, of all trials.
-      kept: why others were not, and the law before went on: reason -> how many.
+      kept: why others were not used, so that the previous law continued: reason -> number.
     """
 
     def __init__(self) -> None:

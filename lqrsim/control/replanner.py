@@ -99,7 +99,7 @@ class LiveReplanner:
             self._thread.join()
 
     def summary(self) -> str:
-        """How often it solved, how long that took, and why the law before was kept where it was, in a line."""
+        """The number of solves, their times, and the reasons why the previous law was kept, in a line."""
         return self.log.summary(times=True)
 
     def change(self, **parts: Any) -> None:
@@ -149,7 +149,7 @@ class LiveReplanner:
         return policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
 
     def _due(self, step: int) -> bool:
-        """Whether a solve begins in a control period: that is so of the first, too, and of one after those left out."""
+        """Whether a solve begins in a control period: also in the first, and in the next one after periods left out."""
         rule = self._rule
         left = rule.horizon == "moving" or step + rule.delay < rule.problem.steps
         return left and step // rule.periods > self._asked // rule.periods

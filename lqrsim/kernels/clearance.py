@@ -1,4 +1,4 @@
-"""Distances to obstacles, less what they must be: values of a constraint. The kernels' subset.
+"""Distances to obstacles minus the required ones: values of a constraint. The kernels' subset.
 
 The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
 Jacobian in place of state and control, as `augmented_lagrangian.py` has them.

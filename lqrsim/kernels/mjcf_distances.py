@@ -1,9 +1,9 @@
 """Distances between the geoms of a robot and those of obstacles, by MuJoCo's `mj_geomDistance`. The kernels' subset.
 
-`data` has the address of what `mjcf_dynamics.py` calls p, how many rows and how many pairs of geoms there are, the
-largest distance of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's
-geom, how far both reach from their middles together, and whether the obstacle is a plane. A row is the least distance
-of its pairs. Pairs whose bounding spheres are farther apart than that are skipped.
+`data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
+of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's geom, how far both
+reach from their middles together, and whether the obstacle is a plane. A row is the least distance of its pairs. Pairs
+whose bounding spheres are farther apart than that are skipped.
 """
 
 from math import sqrt

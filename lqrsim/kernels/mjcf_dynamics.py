@@ -66,8 +66,7 @@ def advance(x, u, p, h, out):
 def step_jacobian(x, u, p, h, out, jacobian):
     """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
 
-    If there are helpers and nobody has them, they do columns, too; which thread did one makes no difference to the
-    last bit.
+    Free helpers compute columns, too; the bits do not depend on which thread computed one.
     """
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
@@ -169,7 +168,7 @@ def linearize_here(z, p, wrench, address, warm):
 
 
 def column(k, z, p, wrench, substeps, address, warm, jacobian):
-    """Write a column of the Jacobian: the k-th, of the controls first, which leave the stage of velocities as it is.
+    """Write the k-th column of the Jacobian. Controls come first: they do not change the stage of velocities.
 
     A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
     reused.
@@ -263,7 +262,7 @@ def start_from(p, one, guess):
 
 
 def step_from(z, p, one, two, guess, kept):
-    """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
+    """A physics step to `two`; it reuses the stages of `one` that the state and control share."""
     write_to(z, p, one)
     start_from(p, one, guess)
     call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(kept), int32(1))

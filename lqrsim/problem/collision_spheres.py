@@ -73,7 +73,7 @@ class SphereCenters:
 
     @property
     def numbers(self) -> int:
-        """How many numbers of the data that compiled code is given are the places'."""
+        """Number of entries in compiled code's data that belong to the places."""
         return len(self.functions) + len(self.data)
 
     def world_seen(self, world: World, space: Coordinates) -> World:

@@ -178,8 +178,8 @@ def check_derivatives(
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
     Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
-    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, for theirs are
-    central differences themselves.
+    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, because theirs
+    are central differences themselves.
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.

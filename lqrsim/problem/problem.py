@@ -71,8 +71,8 @@ class Problem:
       begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
       noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
         worked out to second order about the plan. None for none.
-      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
-        runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
+      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
+        risk-averse, below 0 risk-seeking; 0 is the expectation.
       duration: (shortest, longest) in s: the final time is free. A solve begins with `dt` and `steps`; the solution has
         as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is. None for the
         duration that dt and steps say.
@@ -199,7 +199,7 @@ class Problem:
 
         Args:
           stage_cost: or None for the one there is.
-          final_cost: or None for the one there is.
+          final_cost: the final cost, or None for the present one.
 
         Returns:
           A Problem.
@@ -213,7 +213,7 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later begin: moving obstacles are where they are then.
+        """The same problem with a later beginning: moving obstacles are where they are then.
 
         Args:
           seconds: how much later, in seconds.
@@ -225,7 +225,7 @@ class Problem:
         return other._bound_anew() if self.moving else other
 
     def _bound_anew(self) -> "Problem":
-        """The same with all that depends on the steps or on when it begins as it then is."""
+        """The same problem, with everything updated that depends on the steps or on its beginning."""
         stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
         terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
         constraints = bind_all(self.constraints, self.dynamics, self.times)

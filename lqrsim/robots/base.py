@@ -19,8 +19,8 @@ class Robot(abc.ABC):
 
     Attributes:
       name: its name on the command line.
-      body: the body in the MJCF that is the robot; its origin is where the states say that its position is. Obstacles
-        are everything else that is fixed to the world.
+      body: the robot's body in the MJCF; its origin is the position in the states. Obstacles are everything else that
+        is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.

@@ -235,7 +235,7 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:
-    """How far from a body's origin what collides of it and of all it carries can be, at most, in metres.
+    """The largest distance from a body's origin of its colliding geoms and of those it carries, in metres.
 
     If no geom collides, the visual geoms count instead.
     """

@@ -37,7 +37,7 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
-    if _bodies(model) == elements["body"].keys():  # else there are some whose mass the text has no place for
+    if _bodies(model) == elements["body"].keys():  # otherwise the text has no place for the mass of some
         found += [Number("mass", "", sum(masses.values()))] if masses else []
         found += [Number("mass", name, mass) for name, mass in masses.items()]
     for number in range(model.njnt):
@@ -59,14 +59,13 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
 def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], what: str) -> str:
     """The MJCF with others of its numbers, by name, as in `numbers_of`.
 
-    A body's inertia is as many times its own as its mass is, and so it is for all bodies with `mass`. The numbers of a
-    gear keep their ratios.
+    A body's inertia scales with its mass; `mass` scales those of all bodies. The numbers of a gear keep their ratios.
 
     Args:
       what: the MJCF's name in messages.
 
     Raises:
-      InputError: a value is out of range, or both the whole mass and that of a body are there.
+      InputError: a value is out of range, or both the whole mass and that of a body are given.
     """
     numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
     elements, scales = _elements(root), dict[str, float]()
@@ -99,7 +98,8 @@ def _state_masses(
     model: mujoco.MjModel,
     scales: Mapping[str, float],
 ) -> None:
-    """Write the mass and inertia of each body, times its scale: as compiled, in place of how they came about."""
+    """Write the mass and inertia of each body, times its scale: as compiled, in place of the elements that they came
+    from."""
     for name, body in bodies.items():
         for inertial in body.findall("inertial"):
             body.remove(inertial)

@@ -96,7 +96,7 @@ def faults(
     """List what contradicts a claim of convergence, in words; empty if nothing does.
 
     Args:
-      claimed: the cost that the log ends with. rest: the rounding error of a cost whose terms cancel.
+      claimed: the last cost in the log. rest: the rounding error of a cost whose terms cancel.
       tolerance: tolerance of the optimality; None where only the cost was asked for.
       kept: whether the violation is that of equalities within their tolerance.
     """

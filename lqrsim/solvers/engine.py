@@ -316,7 +316,7 @@ class SolveRun:
         return np.inf if self.ending.pass_failed else _cost_of(self._last)
 
     def smooth(self, last: int) -> None:
-        """Go on until smoothing has done `last` iterations, or ends."""
+        """Continue until smoothing has done `last` iterations, or ends."""
         if self.ending.outcome != declarations.RUNNING:
             return
         if not self._row and not self.run_opening_pass():

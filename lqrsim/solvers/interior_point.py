@@ -385,8 +385,8 @@ class InteriorPoint:
       problem: a problem with constraints, limits, or neither.
       plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
       barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
-      room: what slacks are at first, at least: relative to a row's size, or to a control's range.
-      price: price of missing a constraint, in cost a unit: then it is elastic. Infinite: it is not to be missed.
+      room: the least initial slack: relative to a row's size, or to a control's range.
+      price: price of missing a constraint, in cost a unit: then it is elastic. Infinite: it must not be missed.
       multipliers: known ones of the constraints, (T+1, rows) each, or none.
       stages: to use again, of the same problem.
     """

@@ -147,7 +147,8 @@ class PreparedSolver:
         after: int = 0,
         time_limit: float | None = None,
     ) -> Replan:
-        """Solve from a state, starting from a plan. The answer is no worse than going on with that plan; see `Replan`.
+        """Solve from a state, starting from a plan. The answer is no worse than continuing with that plan; see
+        `Replan`.
 
         Args:
           state: (n,) the state to plan from.
@@ -359,7 +360,7 @@ class _Best:
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
       multipliers: that it was found with. cost, violation: of it. before: the cost of the first.
-      improved: whether it is another than the first. rolling_out: how long it took to see where that leads, in s.
+      improved: whether it is another than the first. rolling_out: time that its rollout took, in s.
     """
 
     def __init__(self, run: SolveRun) -> None:

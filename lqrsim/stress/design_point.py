@@ -14,7 +14,7 @@ multilevel_splitting.py measures the probability. The search uses no derivatives
    angle. Rounds are added up while the failure stays where it is. The search ends when the noise leaves less to gain
    than the tolerance.
 
-The result fails. It is not proven that nothing nearer does; a search from other failures is a check.
+The result fails. There may be a nearer failure; a search from other failures is a check.
 """
 
 from dataclasses import dataclass

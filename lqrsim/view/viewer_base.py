@@ -162,7 +162,7 @@ class Viewer(abc.ABC):
         return selected or (self.goal_body if self.holds_goal else self.robot)
 
     def other(self) -> int:
-        """The body that Enter selects: of robot and goal the one that is not held."""
+        """The body that Enter selects: the one of robot and goal that is not held."""
         return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
     def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
