@@ -63,9 +63,6 @@ class Clearance(Constraint):
 
         Args:
           margin: as of a Clearance.
-
-        Returns:
-          A Clearance.
         """
         radius = self.radius if self.balls is None and self.geoms is None else None
         return Clearance(self.world, radius=radius, balls=self.balls, geoms=self.geoms, margin=margin)

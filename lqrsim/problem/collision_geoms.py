@@ -62,9 +62,6 @@ class CollisionGeoms(abc.ABC):
         Args:
           dynamics: dynamics of the robot. world: the obstacles. reach: in metres, the largest distance of interest.
 
-        Returns:
-          The GeomDistances.
-
         Raises:
           InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
         """

@@ -82,9 +82,6 @@ class SphereCenters:
         Args:
           world: the obstacles.
           space: the coordinates of the states.
-
-        Returns:
-          A World.
         """
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
 

@@ -116,9 +116,6 @@ class Constraint(abc.ABC):
 
         Args:
           steps: how many steps are over.
-
-        Returns:
-          A Constraint.
         """
         check_count("steps", steps, at_least=0)
         return self

@@ -221,9 +221,6 @@ class ObstacleCost(Cost):
 
         Args:
           weight: cost of touching one obstacle, with one ball, for one step.
-
-        Returns:
-          An ObstacleCost.
         """
         radius = self.radius if self.balls is None and self.geoms is None else None
         return ObstacleCost(

@@ -187,9 +187,6 @@ class Dynamics:
         Args:
           **values: parameter -> number.
 
-        Returns:
-          Dynamics.
-
         Raises:
           InputError: there is no such parameter, or the value is not finite.
         """
@@ -363,9 +360,6 @@ class Dynamics:
 
         Args:
           threads: how many threads the solver may use for one trajectory.
-
-        Returns:
-          A context manager.
         """
         check_count("threads", threads)
         return contextlib.nullcontext()
@@ -391,9 +385,6 @@ class Dynamics:
         Args:
           state: (n,).
           control: (m,).
-
-        Returns:
-          df/dx (n, n) and df/du (n, m).
         """
         x, u = self._check(state, control)
         n, m = len(x), len(u)
@@ -408,9 +399,6 @@ class Dynamics:
           state: (n,).
           control: (m,), held over the step.
           dt: seconds; negative steps lead backwards in time.
-
-        Returns:
-          (n,).
         """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
@@ -424,9 +412,6 @@ class Dynamics:
           state: (n,).
           control: (m,), held over the step.
           dt: seconds.
-
-        Returns:
-          A (n, n), B (n, m) and c (n,).
         """
         x, u = self._check(state, control)
         n, m = len(x), len(u)

@@ -174,9 +174,6 @@ class Problem:
           state: (n,).
           after: how many steps are over.
 
-        Returns:
-          A Problem.
-
         Raises:
           InputError: the state is not one, or no step is left.
         """
@@ -200,9 +197,6 @@ class Problem:
         Args:
           stage_cost: or None for the one there is.
           final_cost: the final cost, or None for the present one.
-
-        Returns:
-          A Problem.
 
         Raises:
           InputError: a cost does not belong to the system.

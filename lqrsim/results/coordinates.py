@@ -158,9 +158,6 @@ class Coordinates:
           places: (..., d), d position coordinates in metres.
           height: in metres, of positions in a horizontal plane without a height.
 
-        Returns:
-          Points (..., 3).
-
         Raises:
           InputError: not numbers of such a shape, or there is no position.
         """
@@ -259,9 +256,6 @@ class Coordinates:
 
         Args:
           other: coordinates of as many entries.
-
-        Returns:
-          Coordinates with the narrower limits.
 
         Raises:
           InputError: the numbers of entries differ, or nothing is within both limits.

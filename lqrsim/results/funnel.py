@@ -139,9 +139,6 @@ class Funnel:
         Args:
           t: seconds since the start of the plan.
 
-        Returns:
-          A level.
-
         Raises:
           InputError: `t` is negative or not finite.
         """
@@ -157,9 +154,6 @@ class Funnel:
           x: (..., n).
           t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
-
-        Returns:
-          (...).
 
         Raises:
           InputError: states of another size; `t` is negative or not finite.
@@ -197,9 +191,6 @@ class Funnel:
 
         Args:
           rollout: K trials of the funnel's plan.
-
-        Returns:
-          (K,).
 
         Raises:
           InputError: the rollout has another plan.

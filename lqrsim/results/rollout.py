@@ -247,9 +247,6 @@ class Rollout:
         Args:
           places: (..., 2 or 3), in metres.
           height: in metres, of places in a horizontal plane that has no height of its own.
-
-        Returns:
-          Points (..., 3).
         """
         space = self.state_coordinates
         if space.position or self.balls is None:

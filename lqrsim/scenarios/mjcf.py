@@ -43,9 +43,6 @@ def mjcf(
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
-    Returns:
-      The Scenario.
-
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """

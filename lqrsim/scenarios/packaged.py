@@ -72,9 +72,6 @@ class Scenario:
           goal_radius: in metres, or None.
           goal_tolerance: a scaled error, or None.
 
-        Returns:
-          The distance.
-
         Raises:
           InputError: as `simulate` does.
         """
@@ -119,9 +116,6 @@ def get(name: str) -> Scenario:
     Args:
       name: one of `names()`.
 
-    Returns:
-      The Scenario.
-
     Raises:
       InputError: there is no such scenario.
     """
@@ -139,11 +133,7 @@ def _functions() -> dict[str, Callable[..., Scenario]]:
 
 
 def differential_drive() -> Scenario:
-    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights.
-
-    Returns:
-      The Scenario.
-    """
+    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights."""
     robot, scene = DifferentialDrive(), load_scene("arena")
     start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
     weight = (5000.0, 5000.0, 50.0)
@@ -175,9 +165,6 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     Args:
       query: number of the random start and goal, from 0; see `quadrotor_queries`.
       seed: seed of the random starts and goals.
-
-    Returns:
-      The Scenario.
     """
     starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")

@@ -98,9 +98,6 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
         or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says whether it
         is one.
 
-    Returns:
-      The Scene.
-
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
         is of a type without a distance.

@@ -170,9 +170,6 @@ class World:
           plane: as in `Coordinates`.
           offset: as in `Coordinates`, in metres.
 
-        Returns:
-          A World in the plane's coordinates.
-
         Raises:
           InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
             so that it has no outline among the primitives.

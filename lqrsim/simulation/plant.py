@@ -93,9 +93,6 @@ class Plant:
         Args:
           period: seconds, such as `solution.trajectory.dt`.
 
-        Returns:
-          A Plant.
-
         Raises:
           InputError: the period is not positive.
         """
@@ -111,9 +108,6 @@ class Plant:
 
         Args:
           period: seconds.
-
-        Returns:
-          A count.
 
         Raises:
           InputError: the period is not a multiple of the physics step.
@@ -240,9 +234,6 @@ class Plant:
         Args:
           before: (..., B, 2 or 3), as of `middles`.
           after: likewise.
-
-        Returns:
-          (...).
         """
         if self.geoms is not None:
             return self.geoms.travel(before[..., 0, :], after[..., 0, :])
@@ -254,9 +245,6 @@ class Plant:
         Args:
           middles: (B, 2 or 3), as of `middles`.
           displaced: (obstacles, 3), by how much they are elsewhere.
-
-        Returns:
-          A name.
         """
         if self.geoms is not None:
             return self.world.names[int(self._distances(middles[None], displaced[None])[0, 0].argmin())]

@@ -137,9 +137,6 @@ def check_plant(
       tolerance: largest allowed error, relative to the largest change of the state.
       seed: seed of all random numbers.
 
-    Returns:
-      The PlantCheck.
-
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the
         simulation becomes unstable.

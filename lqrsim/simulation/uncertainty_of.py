@@ -29,9 +29,6 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
       plant: the simulated robot.
       disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
 
-    Returns:
-      The Uncertainty.
-
     Raises:
       InputError: a disturbance does not fit the plant.
     """

@@ -53,9 +53,6 @@ def prepare(
       max_iterations: as in `smooth`.
       finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
-    Returns:
-      A PreparedSolver.
-
     Raises:
       InputError: an argument is not as described.
     """
@@ -124,9 +121,6 @@ class PreparedSolver:
         Args:
           problem: to be solved.
 
-        Returns:
-          The problem.
-
         Raises:
           InputError: it would have to be compiled.
         """
@@ -156,9 +150,6 @@ class PreparedSolver:
           problem: the problem to solve from that state; by default the prepared one.
           after: the number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
-
-        Returns:
-          A Replan.
 
         Raises:
           InputError: an argument is not as described.

@@ -53,9 +53,6 @@ def verify_video(
       solution: as for `verify_run`.
       progress: as for `verify_run`.
 
-    Returns:
-      The Verification.
-
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
