@@ -68,7 +68,7 @@ class SafePlan:
 
     @property
     def success(self) -> bool:
-        """Whether the plan is a solution, and its predicted chance of collision no more than was asked."""
+        """Whether the plan is a solution, and its predicted chance of collision is at most the requested one."""
         return self.solution.success and self.tube.collision_chance <= self.asked
 
     def __str__(self) -> str:

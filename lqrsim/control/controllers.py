@@ -194,7 +194,7 @@ class _FeedbackRun(ControllerRun):
 
 
 class OutputFeedback(Controller):
-    """An `OutputFeedbackPolicy` that measures states. A measurement that is the last one to the last bit got lost."""
+    """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost."""
 
     def __init__(self, policy: OutputFeedbackPolicy) -> None:
         states, names = policy.state_coordinates.names, policy.measured_coordinates.names

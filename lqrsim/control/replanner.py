@@ -61,8 +61,8 @@ class LiveReplanner:
     Attributes:
       problem: the problem that is solved from now on.
       active: the plan in force, `active.plan`, and the control period that it begins at, `active.first`.
-      log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, how many were used; and
-        `log.kept`, why others were not, and the law before went on: reason -> how many.
+      log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, the number used; and `log.kept`,
+        why others were not used, so that the previous law continued: reason -> number.
 
     Raises:
       InputError: as `Replanner.live`.

@@ -65,7 +65,7 @@ def choose_tolerances(
     """Return the tolerances for a law about a plan.
 
     Args:
-      predicted: predicts for each of C weights what their law leads to.
+      predicted: predicts the results of the laws of C weights.
       effort: the most that may be added to each control, (m,).
       at_end: as in `track`.
     """

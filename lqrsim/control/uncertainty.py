@@ -167,8 +167,8 @@ class Uncertainty:
     def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
         """The same for a filter: varying unknowns may have a mean that is not zero, and constant ones may change.
 
-        By the linear model, that leaves no steady error: a filter that believes in a constant stops listening, and one
-        that believes in a wind that always comes back to zero is always a little wrong about one that does not.
+        In the linear model, this leaves no steady error: a filter that assumes a constant stops adapting, and one that
+        assumes a wind of mean zero is biased for a steady wind.
 
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
@@ -214,7 +214,7 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
     """Numbers as one for each entry, (len(space),); those by name win over those by unit, the rest are 0.
 
     Args:
-      above: what each must exceed; by default they must not be negative, and need not be there for all.
+      above: a bound that each must exceed; by default they must be nonnegative, and some may be missing.
 
     Raises:
       InputError: a name or unit that there is not, another number of them, or one that is out of range.

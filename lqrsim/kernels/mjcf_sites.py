@@ -108,7 +108,7 @@ def write_errors(one, data, out, point):
 
 
 def write_inverse(out, first, inverse):
-    """Write what takes an angular velocity in the wanted axes to the rate of the rotation vector."""
+    """Write the matrix from an angular velocity in the wanted axes to the rate of the rotation vector."""
     a, b, c = out[first], out[first + 1], out[first + 2]
     square = a * a + b * b + c * c
     ratio = cotangent_ratio(square)

@@ -265,7 +265,7 @@ class CollisionSpheres:
         return SphereCenters(source, dynamics.data, axes, size == 2, functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
-        """How many coordinates a compiled or plain function returns of each ball, which is seen by trying it."""
+        """The number of coordinates that a compiled or plain function returns for each ball, found by calling it."""
         plain: Any = getattr(self.function, "py_func", self.function)
         p = symbolic.Parameters(**dynamics.parameters)
         try:

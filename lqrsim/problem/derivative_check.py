@@ -102,7 +102,8 @@ def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[
 def _constraints(
     problem: Problem,
 ) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
-    """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
+    """The constraints' numbers in plain Python: the name of each in messages, its value and its slope (n+m,) at (x,
+    u)."""
     n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
     for term in problem.constraint_terms:
         names, data = _run_plainly(term, n, m)

@@ -195,7 +195,7 @@ class Problem:
         """The same with other costs. It may begin within an obstacle if this does; see `from_state`.
 
         Args:
-          stage_cost: or None for the one there is.
+          stage_cost: the stage cost, or None for the present one.
           final_cost: the final cost, or None for the present one.
 
         Raises:

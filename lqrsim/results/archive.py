@@ -141,7 +141,7 @@ class Archive:
 
 @contextlib.contextmanager
 def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
-    """Open a file of this kind, or of any in `versions`; all that the block raises is put down to the file.
+    """Open a file of this kind, or of any in `versions`; any exception in the block is reported as a fault of the file.
 
     Raises:
       InputError: the file does not exist, has another kind or version, or is damaged.

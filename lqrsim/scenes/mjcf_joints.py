@@ -223,7 +223,7 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
 
 
 def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
-    """The body of a site, and its place (3,) and axes (3, 3) in those of the body."""
+    """The body of a site, and its place (3,) and axes (3, 3) in the body's axes."""
     return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
 
 

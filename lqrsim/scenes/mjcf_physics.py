@@ -27,7 +27,7 @@ _PARTS = {
 class MjcfPhysics:
     """The data of an MJCF for `kernels/mjcf_dynamics.py`.
 
-    The model is the MJCF's own, but that
+    The model is the MJCF's own, except that
 
     - obstacles do not collide: they are for costs and constraints to keep clear of;
     - controls are not cut off at their range, which would hide from a solver which way to go from there;

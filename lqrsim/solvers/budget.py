@@ -110,7 +110,7 @@ class Budget:
 
     @contextlib.contextmanager
     def without_costs(self) -> Iterator[None]:
-        """For a while: the costs of iterations are those of another problem, and are not logged."""
+        """Temporarily: iterations are of another problem, and their costs are not logged."""
         begin, callback = len(self.log), self._callback
 
         def hidden(iteration: Iteration) -> Iteration:
