@@ -141,8 +141,12 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
         items = check_items(field, value, object, "a tuple")
         if said.letters:
             _check_length(field, len(items), said.letters, sizes)
-        inner = declared(get_args(kind)[0])
-        return tuple(_checked(f"{field}[{i}]", item, inner, sizes) for i, item in enumerate(items))
+        inner = get_args(kind)
+        each = inner[:1] * len(items) if inner[-1] is Ellipsis else inner
+        if len(each) != len(items):
+            raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
+        pairs = enumerate(zip(items, each, strict=True))
+        return tuple(_checked(f"{field}[{i}]", item, declared(one), sizes) for i, (item, one) in pairs)
     if origin is not None:  # a Mapping
         value = check_kind(field, value, Mapping, "a dictionary by name")
         inner = declared(get_args(kind)[1])

@@ -58,16 +58,14 @@ class PlantCheck:
     predicted: Annotated[Array, "n"]
     tolerance: Annotated[float, Bounds(above=0.0)]
     samples: int
-    contacts: tuple[tuple[object, ...], ...] = ()
+    contacts: tuple[tuple[str, str, int], ...] = ()
 
     def __post_init__(self) -> None:
         if not check_fields(self)["n"]:
             raise InputError("PlantCheck: names: got none, want at least one state")
         check_count("PlantCheck: samples", self.samples)
-        for pair in self.contacts:
-            if [isinstance(name, str) for name in pair] != [True, True, False]:
-                raise InputError(f"PlantCheck: contacts: got {excerpt(pair)}, want (geom, geom, number of samples)")
-            check_count("PlantCheck: contacts: count", pair[2], at_most=self.samples)
+        for *_, count in self.contacts:
+            check_count("PlantCheck: contacts: count", count, at_most=self.samples)
 
     @property
     def relative(self) -> Array:
