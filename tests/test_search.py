@@ -228,7 +228,7 @@ class TestWithoutAWay:
         for changes in changed:
             problem = in_the_plane(**changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
-            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, a start"):
+            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, or with start"):
                 ls.smooth(problem, starts=2)
             with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
                 ls.smooth_many([nowhere, problem], starts=2)
