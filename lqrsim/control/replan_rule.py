@@ -129,7 +129,7 @@ class ReplanLog:
         finite = np.isfinite(replan.cost)
         used = finite and not late and (replan.success or replan.improved)
         if not finite:
-            reason = "the law before leads to infinity by the model"
+            reason = "the previous law leads to infinity by the model"
         self.solved += used
         if not used:
             self.kept[reason] += 1
@@ -164,7 +164,7 @@ class ReplanLog:
             line += f" ({', '.join(f'{count} {reason}' for reason, count in early.most_common())})"
         if self.kept:
             reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
-            line += f", kept the law before {self.kept.total()} times: {reasons}"
+            line += f", kept the previous law {self.kept.total()} times: {reasons}"
         if times and self.records:
             took = 1e3 * np.array([one.seconds for one in self.records])
             line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
