@@ -116,6 +116,7 @@ def export_c(
         "period": repr(law.dt), "entries": _entries(law), "sha256": sha, "T": law.steps,
         "n": len(law.state_coordinates), "Y": len(_measured(law)), "m": len(law.control_coordinates),
         "bytes": tables.bytes, "real": number,
+        "or": "" if isinstance(law, OutputFeedbackPolicy) else ", or measured is NULL",
         "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period."
         if isinstance(law, OutputFeedbackPolicy) else "",
     }  # fmt: skip

@@ -25,7 +25,7 @@ int my_policy_step(const my_policy_real *measured, double t, my_policy_real *com
 {
     real state[MY_POLICY_STATES], near[MY_POLICY_STATES];
 
-    if (!(t >= 0.0) || !isfinite(t))
+    if (!measured || !(t >= 0.0) || !isfinite(t))
         return 1;
     for (int j = 0; j < MY_POLICY_STATES; j++) {
         if (!isfinite(measured[j]))

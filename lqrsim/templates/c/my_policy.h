@@ -35,7 +35,7 @@ void my_policy_init(void);
  * command: MY_POLICY_CONTROLS numbers, within their limits.
  *
  * After the horizon the last law stays in force. Returns 0; or 1, and does nothing, if t is negative or a number is not
- * finite.
+ * finite@or@.
  */
 int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command);
 
