@@ -40,7 +40,11 @@ VARIANTS: dict[str, dict[str, str]] = {
 EXACT = 1e-12  # that commands in double may differ by
 FLASH, RAM = 1 << 20, 192 << 10  # bytes of an STM32F405
 
-WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wdouble-promotion")
+# The last ones are those of the firmwares of Crazyflie and PX4 that C99 with constant tables could break.
+WARNINGS = (
+    "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wdouble-promotion", "-Wfloat-equal",
+    "-Wshadow", "-Wundef",
+)  # fmt: skip
 ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-O2")
 QEMU = ("qemu-system-arm", "-machine", "netduinoplus2", "-nographic", "-semihosting")
 REAL = {"float": ctypes.c_float, "double": ctypes.c_double}
@@ -75,7 +79,7 @@ class CompiledLaw(ls.Controller):
     ) -> None:
         self.policy, self.number = policy, number
         self.exported = ls.export_c(policy, folder, number=number, **options)
-        (folder / "swap.c").write_text(SWAP + "void swap(real *);\n", encoding="utf-8")
+        (folder / "swap.c").write_text(SWAP, encoding="utf-8")
         source, library = folder / "swap.c", folder / "policy.so"
         said = ["cc", *WARNINGS, "-O2", "-shared", "-fPIC", "-o", str(library), str(source), "-lm"]
         subprocess.run(said, check=True)

@@ -11,6 +11,6 @@ static void nearest_rotation(real *x, const real *near)
         along += axis[i] * near[i];
     }
     const real turns = RINT((along - angle) / TURN);
-    for (int i = 0; turns != 0 && i < 3; i++)
+    for (int i = 0; (turns < 0 || turns > 0) && i < 3; i++)
         x[i] = (angle + TURN * turns) * axis[i];
 }
