@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin, overload
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
-from lqrsim.results.archive import Arrays, Header, opened, write
+from lqrsim.results.archive import Arrays, Header, digest, opened, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
@@ -55,6 +55,17 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
       InputError: the file cannot be written, or its content could not be read again.
     """
     path = check_path("output", path)
+    write(path, *_content(result))
+    return path
+
+
+def hash_of(result: Saved) -> str:
+    """The `sha256` of the file that `save` writes of this. Raises InputError as `save`."""
+    return digest(*_content(result))
+
+
+def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
+    """The arrays and the JSON tree of a file. Raises InputError for what could not be read again."""
     kinds = ", ".join(f"{'an' if kind.__name__[0] in 'AO' else 'a'} {kind.__name__}" for kind in FORMATS)
     check_kind("result", result, tuple(FORMATS), f"one of: {kinds}")
     kind = next(kind for kind in FORMATS if isinstance(result, kind))
@@ -67,8 +78,7 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
         raise InputError(f"result: got a {name}, {reason}, want one as lqrsim makes it") from None
-    write(path, arrays, {"format": f"lqrsim {name}", "version": version, **tree})
-    return path
+    return arrays, {"format": f"lqrsim {name}", "version": version, **tree}
 
 
 @overload
