@@ -41,8 +41,8 @@ SLOT, SIZE = 24, 12
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 # The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
-# many are done, whether to stop, how many helpers there are.
-BUSY, TICKET, DONE, STOP, HELPERS = 0, 1, 2, 3, 4
+# many are done, whether to stop, how many helpers there are, whether a signal came: then all steps are NaN.
+BUSY, TICKET, DONE, STOP, HELPERS, SIGNALLED = 0, 1, 2, 3, 4, 5
 JOBS = 65536  # the ticket is JOBS * job + column
 PATIENT = 2000  # looks at the ticket before a helper lets others run
 
@@ -200,12 +200,14 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
 def steps_in(x, u, p, h, z):
     """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN.
 
-    Writes the state and the control one after the other, (W,).
+    0, too, once a signal came. Writes the state and the control one after the other, (W,).
     """
     for i in range(W):
         z[i] = x[i] if i < N else u[i - N]
         if not abs(z[i]) < LARGEST:
             return 0
+    if p[TEAM] != 0 and load(p[TEAM], SIGNALLED) != 0:
+        return 0
     return int(h / p[TIMESTEP] + 0.5) if h > 0 else 0
 
 

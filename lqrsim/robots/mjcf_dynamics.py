@@ -4,12 +4,13 @@ import contextlib
 import copy
 import threading
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim import process
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
@@ -169,11 +170,12 @@ class MjcfDynamics(Dynamics):
     def solving(self, threads: int) -> Iterator[None]:
         """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
 
-        More threads than processors would wait for each other, and are not begun.
+        More threads than processors would wait for each other, and are not begun. After a signal that raises
+        KeyboardInterrupt all steps are NaN, so that it need not wait for an iteration, which may take half a minute.
         """
         threads = min(check_count("threads", threads), processors())
         team, helpers = self.physics.team, list[threading.Thread]()
-        with unlogged():
+        with unlogged(), process.on_interrupt(partial(team.__setitem__, kernel.SIGNALLED, 1)):
             with _forming:
                 if team[kernel.HELPERS] == 0:
                     numbers, help_out = self.data, self.compiled.help_out
@@ -184,6 +186,7 @@ class MjcfDynamics(Dynamics):
             try:
                 yield
             finally:
+                team[kernel.SIGNALLED] = 0
                 if helpers:
                     team[kernel.STOP] = 1
                     for helper in helpers:
