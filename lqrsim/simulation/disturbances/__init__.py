@@ -24,6 +24,7 @@ from lqrsim.simulation.disturbances.mismatch import (
 )
 from lqrsim.simulation.disturbances.noise import (
     ControlNoise,
+    ControlOffset,
     DisplacedObstacles,
     ForceNoise,
     InitialStateError,
@@ -49,6 +50,7 @@ __all__ = [
     "CommandDropouts",
     "ControlDelay",
     "ControlNoise",
+    "ControlOffset",
     "DisplacedObstacles",
     "Disturbance",
     "Dryden",
