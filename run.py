@@ -23,6 +23,7 @@ STAMP = VENV / "installed-for"  # says what is installed; UNFINISHED while that 
 UNFINISHED = "an installation that was interrupted"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
+ARM_PACKAGES = ("gcc-arm-none-eabi", "libnewlib-arm-none-eabi", "qemu-system-arm")
 
 COMPILE = "import compileall, sysconfig; compileall.compile_dir(sysconfig.get_path('purelib'), quiet=2, workers=0)"
 
@@ -57,6 +58,7 @@ def main() -> int:
         set_up_graphics()
     if options.command == "test":
         set_up_browser()
+        set_up_emulator()
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
@@ -144,9 +146,16 @@ def set_up_browser() -> None:
         install_system_packages(BROWSERS[:1], "No browser, so what the viewer's page shows is not tested")
 
 
-def install_system_packages(packages: Sequence[str], problem: str) -> None:
+def set_up_emulator() -> None:
+    """Install what compiles and emulates the tests of exported C; without the rights, print how: they are skipped."""
+    if sys.platform == "linux" and not all(map(shutil.which, ("arm-none-eabi-gcc", "qemu-system-arm"))):
+        problem = "No compiler and emulator for ARM, so exported C is tested on this machine alone"
+        install_system_packages(ARM_PACKAGES, problem, "--no-install-recommends")  # which would be ten times as many
+
+
+def install_system_packages(packages: Sequence[str], problem: str, *options: str) -> None:
     """Install Debian packages with apt-get where this user may; otherwise print the line that does it."""
-    install = ["apt-get", "install", "--yes", *packages]
+    install = ["apt-get", "install", "--yes", *options, *packages]
     if os.name == "posix" and os.geteuid() == 0 and shutil.which("apt-get"):
         say(f"Installing {' '.join(packages)} with apt-get ...")
         # The lists of a fresh machine are empty or stale; where they are not, fetching them is not needed.

@@ -37,6 +37,7 @@ from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
+from .results.export_c import export_c as export_c
 from .results.funnel import Funnel as Funnel
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.plan import Plan as Plan

@@ -33,7 +33,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 
     Attributes:
-      length: of its segment, without the round ends, in metres; 0 for a ball.
+      length: length of its segment, without the round ends, in metres; 0 for a ball.
       radius: in metres, of the capsule and of each ball.
       tolerance: largest protrusion of the capsule from the balls, in metres, more than 0.
 
@@ -82,10 +82,10 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
         Args:
           start: one end of the segment, 2 or 3 coordinates in metres.
-          end: the other end, as many coordinates.
+          end: the other end, with the same number of coordinates.
 
         Returns:
-          `count` lists of as many coordinates.
+          `count` lists with the same number of coordinates.
 
         Raises:
           InputError: they are not two points of the same size.

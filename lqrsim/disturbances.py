@@ -1,65 +1,8 @@
-"""Disturbances of a run, such as `ls.disturbances.ControlNoise(0.05)`, and what a filter can estimate of them."""
+"""Disturbances of a run, such as `ls.disturbances.ControlNoise(0.05)`, and unknowns that a filter can estimate."""
 
 from lqrsim.control.uncertainty import Unknown
-from lqrsim.simulation.disturbances import (
-    ActuatorLoss,
-    AxleMismatch,
-    CommandDropouts,
-    ControlDelay,
-    ControlNoise,
-    DisplacedObstacles,
-    Disturbance,
-    Dryden,
-    Effect,
-    ForceNoise,
-    FrictionMismatch,
-    GilbertElliott,
-    Gusts,
-    InertiaMismatch,
-    InitialStateError,
-    MassMismatch,
-    MeanWind,
-    MeasurementBias,
-    MeasurementDropouts,
-    MeasurementLatency,
-    MeasurementNoise,
-    MotorLag,
-    Push,
-    Saturation,
-    ThrustMismatch,
-    TorqueNoise,
-    WheelRadiusMismatch,
-    preset,
-)
+from lqrsim.simulation import disturbances as _disturbances
+from lqrsim.simulation.disturbances import *  # noqa: F403
 
-__all__ = [
-    "ActuatorLoss",
-    "AxleMismatch",
-    "CommandDropouts",
-    "ControlDelay",
-    "ControlNoise",
-    "DisplacedObstacles",
-    "Disturbance",
-    "Dryden",
-    "Effect",
-    "ForceNoise",
-    "FrictionMismatch",
-    "GilbertElliott",
-    "Gusts",
-    "InertiaMismatch",
-    "InitialStateError",
-    "MassMismatch",
-    "MeanWind",
-    "MeasurementBias",
-    "MeasurementDropouts",
-    "MeasurementLatency",
-    "MeasurementNoise",
-    "MotorLag",
-    "Push",
-    "Saturation",
-    "ThrustMismatch",
-    "TorqueNoise",
-    "Unknown",
-    "WheelRadiusMismatch",
-    "preset",
-]
+__all__ = ["Unknown"]
+__all__ += _disturbances.__all__

@@ -100,7 +100,7 @@ def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> A
 
 
 def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
-    """Weights (size,), given as one number for all or as so many. Raises InputError unless they are finite and >= 0."""
+    """Weights (size,), from one number for all or an array. Raises InputError unless they are finite and >= 0."""
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.full(size, check_number(field, value, at_least=0.0))
     weights = check_array(field, value, (size,))
@@ -184,7 +184,7 @@ def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: s
 def check_function(
     field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True
 ) -> None:
-    """Raises InputError unless `value` can be called with so many arguments, or is None and optional.
+    """Raises InputError unless `value` can be called with this number of arguments, or is None and optional.
 
     Exceptions that it raises when it is called are not turned into InputErrors.
     """
@@ -315,7 +315,7 @@ def _bytes(count: int) -> str:
 
 
 def excerpt(value: object) -> str:
-    """A value as one short line for a message, whatever its `__repr__` does."""
+    """A value as one short line for a message, even if its `__repr__` fails."""
     try:
         if isinstance(value, (str, bytes, bytearray)):
             value = value[:200]
@@ -333,7 +333,7 @@ def excerpt(value: object) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """What an exception says, for a message: its kind, and its text as one printable line, whatever that is."""
+    """An exception as one printable line for a message: its type and text."""
     try:
         text = " ".join(str(error).split())
     except Exception:  # of its own __str__

@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NoReturn
 
@@ -112,6 +112,39 @@ def uninterrupted() -> Iterator[None]:
         number, _Signals.deferred = _Signals.deferred, 0
         if number:
             _raise_interrupt(number, None)
+
+
+@contextlib.contextmanager
+def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
+    """A block in which `tell` is called, by another thread, as soon as a signal arrives that raises KeyboardInterrupt.
+
+    Python raises it only when compiled code returns, which can be told so to return early. Other handlers of signals,
+    which may not raise anything, are left alone; and so is what happens outside of the main thread.
+    """
+    if threading.current_thread() is not threading.main_thread() or os.name != "posix":
+        yield
+        return
+    arrived, arrivals = os.pipe()
+    os.set_blocking(arrivals, False)
+    before = signal.set_wakeup_fd(arrivals, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while numbers := os.read(arrived, 64):
+            if any(signal.getsignal(number) in (signal.default_int_handler, _raise_interrupt) for number in numbers):
+                tell()
+            if before >= 0:
+                with contextlib.suppress(OSError):
+                    os.write(before, numbers)
+
+    watcher = threading.Thread(target=watch, name="interrupts", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before, warn_on_full_buffer=False)
+        os.close(arrivals)
+        watcher.join()
+        os.close(arrived)
 
 
 def run_script(arguments: list[str]) -> None:

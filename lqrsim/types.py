@@ -8,6 +8,7 @@ from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck
+from lqrsim.results.export_c import ExportedC
 from lqrsim.results.plan import Replan
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
@@ -21,6 +22,7 @@ __all__ = [
     "ConstraintTerm",
     "CostTerm",
     "DerivativeCheck",
+    "ExportedC",
     "Iteration",
     "LiveReplanner",
     "Moments",

@@ -112,7 +112,7 @@ def test_a_re_plan_is_run_as_a_solution_is(
 def test_what_is_refused(plant: ls.Plant, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
     unchecked: Any = ls.simulate
     law = ls.Replanner(differential_drive.problem, drive_solution, every=5.0)
-    no_plan = "plan: got none, want what the run begins at and is compared with, such as smooth(problem)"
+    no_plan = "plan: got none, want the plan that the run follows, such as smooth(problem)"
     for controller in (None, drive_solution.policy, lambda state, t: [0.1, 0.1]):
         assert refusal(lambda c=controller: unchecked(plant, controller=c)).startswith(no_plan)
     assert refusal(lambda: unchecked(plant, law)).startswith("plan: got")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from comparing import assert_white
+from scipy import stats
 from tracking import hover, weave
 
 from lqrsim.errors import InputError
@@ -10,7 +11,7 @@ from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
+from lqrsim.simulation.disturbances import ControlNoise, ControlOffset, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
 
 TRIALS = 40
@@ -32,6 +33,17 @@ def test_control_noise(arena, cage):
     assert_white(rollout.applied - rollout.commanded, 0.05)
     rollout = simulate(arena, weave(60), disturbances=[ControlNoise((0.01, 0.03))], trials=TRIALS)
     assert_white(rollout.applied - rollout.commanded, [0.01, 0.03])
+
+
+def test_a_control_offset_is_constant_in_a_trial_and_of_its_size_over_trials(arena):
+    rollout = simulate(arena, weave(10), disturbances=[ControlOffset((0.01, 0.03))], trials=TRIALS)
+    assert not rollout.saturated.any()
+    offsets = rollout.applied - rollout.commanded
+    np.testing.assert_allclose(offsets, np.broadcast_to(offsets[:, :1], offsets.shape), atol=1e-15)  # rounding
+    # Sums of squares are chi-squared: outside of these two quantiles once in 500,000.
+    sums = (offsets[:, 0] ** 2).sum(axis=0) / np.square([0.01, 0.03])
+    low, high = stats.chi2.ppf([1e-6, 1 - 1e-6], TRIALS)
+    assert ((low < sums) & (sums < high)).all()
 
 
 def test_measurement_noise_is_in_the_unit_of_each_state_and_leaves_the_true_state(cage):

@@ -16,6 +16,7 @@ from lqrsim.disturbances import (
     CommandDropouts,
     ControlDelay,
     ControlNoise,
+    ControlOffset,
     DisplacedObstacles,
     Dryden,
     ForceNoise,
@@ -53,7 +54,7 @@ RECORDS = (
 BOTH = [
     InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), InertiaMismatch(0.1),
     MeasurementNoise(0.005), MeasurementBias(0.005), MeasurementLatency(1),
-    MeasurementDropouts(GilbertElliott(0.2, 0.5)), ControlNoise(0.02), CommandDropouts(0.2),
+    MeasurementDropouts(GilbertElliott(0.2, 0.5)), ControlNoise(0.02), ControlOffset(0.02), CommandDropouts(0.2),
     ControlDelay(1), MotorLag(0.05), Saturation(share=0.9), ActuatorLoss(at=0.2, remaining=0.7),
     ForceNoise(0.1), TorqueNoise(0.002), Push((0.1, 0.0, 0.0), at=0.1),
 ]  # fmt: skip
@@ -291,6 +292,7 @@ def test_descriptions_are_in_words_and_units(plants):
         "measurements late by 1 control period",
         "28.6 % of measurements lost, in bad spells of 2 control periods on average",
         "control noise, std 0.02 N",
+        "control offset, std 0.02 N",
         "20 % of commands lost",
         "commands late by 1 control period",
         "motor lag, time constant 0.05 s",

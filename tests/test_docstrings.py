@@ -48,16 +48,20 @@ def raises_input_error(function: Callable[..., Any]) -> bool:
     return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
 
 
+def says_what_returns(function: Callable[..., Any], doc: str) -> bool:
+    """Whether nothing is returned; or a record, which has a docstring of its own; or the summary names what it is."""
+    annotation = inspect.signature(function).return_annotation
+    name = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+    record = name in vars(ls.types) or name in ls.__all__ or hasattr(annotation, "__dataclass_fields__")
+    named = re.match(r"(The|A|An|Another|Whether|How|Controls|Points|df/dx) ", doc)
+    return annotation in (None, "None", inspect.Signature.empty) or record or named is not None
+
+
 def missing(function: Callable[..., Any], doc: str, *, returns: bool) -> list[str]:
     """What a docstring does not say."""
     parts = sections(doc)
     found = sorted(parameters(function) - documented(doc))
-    annotation = inspect.signature(function).return_annotation
-    if (
-        returns
-        and annotation not in (None, "None", inspect.Signature.empty)
-        and not parts.keys() & {"Returns", "Yields"}
-    ):
+    if returns and not parts.keys() & {"Returns", "Yields"} and not says_what_returns(function, doc):
         found.append("Returns")
     if raises_input_error(function) and not any(line.startswith("InputError: ") for line in parts.get("Raises", [])):
         found.append("Raises InputError")
@@ -139,8 +143,9 @@ def test_what_is_missing_is_noticed() -> None:
 
     assert missing(complete, complete.__doc__ or "", returns=True) == []
     assert documented(complete.__doc__ or "") == {"a", "b"}
-    bare = "A sum.\n\nArgs:\n  a, b: both.\n"
+    bare = "Add.\n\nArgs:\n  a, b: both.\n"
     assert missing(complete, bare, returns=True) == ["a", "b", "Returns", "Raises InputError"]
     assert missing(complete, bare + "\n\nRaises InputError.", returns=False)[2:] == [
         "Raises InputError", "InputError in the text, want it under Raises"
     ]  # fmt: skip
+    assert "Returns" not in missing(complete, bare.replace("Add", "A sum"), returns=True)

@@ -266,7 +266,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
     ("changes", "message"),
     [
         # Arrays that have the hash that belongs to them.
-        ({"states": lambda a: a.astype(np.float32)}, "'states': got no array as lqrsim writes it"),
+        ({"states": lambda a: a.astype(np.float32)}, "'states': got an array in another format"),
         ({"frames": lambda a: a.astype(np.float16)}, "which is damaged"),
         ({"clearance": lambda a: a.astype(int)}, "clearance: got numbers of type <i8, want <f8"),
         ({"clearance": lambda a: a > 0}, r"clearance: got numbers of type \|b1, want <f8"),
@@ -290,7 +290,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"contacts": lambda a: a - 10**6}, r"contacts: got .*, want whole numbers >= 0"),
         ({"states": lambda a: np.array(1.0)}, "states: got shape"),
         ({"torques": None}, "torques: got none, want it"),
-        ({"bomb": np.zeros(3)}, "'bomb': got an unknown array, want only those of its format"),
+        ({"bomb": np.zeros(3)}, "'bomb': got an unknown array, want only arrays of this format"),
         # Text of another type or range.
         *(({name: 7}, f"{name}: got 7, want text") for name in ("robot", "scene", "model", "policy_digest")),
         *(({name: "7"}, f"{name}: got '7', want a finite number") for name in ("radius", "goal_radius")),
@@ -308,7 +308,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"versions": ["1"]}, "versions: got .*, want a dictionary by name"),
         ({"versions": {"numpy": 2}}, "versions.numpy: got 2, want text"),
         ({"states": None, "control_coordinates": 3}, "which is damaged"),
-        ({"more": 1}, "meta: got 'more', want no other than"),
+        ({"more": 1}, "meta: got 'more', want only"),
     ],
 )
 def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, Any], message: str | None) -> None:
@@ -412,8 +412,12 @@ def npy(array: np.ndarray) -> bytes:
         ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got it twice, want it once"),
         ("meta.npy", npy(np.array("{}")), "'meta': got it twice"),
         ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays only"),
-        ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got no array"),
-        ("multipliers.0.values.npy", b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "'multipliers.0.values': got no array"),
+        ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got an array in another format"),
+        (
+            "multipliers.0.values.npy",
+            b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16,
+            "'multipliers.0.values': got an array in another format",
+        ),
         ("multipliers.0.values.npy", npy(np.zeros((151, 1))), "sha256: got another hash than that of the content"),
         ("clearance ", b"", "got a part of that name"),
     ],

@@ -361,7 +361,9 @@ def test_texts_that_python_does_not_read(text: str) -> None:
 
 
 def test_too_deep_a_nesting_is_refused() -> None:
-    assert "f, line 1: got too deep a nesting" in refusal("def f(a):\n    return " + "+".join(["a"] * 2000), 1.5)
+    assert "f, line 1: got expressions nested too deeply" in refusal(
+        "def f(a):\n    return " + "+".join(["a"] * 2000), 1.5
+    )
 
 
 def statements(body: str) -> list[ast.stmt]:

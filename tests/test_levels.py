@@ -346,7 +346,7 @@ def test_what_a_function_does_only_later_is_not_taken_for_numbers(level: str) ->
         (lambda x, u, p: (x[1], 1j), {}, "got .*1j.*, want 2: one for each of angle, speed"),
         (lambda x, u, p: ("1", "2"), {}, "got .*, want 2: one for each of angle, speed"),
         (lambda x, u, p: None, {}, "got None, want 2: one for each of angle, speed"),
-        (pendulum, {"jacobian": lambda x, u, p, fx, fu: (fx, fu)}, "returned, want it written to the last two"),
+        (pendulum, {"jacobian": lambda x, u, p, fx, fu: (fx, fu)}, "returned, want the result written to the last two"),
         (pendulum, {"jacobian": _nan_jacobian}, r"got nan in df/dx, row speed, column angle, at the start"),
         (lambda x, u: x, {}, r"too many positional arguments, want a function of \(x, u, p\)"),
     ],

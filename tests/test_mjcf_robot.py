@@ -1,7 +1,10 @@
 """A robot of any MJCF: MuJoCo's own steps, the derivatives of these, and what states and controls are called."""
 
+import os
 import pickle
+import signal
 import threading
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -389,7 +392,7 @@ def test_bad_arguments_are_named() -> None:
     robot = ls.MjcfRobot(scene)
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"body": "hull"}, "body: got 'hull', want one of: cart, pole"),
-        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that say where the body is, of: slider"),
+        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that are the body's position, among: slider"),
         ({"position": ("nose",)}, "position: got 'nose'"),
         ({"radius": -1.0}, "radius: got -1"),
         ({"floors": 3}, "floors: got 3"),
@@ -403,3 +406,24 @@ def test_bad_arguments_are_named() -> None:
         robot.dynamics.rate(robot.at(), np.zeros(1))
     with pytest.raises(InputError, match="steps have no inverse, want 'dual'"):
         ls.smooth(swing(robot), form="primal")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no signals to send to a process")
+@pytest.mark.parametrize("solve", [ls.ilqr, ls.smooth])
+def test_ctrl_c_ends_an_iteration_that_would_take_minutes(solve: Any) -> None:
+    xml = """
+    <mujoco><option timestep="1e-6"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 -1"/>
+    </body></worldbody><actuator><motor joint="hinge"/></actuator></mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "pendulum"))
+    quick, endless = (robot.problem(robot.at(), robot.at(hinge=1.0), steps=200, dt=dt) for dt in (1e-6, 0.5))
+    solve(quick, max_iterations=1)  # compiles
+    ctrl_c = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+    ctrl_c.start()
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt) as raised:
+        solve(endless, max_iterations=1)
+    # 5e5 steps for each of 200 periods and 7 rollouts, at 0.3 us or more: three minutes at least.
+    assert time.monotonic() - begin < 30.0
+    assert raised.value.solution.status is ls.Status.INTERRUPTED  # pyright: ignore[reportAttributeAccessIssue]
+    after = robot.dynamics.step(robot.at(hinge=1.0), np.zeros(1), 1e-6)
+    assert np.isfinite(after).all()  # the robot can be used again

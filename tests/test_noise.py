@@ -240,7 +240,7 @@ def test_a_file_says_what_the_noise_was(tmp_path):
         (lambda: ls.smooth(of(None), noise="white"), "^noise: got 'white', want a Noise"),  # pyright: ignore[reportArgumentType]
         (
             lambda: ls.lq.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
-            "^noise: got some, which is per control period, want",
+            "^noise: got some, want none in continuous time",
         ),
         (lambda: ls.sample_costs(of(None), None), "^problem: got one without noise, want"),  # pyright: ignore[reportArgumentType]
     ],

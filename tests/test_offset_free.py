@@ -245,11 +245,11 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ),
         (
             {"uncertainty": ls.Uncertainty(unknowns=[Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
-            "OffsetFree: unknowns: got force_x, which changes nothing of what is measured (rx, ry, rz), want sensors",
+            "OffsetFree: unknowns: got force_x, which no measurement sees (rx, ry, rz), want sensors",
         ),
         (
             {"uncertainty": ls.Uncertainty(unknowns=[Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
-            "OffsetFree: unknowns: got wind_x and wind_y, which changes nothing of what is measured (z), want sensors",
+            "OffsetFree: unknowns: got wind_x and wind_y, which no measurement sees (z), want sensors",
         ),
     ],
 )  # fmt: skip

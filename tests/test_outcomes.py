@@ -150,7 +150,7 @@ class TestReplanner:
         assert log.solved + log.kept.total() == 49
         assert log.kept.total() > 0
         assert log.summary().startswith(f"solved again {log.solved} times")
-        assert f"kept the law before {log.kept.total()} times" in log.summary()
+        assert f"kept the previous law {log.kept.total()} times" in log.summary()
         assert all(reason in log.summary() for reason in log.kept)
 
     def test_a_rate_beyond_the_control_rate_is_refused(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:

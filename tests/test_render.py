@@ -409,7 +409,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
         ({"size": (641, 360)}, "size: got 641 x 360, want even numbers"),
         ({"size": (640,)}, r"size: got \(640,\), want a width and a height"),
         ({"size": (32, 360)}, "size: got 32, want a whole number >= 64"),
-        ({"size": (64, 64)}, "size: got 64 x 64, which captions fill, want a larger one"),
+        ({"size": (64, 64)}, "size: got 64 x 64, which captions would fill, want it larger"),
         ({"camera": "overvew"}, r"camera: got 'overvew', want one of: .*top.*did you mean overview"),
         ({"insets": ("top", "above")}, "camera: got 'above', want one of: overview, chase, top, side"),
         ({"insets": ("top", "side", "chase", "top")}, "insets: got 4, want 3 at most"),

@@ -258,7 +258,7 @@ def test_where_no_solve_succeeds_the_law_goes_on() -> None:
             assert begun.log.solved == 0
             assert begun.log.kept.total() == 2
             assert set(begun.log.kept) == {"NOT_FINITE, without a better plan"}
-            assert begun.summary().startswith("solved again 0 times, kept the law before 2 times: 2 times NOT_FIN")
+            assert begun.summary().startswith("solved again 0 times, kept the previous law 2 times: 2 times NOT_FIN")
         else:
             assert begun.summary() == ""
     np.testing.assert_array_equal(commands[0], commands[1])

@@ -206,7 +206,7 @@ class TestReplanner:
         np.testing.assert_array_equal(late.states, plain.states)
         log = late.controller_run.log
         assert (log.solved, log.kept) == (0, {"not ready in time": 9})
-        assert log.summary() == "solved again 0 times, kept the law before 9 times: 9 times not ready in time"
+        assert log.summary() == "solved again 0 times, kept the previous law 9 times: 9 times not ready in time"
 
     def test_the_goal_and_the_obstacles_that_are_known_by_then(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution

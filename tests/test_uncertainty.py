@@ -16,6 +16,7 @@ from lqrsim.disturbances import (
     CommandDropouts,
     ControlDelay,
     ControlNoise,
+    ControlOffset,
     DisplacedObstacles,
     Disturbance,
     Dryden,
@@ -51,7 +52,7 @@ DT = 1 / 30
 # One of each; "in words" are those that no linear model has.
 EXAMPLES = [
     InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), ls.disturbances.MeasurementNoise(0.005),
-    MeasurementLatency(1), MeasurementDropouts(0.2), ControlNoise(0.02), ControlDelay(1),
+    MeasurementLatency(1), MeasurementDropouts(0.2), ControlNoise(0.02), ControlOffset(0.02), ControlDelay(1),
     MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
     ls.disturbances.MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
     AxleMismatch(0.02),

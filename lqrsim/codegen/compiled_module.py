@@ -46,7 +46,7 @@ from lqrsim.results.hashing import sha256
 
 logger = logging.getLogger("lqrsim")
 
-# What was compiled in this process, and not loaded from disk.
+# Functions that were compiled in this process, and not loaded from disk.
 compilations: list[str] = []
 compiling = threading.RLock()
 
@@ -83,7 +83,7 @@ class CompiledModule:
 
     Args:
       source: the functions. sizes: name -> number, of the sizes in `kernels/declarations.py`.
-      what: what it is for, in progress messages and `lqrsim cache`.
+      what: its purpose, in progress messages and `lqrsim cache`.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int], what: str) -> None:
@@ -196,7 +196,7 @@ class Entry:
     """A compiled function that Python calls.
 
     Args:
-      types: of the arguments. address: of the machine code. returns: the type of the result.
+      types: types of the arguments. address: of the machine code. returns: the type of the result.
     """
 
     def __init__(self, types: tuple[Type, ...], address: int, returns: Type | None) -> None:
@@ -209,8 +209,8 @@ class Entry:
 class Call:
     """A call of an entry, with its arguments laid out once.
 
-    `call()` makes it, and `call(...)` makes it with other arguments, of which only those that are other objects than
-    before are laid out again. Arrays are passed by reference.
+    `call()` repeats it, and `call(...)` takes other arguments; only those that are different objects than before are
+    laid out again. Arrays are passed by reference.
     """
 
     def __init__(self, entry: Entry, arguments: tuple[Any, ...]) -> None:
@@ -345,7 +345,7 @@ def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
             names, several = known["returns"]
             kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
             returns = Group(kinds) if several else kinds[0]
-        if known["code"] != sha256(code):  # LLVM would end the process for what is no object file
+        if known["code"] != sha256(code):  # LLVM would end the process if this is no object file
             raise ValueError("its checksum does not fit")
         return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
@@ -355,7 +355,9 @@ def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
 
 @functools.cache
 def _toolchain() -> str:
-    """A hash of what machine code depends on besides its source: all kernels, and the compiler's own modules."""
+    """A hash of everything besides the source that machine code depends on: all kernels, and the compiler's own
+    modules.
+    """
     own = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))
     paths = [Path(str(importlib.import_module(name).__file__)) for name in own]
     paths += sorted(Path(str(kernels.__file__)).parent.glob("*.py"))

@@ -1,4 +1,4 @@
-"""A hash of what a function does, without running it: the key under which what is derived from it is cached.
+"""A hash of what a function does, without running it: the cache key of everything derived from the function.
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
 that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else
@@ -21,10 +21,10 @@ from lqrsim import capsules, rotations
 from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
-# What formulas may use without being covered itself: the hash includes the versions.
+# Modules that formulas may use; the hash includes their versions instead of their code.
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
-# What reads files, other names or random numbers: a function that uses these cannot be covered. `getattr` is allowed,
+# Names that read files, other names or random numbers: a function that uses them has no hash. `getattr` is allowed,
 # because what it can reach is covered, except through names like `__globals__`.
 _REFUSED = {
     "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "setattr", "__import__",

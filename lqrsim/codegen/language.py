@@ -1,7 +1,7 @@
 """The kernels' subset of Python. `printer.py` prints it to LLVM IR.
 
 A kernel is a function of positional arguments. It also runs as plain Python on NumPy arrays, with the same results to
-rounding. What is not listed here is refused with file and line.
+rounding. Anything else is refused with file and line.
 
 Types
     float           float64. Arithmetic may be fused and reordered, but NaN and infinity keep their meaning.
@@ -120,7 +120,7 @@ VECTOR = Pointer()
 
 
 def describe(kind: Type | None) -> str:
-    """How messages call a type."""
+    """Name of a type in messages."""
     match kind:
         case None:
             return "nothing"

@@ -27,14 +27,14 @@ logger = logging.getLogger("lqrsim")
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _SYMBOL = "function"
 
-# What was loaded in this process, by its key.
+# Functions loaded in this process, by key.
 _loaded: dict[str, tuple[Any, int]] = {}
 
 
 def compiled(
     function: Callable[..., Any], adapter: str, names: dict[str, Any], pointers: int, what: str
 ) -> tuple[Any, int]:
-    """Compile a function to a C function of so many pointers to float64.
+    """Compile a function to a C function of this number of pointers to float64.
 
     Args:
       function: a numba function, or one that numba can compile.
@@ -42,7 +42,7 @@ def compiled(
       names: others that the adapter uses, among them the named tuple `Parameters`. what: how messages call it.
 
     Returns:
-      What must be kept alive, and the address.
+      The object that must be kept alive, and the address.
 
     Raises:
       InputError: numba is missing, or cannot compile it.
@@ -63,7 +63,7 @@ def compiled(
     found = _unpacked(kept) if kept is not None else None
     if found is None:
         note_helpers(function)
-        # numba compiled helpers with their globals of then: if these have changed, the result is not cached.
+        # numba compiled helpers with the globals of that time: if these have changed, the result is not cached.
         lasting = bool(key) and not stale(function)
         compilations.append(what)
         logger.debug(f"compiling {what} ...")
@@ -124,7 +124,7 @@ def _numba_names() -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """The lines of numba's long error message that say what is wrong."""
+    """The lines of numba's long error message that describe the error."""
     if isinstance(error, AttributeError) and "NoneType" in str(error):
         return "a function that returns on every path, and does not change x and u"
     if "readonly" in str(error) and "setitem" in str(error):

@@ -28,7 +28,7 @@ def plain_functions(
     """Functions of a source as plain Python functions.
 
     Args:
-      source: the kernels. sizes: as for a `Scope`. names: the functions.
+      source: source of the kernels. sizes: as for a `Scope`. names: names of the functions.
       functions: Python functions that kernels call by their index here, in place of an address.
       caller: if given, calls each kernel: `caller(kernel, run, arguments)`.
 

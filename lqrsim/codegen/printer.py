@@ -116,14 +116,15 @@ class Program:
             try:
                 text, result = _print(self, function, types, name)
             except RecursionError:
-                raise SubsetError(f"{where(function, function.node)}: got too deep a nesting, want less") from None
+                place = where(function, function.node)
+                raise SubsetError(f"{place}: got expressions nested too deeply, want less nesting") from None
             self._running.pop()
             self._texts.append(text)
             self._instances[key] = name, result
         return self._instances[key]
 
     def library(self, name: str, count: int) -> str:
-        """LLVM's name of an intrinsic or a C library function of so many floats."""
+        """LLVM's name of an intrinsic or a C library function of this number of floats."""
         return self.declare(name, "double", ", ".join(["double"] * count))
 
     def declare(self, name: str, returns: str, arguments: str) -> str:

@@ -1,4 +1,4 @@
-"""Functions in the kernels' subset, and what the names in them mean.
+"""Functions in the kernels' subset, and the meaning of the names in them.
 
 A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as which states are
 the position, and functions, such as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
@@ -39,7 +39,7 @@ class Source:
       module: name of a module in `lqrsim/kernels`; empty for a text. text: defines functions.
       constants: (name, number or tuple of numbers), which replace the module's.
       fills: (name, source, name there) of functions that the module or its imports declare, or that replace theirs.
-      what: how messages call it.
+      what: its name in messages.
     """
 
     module: str = ""
@@ -79,7 +79,7 @@ def source_of(module: ModuleType, **constants: Constant) -> Source:
     """The functions of a module of `lqrsim/kernels`.
 
     Args:
-      module: of the kernels.
+      module: module of the kernels.
       **constants: numbers and tuples of numbers, in place of the module's.
 
     Raises:
@@ -101,7 +101,7 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
     Functions of math are named without a module in it: cos, not math.cos or np.cos.
 
     Args:
-      field: how messages call it. source: text or Source. functions: name -> number of arguments, which it must define.
+      field: its name in messages. source: text or Source. functions: name -> number of arguments, which it must define.
 
     Raises:
       InputError: it is neither, or does not define the functions.

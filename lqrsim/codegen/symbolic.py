@@ -47,7 +47,7 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(
     function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
 ) -> dict[str, Any]:
-    """What `make` derives from a user's function, or the same from the cache, without importing SymPy.
+    """The result of `make` for a user's function, or the same from the cache, without importing SymPy.
 
     A function without a fingerprint is not cached.
 
@@ -73,7 +73,7 @@ def kept(
 
 @functools.cache
 def _writers() -> str:
-    """The source of the modules that write what is cached, which it depends on."""
+    """The source of the modules that write the cached files, because these depend on it."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
     files += [
@@ -124,7 +124,7 @@ def trace(
             " for NumPy's functions and for branches there is level='compiled' or 'plain'"
         ) from None
     if returned is None:
-        raise InputError(f"{called}: got None, want what it computes: is a return missing?")
+        raise InputError(f"{called}: got None, want expressions: is a return missing?")
     if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
         returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]
@@ -158,7 +158,7 @@ def write_function(
     Args:
       name, arguments: its signature. data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
-      of: how messages call the user's function.
+      of: the name of the user's function in messages.
       returns: the target, among `assignments`, whose value is returned.
 
     Raises:

@@ -68,7 +68,7 @@ class UserFunction:
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
       unused: (index, name) of the entries of (x, u) that the value is stated not to depend on.
-      held: what must be kept alive, and the address, once it has one.
+      held: objects that must be kept alive, and the address, once there is one.
       stopped: set it to end the solves that call back, in any thread.
       entries: what each returned value is for, in messages; empty where a single number is returned.
       columns: size of the rows in which the values are returned; 0 for a flat list.
@@ -129,7 +129,7 @@ class UserFunction:
                 returned = plain(*given, parameters_class(tuple(p))(*p.values()), *written)
                 if self.writes and returned is not None:
                     last = "argument" if len(self.writes) == 1 else "two arguments"
-                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last {last}")
+                    raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
@@ -199,7 +199,7 @@ class UserFunction:
 
     @property
     def raised(self) -> BaseException | None:
-        """What it raised in this thread when called back; it is not called again before `forget`."""
+        """The exception that it raised in this thread when called back; it is not called again before `forget`."""
         return getattr(self._thread, "raised", None)
 
     def forget(self) -> None:
@@ -235,14 +235,14 @@ class UserFunction:
         return source, {"Parameters": parameters_class(self.parameters)}
 
     def _entry(self, i: int) -> str:
-        """The index of value i in what is returned."""
+        """The index of value i among the returned values."""
         if self.columns:
             return f"[{i // self.columns}][{i % self.columns}]"
         return f"[{i}]" if self.entries else ""
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:
-    """The functions for `plain_functions`: each writes what the user's returns."""
+    """The functions for `plain_functions`: each writes the values that the user's function returns."""
 
     def calling(function: UserFunction) -> Callable[..., None]:
         def run(x: Array, u: Array, data: Array, *outputs: Array) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
-from lqrsim.commands.creating import New
+from lqrsim.commands.creating import Export, New
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.reliability import Break, FunnelCommand, Rare
 from lqrsim.commands.solving import List, Simulate, Solve
@@ -18,7 +18,7 @@ from lqrsim.commands.viewing import Render, View
 
 _ALL = (
     List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Break, FunnelCommand,
-    Reproduce, Cache,
+    Export, Reproduce, Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}
 # Name -> the first line of its help.

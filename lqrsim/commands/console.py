@@ -1,4 +1,4 @@
-"""What the commands share: output, progress, and an early check whether the results can be written."""
+"""Shared by the commands: output, progress, and an early check whether the results can be written."""
 
 import contextlib
 import os
@@ -62,7 +62,7 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 
 def result(**parts: object) -> None:
-    """Add to what `--json` prints; without it, do nothing."""
+    """Add to the output of `--json`; without it, do nothing."""
     found = _RESULT.get()
     if found is not None:
         found.update(parts)
@@ -176,5 +176,5 @@ class Progress:
 
 
 def progress(what: str, unit: str, every: float = 10.0) -> contextlib.AbstractContextManager[Progress]:
-    """Progress during a block; a line every so many seconds if there is no terminal."""
+    """Progress during a block; a line every few seconds if there is no terminal."""
     return contextlib.closing(Progress(what, unit, every))

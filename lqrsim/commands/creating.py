@@ -1,4 +1,4 @@
-"""The command that writes the files of a new robot."""
+"""The commands that write source files: of a new robot, and a policy as C."""
 
 import builtins
 import importlib.util
@@ -6,13 +6,15 @@ import keyword
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from lqrsim.commands.options import Json
+
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
-# Names with another meaning: what the written files use, MuJoCo's first body, pytest's own file, Windows' devices.
+# Names with another meaning: those used in the written files, MuJoCo's first body, pytest's own file, Windows' devices.
 TAKEN = {
     "any", "path", "self", "world", "conftest", "con", "prn", "aux", "nul",
     *(f"{port}{number}" for port in ("com", "lpt") for number in range(10)),
@@ -56,6 +58,50 @@ class New:
         console.say("\nnext:")
         for command in next_commands(self.name, folder):
             console.say(f"  {shlex.join(command)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a policy as C99, for a microcontroller.
+
+    The folder gets a header and a source file that need math.h alone and allocate nothing, an example that compares
+    commands with Python's, and a CMake file for this machine and for an STM32F405, which QEMU emulates.
+    docs/microcontrollers.md says how to put it on a Crazyflie or into PX4.
+
+      lqrsim export runs/quadrotor/solution.npz --c firmware/policy
+      cmake -S firmware/policy -B build && cmake --build build && ctest --test-dir build
+    """
+
+    policy: Annotated[Positional[Path], arg(metavar="POLICY.npz")]
+    """A file from `lqrsim solve`, or a policy from `ls.save`: of ls.track, or of ls.OffsetFree with its filter."""
+    c: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder for the C files. Files of their names are replaced."""
+    number: Literal["float", "double"] = "float"
+    """Type of the numbers, except the time, which is a double."""
+    gains: Literal["full", "int16"] = "full"
+    """int16: matrices take 16 bits an entry. What that changes of the commands is printed, and is in the header."""
+    interpolate: bool = False
+    """Blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
+    name: str = "policy"
+    """Name of the files and the functions: small letters, digits and underscores."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim.commands import console
+        from lqrsim.results import save_load
+        from lqrsim.results.export_c import export_c
+
+        console.check_output("--c", self.c)
+        policy: Any = save_load.load(self.policy)  # what cannot be exported is refused
+        found = export_c(
+            policy, self.c, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
+        )
+        for path in found.files:
+            console.wrote(path)
+        console.say(found.summary())
+        console.result(sha256=found.sha256, table_bytes=found.table_bytes, rounding=found.rounding)
         return 0
 
 

@@ -32,8 +32,8 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
 
     Args:
       references: the scenarios; see `scenarios/references.py`.
-      out: folder for a folder of each scenario.
-      seed: of the disturbances.
+      out: folder that gets a folder for each scenario.
+      seed: seed of the disturbances.
       video: whether to render videos. quick: small videos with fewer frames.
 
     Returns:

@@ -66,9 +66,9 @@ class Solve:
     stop: Literal["optimal", "cost"] = "optimal"
     """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
     tolerance: Annotated[float | None, optional("SHARE")] = None
-    """Share of the cost that may be left to save. By default 1e-8, and 1e-4 without Newton's method."""
+    """Relative tolerance of the cost and of the optimality. By default 1e-8, and 1e-4 without Newton's method."""
     finish: Literal["newton", "none"] = "newton"
-    """newton: smooth leaves the last iterations to Newton's method. none: the paper's method has them all."""
+    """newton: smooth leaves the last iterations to Newton's method. none: the paper's method does them all."""
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Stop after this many iterations. By default the solver's own limit."""
     time_limit: Annotated[float | None, optional("SECONDS")] = None
@@ -77,8 +77,8 @@ class Solve:
     """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
     if there is no start."""
     start: Annotated[Path | None, optional("FILE.npz")] = None
-    """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with as
-    many steps. By default the scenario's own start, or a search."""
+    """Begin with a stored solution or policy, or with the plan of a rollout or a funnel, of the same robot and with the
+    same number of steps. By default the scenario's own start, or a search."""
     paper_start: bool = False
     """Begin as in the paper: from the nominal control, with the scenario's prior."""
     clearance: Annotated[float | None, optional("METRES")] = None

@@ -45,7 +45,7 @@ class Render:
     camera: Annotated[str, arg(metavar="NAME")] = "overview"
     """overview, chase, top or side, or another camera of the scene."""
     inset: Annotated[tuple[str, ...], optional("NAME ...")] = ()
-    """More cameras, in panes beside the first. top and side are calibrated, and the robot wears a mark in them."""
+    """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Title of each run. By default the robot and the scene."""
     overlays: tuple[Overlay, ...] = OVERLAYS

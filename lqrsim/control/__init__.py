@@ -1,1 +1,1 @@
-"""What runs on a robot: controllers."""
+"""Controllers, which run on a robot."""

@@ -1,8 +1,8 @@
 """Plans that keep so far from obstacles, step by step, that they collide no more often than is asked.
 
 The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
-for all steps, and such that the chance of colliding at all, as `collision_chance.py` counts it, is what is asked. A
-plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+for all steps. It is chosen such that the chance of any collision, as `collision_chance.py` computes it, is the
+requested one. A plan with that clearance has a tube of its own, so it is found by solving again, a few times.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,10 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.solvers.smoother import smooth
 
-# How far below what is asked a plan may be, and is not made cheaper any more.
+# A plan whose chance is below the requested one by no more than this factor is not made cheaper.
 ENOUGH = 0.5
 HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
-AIM = 0.8  # of what is asked, the chance that a next plan is to have
+AIM = 0.8  # target for the next plan, relative to the requested chance
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
@@ -41,11 +41,11 @@ class SafePlan:
     """A plan with its predicted chance of collision.
 
     Attributes:
-      problem: with the clearances that were found as constraints.
-      solution: of it.
-      controller: what runs it, an OffsetFree or a policy.
-      tube: where that will be; `tube.collision_chance` is the chance.
-      asked: the chance that was asked for.
+      problem: the problem, with the clearances that were found as constraints.
+      solution: solution of it.
+      controller: the controller that follows the plan, an OffsetFree or a policy.
+      tube: the prediction of its runs; `tube.collision_chance` is the chance.
+      asked: the requested chance.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
     """
 
@@ -68,7 +68,7 @@ class SafePlan:
 
     @property
     def success(self) -> bool:
-        """Whether the plan is a solution, and its predicted chance of collision no more than was asked."""
+        """Whether the plan is a solution, and its predicted chance of collision is at most the requested one."""
         return self.solution.success and self.tube.collision_chance <= self.asked
 
     def __str__(self) -> str:
@@ -87,16 +87,16 @@ def smooth_chance_constrained(
     rounds: int = 8,
     progress: Callable[[int, int], object] | None = None,
 ) -> SafePlan:
-    """A plan whose predicted chance of collision is at most what is asked, at little more cost than need be.
+    """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
-    It ends where the chance is between half of what is asked and that, or where the plan without any clearance is safe
-    enough. Where nothing is, it returns the safest plan that it found, with `success` False: say with print(plan) how
-    far it got, and allow more, estimate better, or have another way round.
+    It ends when the chance is between half of the requested one and the requested one, or when the plan without any
+    clearance is safe enough. If no plan is safe enough, it returns the safest one found, with `success` False:
+    print(plan) says how far it got; allow a higher chance, estimate better, or permit another way round.
 
     Args:
-      problem: with obstacles in its costs or constraints.
-      uncertainty: what runs meet; see `uncertainty_of`.
-      chance: of collision, between 0 and 1.
+      problem: a problem with obstacles in its costs or constraints.
+      uncertainty: the uncertainty in a run; see `uncertainty_of`.
+      chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
       rounds: plans to solve for, at most.
@@ -142,14 +142,16 @@ class _Search:
         self.margin = np.zeros((1, 1))  # that the last of them kept, (T+1, O)
         self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
-        # Of standard deviations: the most that are too few, the fewest that are enough, the fewest without a plan.
+        # Numbers of standard deviations: the largest that is too small, the smallest that is enough, the smallest
+        # without a plan.
         self.too_few, self.enough, self.impossible = 0.0, np.inf, np.inf
         self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances then
 
     def solve(self, deviations: float | None) -> None:
         """Plan with a margin of that many standard deviations, and predict the outcome."""
         problem, start, margin = self.problem, None, self.margin
-        second = len(self.plans) == 1  # of which all steps have the same clearance: where the first is matters little
+        # Whose clearances are the same at all steps: the place of the first matters little.
+        second = len(self.plans) == 1
         if deviations is not None:
             base = self.plans[-1]
             margin = deviations * self._spread(base).std
@@ -191,12 +193,12 @@ class _Search:
         return law
 
     def _spread(self, plan: SafePlan) -> Spread:
-        """Of the clearances along the plan, (T+1, O)."""
+        """Standard deviations of the clearances along the plan, (T+1, O)."""
         tube = plan.tube
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
     def next_deviations(self) -> float | None:
-        """How many standard deviations to try next; None where there is no use in more."""
+        """How many standard deviations to try next; None where more would not help."""
         plan = self.plans[-1]
         chance = plan.tube.collision_chance
         first = len(self.plans) == 1 and self.impossible == np.inf
@@ -205,7 +207,7 @@ class _Search:
         best = self._best()
         if not first and best.success and best.tube.collision_chance >= ENOUGH * self.asked:
             return None
-        if np.isfinite(self.impossible):  # between what has a plan and what has none
+        if np.isfinite(self.impossible):  # between a margin that has a plan and one that has none
             low = self.too_few if not np.isfinite(self.enough) else None
             if low is None or self.impossible - low < 0.05 * self.impossible:
                 return None
@@ -222,7 +224,7 @@ class _Search:
         return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
-        """Of how many standard deviations the plan would be as safe as asked.
+        """The number of standard deviations at which the plan would be exactly as safe as requested.
 
         If all that is nearer moved out there, and what only keeps the margin that it must moved in.
         """
@@ -237,7 +239,7 @@ class _Search:
         return high
 
     def _best(self) -> SafePlan:
-        """Of those that are safe enough the cheapest, or else the safest."""
+        """The cheapest plan that is safe enough, or else the safest."""
         safe = [plan for plan in self.plans if plan.success]
         if safe:
             return min(safe, key=lambda plan: plan.solution.cost)

@@ -1,9 +1,9 @@
 """Chance of collision, from mean and covariance of the states along a plan.
 
-Of each obstacle, the clearance is taken to be linear about the mean, so that it is normal. A collision is counted when
-it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring steps
-are nearly the same number, so to add up or to multiply the chances of single steps would count each collision many
-times.
+The clearance of each obstacle is linearised about the mean, so that it is normally distributed. A collision is counted
+when it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring
+steps are nearly the same number, so to add up or to multiply the chances of single steps would count each collision
+many times.
 """
 
 from dataclasses import dataclass
@@ -42,11 +42,11 @@ class Surroundings:
     """Obstacles of a problem, as its robot sees them.
 
     Attributes:
-      dynamics: of the problem.
-      worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
-      seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
-      place: which states are its position. position: these, or, with balls, all that move it.
-      std: of where an obstacle is, in m.
+      dynamics: dynamics of the problem.
+      worlds: each world with the costs and constraints that keep the robot away from it, each kind once.
+      seen: the worlds as the robot sees them. places: for those that are kept from balls, the places of the balls.
+      place: the states that are its position. position: the same, or, with balls, all states that move it.
+      std: standard deviation of an obstacle's position, in m.
     """
 
     dynamics: Dynamics
@@ -102,9 +102,9 @@ class Surroundings:
         return kept
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
-        """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,).
+        """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p), and its variance (O,).
 
-        Of balls it is the clearance of that which is nearest to the obstacle.
+        With balls it is the clearance of the ball nearest to the obstacle.
         """
         if not self.worlds:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
@@ -177,7 +177,7 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
 
     Plackett's integral over the correlation's angle, by Gauss and Legendre's rule.
     """
-    # Near 1 the integrand is steep: from there it is done from the other end, where it is min(a, b).
+    # Near 1 the integrand is steep: there the integral begins at the other end, where it is min(a, b).
     angle = np.arcsin(correlation)
     start = np.where(np.abs(correlation) > 0.95, np.sign(correlation) * np.pi / 2, 0.0)
     at = start[..., None] + (angle - start)[..., None] * (NODES + 1) / 2

@@ -1,7 +1,7 @@
-"""Whatever decides on the controls: a policy, a function or a `Controller`; and one run of it.
+"""Controllers of a run: a policy, a function or a `Controller`; and the state of one run.
 
-Affine laws run compiled for many trials at once, so that each trial gets what it gets alone, to the last bit.
-`AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
+Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone. `AffinePolicy`
+has the same law in NumPy, for a robot; its module's docstring says why there are two.
 """
 
 import abc
@@ -27,7 +27,7 @@ from lqrsim.results.policy import AffinePolicy
 def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
     """What evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
 
-    As `AffinePolicy.__call__`, but that each trial gets what it gets alone, to the last bit.
+    As `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
     """
     limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
     laws = _laws(len(states), len(controls))
@@ -52,7 +52,7 @@ def _laws(n: int, m: int) -> CompiledModule:
 
 
 def turning_of(space: Coordinates) -> AngularStates:
-    """Which states are to be turned to the nearest, as `kernels/policy_evaluation.py` takes it."""
+    """The states that are to be turned to the nearest, in the form that `kernels/policy_evaluation.py` takes."""
     angles, rotations = (np.array(one, dtype=np.float64) for one in (space.angles, space.rotation_vectors))
     return AngularStates(angles, len(angles), rotations, len(rotations))
 
@@ -61,13 +61,13 @@ ControlFunction = Callable[[Array, float], npt.ArrayLike]
 
 
 class ControllerRun(abc.ABC):
-    """One run of a controller: what it remembers of K trials, and what it records of them."""
+    """One run of a controller: its memory of K trials, and what it records."""
 
     @abc.abstractmethod
     def control(self, step: int, measured: Array) -> Array:
         """The controls of a control period.
 
-        Each trial gets the controls that it gets alone, to the last bit.
+        Each trial gets the same bits as it would alone.
 
         Args:
           step: number of the control period; called once for each, in order.
@@ -89,14 +89,14 @@ class ControllerRun(abc.ABC):
         return {}
 
     def summary(self) -> str:
-        """What there is to say of the run, in a line; empty if nothing."""
+        """A remark on the run, in one line, or empty."""
         return ""
 
 
 class Controller(abc.ABC):
-    """What decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
+    """Decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
 
-    Running a controller does not change it: `start` makes what a run remembers, so one controller can serve several
+    Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
     """
 
@@ -119,7 +119,7 @@ class Controller(abc.ABC):
     @property
     @abc.abstractmethod
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        """Of the states that it wants to be shown, and of its controls."""
+        """Coordinates of the states that it needs, and of its controls."""
 
     @property
     def plan(self) -> Plan | None:
@@ -127,7 +127,7 @@ class Controller(abc.ABC):
         return None
 
 
-# What `simulate` and all that runs trials take as `controller`.
+# The argument `controller` of `simulate` and of everything else that runs trials.
 ControllerLike = Controller | AffinePolicy | OutputFeedbackPolicy | ControlFunction
 WANTED = "a policy, a Controller or a function of state (n,) and time in s that returns controls (m,)"
 
@@ -138,17 +138,17 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
     Args:
       given: what runs; None for the policy of the plan.
       plan: None for the controller's own.
-      dynamics: of the robot that it runs on.
+      dynamics: dynamics of the robot that it runs on.
 
     Raises:
-      InputError: what is given controls nothing, or there is no plan.
+      InputError: the object is no controller, or there is no plan.
     """
     check_kind("plan", plan, (Plan, type(None)), "a Plan, such as smooth(problem)")
     if plan is None and isinstance(given, Controller):
         plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
     if plan is None:
         raise InputError(
-            "plan: got none, want what the run begins at and is compared with, such as smooth(problem); only"
+            "plan: got none, want the plan that the run follows, such as smooth(problem); only"
             " controllers with a plan of their own, such as an OffsetFree, run without"
         )
     match given:
@@ -194,7 +194,7 @@ class _FeedbackRun(ControllerRun):
 
 
 class OutputFeedback(Controller):
-    """An `OutputFeedbackPolicy` that measures states. A measurement that is the last one to the last bit got lost."""
+    """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost."""
 
     def __init__(self, policy: OutputFeedbackPolicy) -> None:
         states, names = policy.state_coordinates.names, policy.measured_coordinates.names
@@ -244,7 +244,7 @@ class FunctionController(Controller):
 
     @property
     def digest(self) -> str:
-        """Of what the function does, where that can be told, or else of its name."""
+        """Hash of what the function does, where that can be determined, else of its name."""
         known = fingerprint(self.function) or f"function {getattr(self.function, '__qualname__', type(self.function))}"
         return sha256(f"{known} {self.dt!r}")[:16]
 

@@ -26,10 +26,10 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: that it follows, as solved.
+      plan: the plan that it follows, as solved.
       model: the linear model about it, which the filter assumes.
       filter: its gains and covariances.
-      weights: of deviations from the plan.
+      weights: weights of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
       nominal: z in an undisturbed run, (T+1, Z).
     """
@@ -82,14 +82,14 @@ class FilterRun(ControllerRun):
     Attributes:
       law: in force.
       first: the step that its plan begins at.
-      z: the estimates now, (K, Z), of the knot that the newest measurement is of.
-      estimates: what was recorded of them, (T+1, K, Z), or None; see `OffsetFree`.
+      z: the current estimates, (K, Z), at the knot of the newest measurement.
+      estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.
       innovations: likewise, (T+1, K, Y).
     """
 
     def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
         self.law, self.first = law, 0
-        self.model = law.model  # for predictions, whatever a later plan assumes of the unknowns
+        self.model = law.model  # for predictions, independent of what a later plan assumes about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
         # If the first measurement is lost, the plan's first state is shown.
@@ -188,7 +188,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     measured = _expected(law)
     for t in range(steps):
         knot = max(t - latency, 0)  # of z
-        under_way = min(t, latency) + delay  # commands, of which the newest are last
+        under_way = min(t, latency) + delay  # commands, the newest last
         first = width - under_way * m
         arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
         if t >= latency:

@@ -14,8 +14,8 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import triangular_root
 from lqrsim.errors import Array, InputError
 
-# The least noise of a measured number, relative to the standard deviation with which it is predicted. Of exact or
-# redundant sensors it makes something that can be inverted; it smooths what a rank decision would make a cliff.
+# The least noise of a measured number, relative to the standard deviation with which it is predicted. It makes the
+# covariance of exact or redundant sensors invertible, and continuous where a decision on the rank would jump.
 RESOLUTION = 1e-6
 NOTHING = 1e-150  # the same, where there is no doubt about the prediction: its square is still a number
 
@@ -70,7 +70,7 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
 
 
 def check_observable(who: str, model: PlanModel) -> None:
-    """Raise InputError for an unknown that moves the robot and changes nothing of what is measured, by name."""
+    """Raise InputError, which names it, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
     effect = np.eye(model.size)[:, first:]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
@@ -83,6 +83,6 @@ def check_observable(who: str, model: PlanModel) -> None:
         if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
-                f"{who}: unknowns: got {unknown.name}, which changes nothing of what is measured ({measured}),"
+                f"{who}: unknowns: got {unknown.name}, which no measurement sees ({measured}),"
                 " want sensors that see its effect"
             )

@@ -1,9 +1,8 @@
 """Mean and covariance of a closed loop about its plan, by the recursion of LQG-MP.
 
 The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
-law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: of u normal with
-mean mu and std sigma the limited one has the slope P(low < u < high) on average, and what is left of its variance is
-noise.
+law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: for u normal with
+mean mu and std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
 """
 
 from dataclasses import dataclass
@@ -20,9 +19,9 @@ class LoopMoments(NamedTuple):
     """Moments of X about its plan.
 
     Attributes:
-      mean: of X, (T+1, X).
-      covariance: of X, (T+1, X, X).
-      across: of the deviation of the states with that of the knot before, (T, n, n).
+      mean: mean of X, (T+1, X).
+      covariance: covariance of X, (T+1, X, X).
+      across: covariance of the deviation of the states with that at the knot before, (T, n, n).
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
     """
@@ -39,7 +38,7 @@ class LinearLoop:
     """A closed loop about a plan as matrices.
 
     Attributes:
-      model: of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
+      model: model of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
       filter_gain: K, (T+1, Z, Y); None for a law of the states that are shown.
       low, high: limits of the controls, (m,).
     """
@@ -52,7 +51,7 @@ class LinearLoop:
     high: Array
 
     def moments(self) -> LoopMoments:
-        """Prediction from the start to the plan's end; of C laws, gain (C, T, m, Z), all at once."""
+        """Prediction from the start to the plan's end, for C laws at once with gain (C, T, m, Z)."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
         width, many = 2 * size if estimates else size, self.gain.shape[:-3]

@@ -41,13 +41,14 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
     `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
     winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
-    states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` has what it assumes.
+    states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` is the uncertainty that it
+    assumes.
 
     Args:
-      problem: that was solved.
+      problem: the problem that was solved.
       solution: its solution, or any with a plan of the same system.
-      uncertainty: of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean, and
-        constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
+      uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
+        and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
       effort: as in `track`.
       at_end: as in `track`.
@@ -64,9 +65,9 @@ class OffsetFree(Controller):
     A run of it, which is a rollout's `controller_run`, has these attributes:
 
     - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot: NaN
-      where none was taken in, which is so of the last knot, and of as many more as measurements are late. Their errors
+    at knots whose measurement was not used: the last one, and one more for each period of latency. Their errors
       have the covariances `filter.corrected`. Else None.
-    - `innovations`: likewise what measurements differed by from what was expected, (T+1, K, Y), of the covariances
+    - `innovations`: likewise the differences of measurements from their predictions, (T+1, K, Y), of the covariances
       `filter.innovation`; NaN where a measurement got lost, too. Both covariances are of the first plan: with
       `replan_every` they are those of a run up to its first solve.
     - with `replan_every`, `plans`: the new plans of each trial, by the step that they begin at; and `log`, how the
@@ -75,14 +76,14 @@ class OffsetFree(Controller):
     Attributes:
       model: the linear model about the plan, with z = (state, what the actuators have reached, unknowns).
       filter: the filter's gains and covariances.
-      weights: what deviations from the plan cost the law.
-      gain: of the law, (T, m, Z).
-      offset: of the law, (T, m).
-      nominal: what z is in an undisturbed run, (T+1, Z).
+      weights: the law's weights of deviations from the plan.
+      gain: gain of the law, (T, m, Z).
+      offset: offset of the law, (T, m).
+      nominal: z in an undisturbed run, (T+1, Z).
 
     Raises:
-      InputError: something does not fit the system; an unknown changes nothing of what is measured; or `replan_every`
-        is shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
+      InputError: something does not fit the system; an unknown changes no measurement; or `replan_every` is shorter
+        than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
     def __init__(
@@ -200,9 +201,9 @@ def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
     """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
 
     Args:
-      model: with the uncertainty as stated.
+      model: the model with the uncertainty as stated.
       memory: seconds.
-      effort: of the controls, (m,).
+      effort: effort of the controls, (m,).
     """
     stated, space = model.uncertainty, model.dynamics.state_coordinates
     moved = unit_means(space.units, reach_of(model, effort, 2)[2])

@@ -1,12 +1,11 @@
 """The linear model about a plan that tracking laws, filters and tubes are made of.
 
-A deviation from the plan is z = (e, a, d): of the state (n), of what the actuators have reached (m of them if they lag,
-else none), and the states of the unknowns (D). With u the deviation of the command,
+A deviation from the plan is z = (e, a, d): of the state (n), of the actuators' states (m if they lag, else none), and
+the states of the unknowns (D). With u the deviation of the command,
 
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 
-c is what the lag does to a plan that does not know of it: the actuators' nominal is what they reach when they are given
-the planned controls.
+c is the effect of the lag on a plan made without it: nominally the actuators are where the planned controls take them.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +49,7 @@ class Sensor(NamedTuple):
 
     Attributes:
       source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
-      data: what these take. size: Y, how many numbers there are. names: what messages call them.
+      data: their parameters. size: Y, the number of measured values. names: their names in messages.
     """
 
     source: Source
@@ -63,7 +62,8 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     """Return the sensor for a user's `sensors`.
 
     Raises:
-      InputError: there is no such state, a matrix of another shape, or a function that depends on what is no state.
+      InputError: there is no such state, a matrix has another shape, or a function depends on something that is no
+        state.
     """
     if sensors is None:
         sensors = space.names
@@ -121,7 +121,7 @@ class Lag:
     """A first-order lag of the actuators over a control period.
 
     Attributes:
-      left: how much of the distance to the command is left at its end. mean: in the mean over it.
+      left: the remaining share of the distance to the command at its end. mean: the same, averaged over it.
     """
 
     left: float
@@ -137,12 +137,12 @@ class Lag:
 
 @dataclass(frozen=True)
 class PlanModel:
-    """A plan with what is uncertain about it, linearised.
+    """A plan and its uncertainty, linearised.
 
     Attributes:
-      dynamics: with the disturbances as parameters.
+      dynamics: the dynamics with the disturbances as parameters.
       plan: nominal states (T+1, n) and controls (T, m).
-      uncertainty: what there is. sensor: what is measured.
+      uncertainty: the uncertainty in a run. sensor: the measured quantities.
     """
 
     dynamics: Dynamics
@@ -177,7 +177,7 @@ class PlanModel:
 
     @cached_property
     def lagging(self) -> int:
-        """How many entries of z the actuators take."""
+        """Number of entries of z for the actuators."""
         return self.m if self.uncertainty.lag > 0 else 0
 
     @cached_property
@@ -191,7 +191,7 @@ class PlanModel:
 
     @cached_property
     def own_states(self) -> list[range]:
-        """Which of the unknowns' states are those of each remembered one."""
+        """For each remembered unknown, the indices of its states."""
         ends = np.cumsum([0, *(len(part.output) for part in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]
 
@@ -200,7 +200,7 @@ class PlanModel:
         """Of z."""
         return self.n + self.lagging + len(self.transition)
 
-    # What the unknowns do.
+    # Effects of the unknowns.
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -214,7 +214,7 @@ class PlanModel:
 
     @cached_property
     def transition(self) -> Array:
-        """Of the unknowns' states, (D, D)."""
+        """Transition matrix of the unknowns' states, (D, D)."""
         return _diagonal([part.transition for part in self._filters])
 
     @cached_property
@@ -292,7 +292,7 @@ class PlanModel:
 
     @cached_property
     def effects(self) -> Array:
-        """Of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
+        """Effect of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
         plan, count = self.plan, len(self.parameters)
         B = self.jacobian[:, :, self.n :]
         slopes = np.empty((plan.steps, self.n, count))
@@ -307,7 +307,7 @@ class PlanModel:
 
     @cached_property
     def E(self) -> Array:
-        """Of the unknowns' states on the next state, (T, n, D)."""
+        """Effect of the unknowns' states on the next state, (T, n, D)."""
         return self.effects @ self.output
 
     @cached_property
@@ -333,7 +333,7 @@ class PlanModel:
 
     @cached_property
     def reached(self) -> Array:
-        """What the actuators reach at each knot when they are given the planned controls, (T+1, m or none)."""
+        """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
         plan, a = self.plan, self.lagging
         reached = np.zeros((plan.steps + 1, a))
         reached[0] = plan.controls[0, :a]
@@ -362,14 +362,14 @@ class PlanModel:
 
     @cached_property
     def start_root(self) -> Array:
-        """Of the covariance of z at the start, (Z, Z)."""
+        """Square root of the covariance of z at the start, (Z, Z)."""
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
         return _diagonal([np.diag(std), at_rest, *(part.start for part in self._filters)])
 
     @cached_property
     def process_root(self) -> Array:
-        """Of the covariance of w, (T, Z, Z), lower triangular."""
+        """Square root of the covariance of w, (T, Z, Z), lower triangular."""
         n, first, steps = self.n, self.n + self.lagging, self.plan.steps
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         commanded = self.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
@@ -396,7 +396,7 @@ class PlanModel:
 
     @cached_property
     def measurement_root(self) -> Array:
-        """Of the covariance of v, (T+1, Y, n)."""
+        """Square root of the covariance of v, (T+1, Y, n)."""
         return self.H * self.shown_std
 
 

@@ -35,7 +35,7 @@ class ActivePlan:
     """A plan in force, or that will be.
 
     Attributes:
-      plan: with its law.
+      plan: the plan, with its law.
       first: the control period that it begins at.
     """
 
@@ -43,7 +43,7 @@ class ActivePlan:
     first: int
 
     def row(self, step: int) -> int:
-        """Which of its laws is in force at a step: after its horizon the last one.
+        """The index of its law at a step; after its horizon, the last one.
 
         Args:
           step: number of the control period.
@@ -56,7 +56,7 @@ class ActivePlan:
 
 @dataclass(frozen=True)
 class SolveRequest:
-    """What is to be solved: at a step, for a plan that begins at another, from a state (n,) and with a law."""
+    """A solve to be done: at a step, for a plan that begins at a later one, from a state (n,) and with a law."""
 
     step: int
     first: int
@@ -70,12 +70,12 @@ class ReplanRecord:
     """How one solve went.
 
     Attributes:
-      step: the control period in which it began.
-      trial: of a simulation, else 0.
+      step: control period in which the solve began.
+      trial: number of a simulation, else 0.
       status: how the solve ended.
       iterations: how many it took.
       seconds: how long it took.
-      cost: of the new plan.
+      cost: cost of the new plan.
       before: cost of continuing with the law in force.
       used: whether its plan came into force.
       reason: why not, or why it is no better; empty if all went well.
@@ -102,7 +102,7 @@ class ReplanLog:
     Attributes:
       records: a `ReplanRecord` of each.
       solved: how many were used, of all trials.
-      kept: why others were not, and the law before went on: reason -> how many.
+      kept: why others were not used, so that the previous law continued: reason -> number.
     """
 
     def __init__(self) -> None:
@@ -113,9 +113,9 @@ class ReplanLog:
         """Count a solve.
 
         Args:
-          step: in which it began.
-          trial: of a simulation, else 0.
-          replan: its answer.
+          step: control period in which the solve began.
+          trial: number of a simulation, else 0.
+          replan: the answer of the solve.
           late: whether it came after the deadline.
 
         Returns:
@@ -129,7 +129,7 @@ class ReplanLog:
         finite = np.isfinite(replan.cost)
         used = finite and not late and (replan.success or replan.improved)
         if not finite:
-            reason = "the law before leads to infinity by the model"
+            reason = "the previous law leads to infinity by the model"
         self.solved += used
         if not used:
             self.kept[reason] += 1
@@ -150,10 +150,10 @@ class ReplanLog:
         self.kept[reason] += 1
 
     def summary(self, *, times: bool = False) -> str:
-        """How often it was solved, and why the law before went on where it did, in a line.
+        """The number of solves, and the reasons why the previous law continued, in a line.
 
         Args:
-          times: whether to say how long solves took, too.
+          times: whether to include how long solves took.
 
         Returns:
           A line of text.
@@ -164,14 +164,14 @@ class ReplanLog:
             line += f" ({', '.join(f'{count} {reason}' for reason, count in early.most_common())})"
         if self.kept:
             reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
-            line += f", kept the law before {self.kept.total()} times: {reasons}"
+            line += f", kept the previous law {self.kept.total()} times: {reasons}"
         if times and self.records:
             took = 1e3 * np.array([one.seconds for one in self.records])
             line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
         return line
 
 
-# What a plan in force is stepped by: field -> what of it has to stay.
+# Fields of the problem that the plan in force depends on, with the part of each that must not change.
 _FIXED: dict[str, Callable[[Problem], object]] = {
     "dt": lambda problem: problem.dt,
     "steps": lambda problem: problem.steps,
@@ -183,16 +183,16 @@ _FIXED: dict[str, Callable[[Problem], object]] = {
 
 
 class ReplanRule:
-    """What is solved, when and from where. Runs do not change it.
+    """The problem that is solved, when, and from which state. Runs do not change it.
 
     Args:
-      who: for messages. problem: that was solved. solution: its solution.
+      who: name for messages. problem: the problem that was solved. solution: its solution.
       every: seconds between two solves. deadline: seconds until its answer comes into force, by default a control
         period, or `at_least` as long. Both are rounded to control periods, the deadline up.
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
       predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
       when: a funnel of the solution, if solves are only for states outside it.
-      share: of the funnel's level that counts as its boundary.
+      share: share of the funnel's level that counts as its boundary.
       changes: (time in s, problem) -> the problem as it is known by then.
 
     Attributes:
@@ -249,7 +249,7 @@ class ReplanRule:
         self.solver = prepare(problem)
 
     def problem_at(self, step: int, problem: Problem) -> Problem:
-        """A problem as it is known in a control period: with what `changes` makes of it."""
+        """A problem as it is known in a control period, with the result of `changes`."""
         if self.changes is None:
             return problem
         return self.checked(f"{self._who}: changes", self.changes(step * self.problem.dt, problem))
@@ -286,7 +286,7 @@ class ReplanRule:
     def request(
         self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0
     ) -> SolveRequest:
-        """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""
+        """The solve for a control period, from a state (n,) that was measured `late` seconds after the period began."""
         plan, first = active.plan, step + self.delay
         row = active.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
@@ -296,7 +296,7 @@ class ReplanRule:
         return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
 
     def _ahead(self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float) -> Array:
-        """Where the law in force leads by the deadline, by the model."""
+        """The state that the law in force reaches by the deadline, according to the model."""
         policy, dt = active.plan.policy, problem.dt
         rows = [active.row(step + i) for i in range(self.delay)]
         if late > 1e-9 * dt:

@@ -1,12 +1,12 @@
 """Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
-At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
-constants at their estimated values. Where that collides or misses the goal, what is left of the horizon is solved from
-there, and the law and the filter are made anew about that plan. Elsewhere a new plan would do harm: it is of less cost,
-and as near to obstacles as its constraints let it. The estimates go on as they are; the law acts on what they differ by
-from what the new plan takes for granted. Gusts pass, and plans do not know of them; gains and offsets of the controls
-and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
-simulation.
+At each of these steps, and for each trial, the law is simulated with the model from the estimated state, with the
+unknown constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved
+from there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower
+cost, and goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their
+difference from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of
+the controls and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no
+time in the simulation.
 """
 
 from collections.abc import Mapping
@@ -32,14 +32,14 @@ class ReplannedRun(ControllerRun):
     """A run in which each trial has its own law.
 
     Args:
-      rule: when it is looked at whether to solve.
+      rule: the periods in which to check whether a solve is needed.
       law: to begin with.
       trials: K.
       records: as of `FilterRun`, of all trials.
       always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
-      plans: of each trial, by the step that they begin at; without the first.
+      plans: plans of each trial, by the step that they begin at; without the first.
       log: how the solves went.
       estimates: as of `FilterRun`.
       innovations: likewise.
@@ -100,7 +100,7 @@ class ReplannedRun(ControllerRun):
         except InputError as error:  # an estimate is not finite
             self.log.refuse(str(error))
             return
-        # By that model the actuators have no lag, and no gains and offsets.
+        # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
         rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
@@ -121,7 +121,7 @@ class ReplannedRun(ControllerRun):
 
 
 def constants(model: PlanModel) -> Array:
-    """Which of the unknowns' states are constants, (D,): they keep their value to the end of the horizon."""
+    """Whether each of the unknowns' states is constant, (D,): they keep their value to the end of the horizon."""
     found = np.zeros(len(model.transition), dtype=bool)
     for one, own in zip(model.remembered, model.own_states, strict=True):
         found[list(own)] = one.constant
@@ -129,7 +129,7 @@ def constants(model: PlanModel) -> Array:
 
 
 def in_parameters(model: PlanModel) -> Array:
-    """Which of the unknowns' states change only parameters of the dynamics, (D,)."""
+    """Whether each of the unknowns' states changes only parameters of the dynamics, (D,)."""
     moved = (model.output != 0).any(axis=0)
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
     return moved & ~beyond

@@ -51,7 +51,7 @@ class LiveReplanner:
 
     `step` only evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
     period in which one is due. Its answer comes into force at the deadline. What is not ready then is not used, and the
-    law before goes on. All is compiled before the first step.
+    previous law continues. All is compiled before the first step.
 
     Args:
       rule: what is solved, when and from where.
@@ -59,10 +59,10 @@ class LiveReplanner:
       clock: likewise.
 
     Attributes:
-      problem: that is solved from now on.
+      problem: the problem that is solved from now on.
       active: the plan in force, `active.plan`, and the control period that it begins at, `active.first`.
-      log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, how many were used; and
-        `log.kept`, why others were not, and the law before went on: reason -> how many.
+      log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, the number used; and `log.kept`,
+        why others were not used, so that the previous law continued: reason -> number.
 
     Raises:
       InputError: as `Replanner.live`.
@@ -72,7 +72,8 @@ class LiveReplanner:
         check_kind("LiveReplanner: rule", rule, ReplanRule, "that of a Replanner")
         if not rule.delay:
             raise InputError(
-                "Replanner.live: deadline: got 0 s, want more: a solve takes time, in which the law before goes on"
+                "Replanner.live: deadline: got 0 s, want more: a solve takes time, during which the previous law"
+                " continues"
             )
         check_function("Replanner.live: clock", clock, "a function that returns seconds", arguments=0, optional=False)
         self._rule, self._clock = rule, clock
@@ -98,15 +99,14 @@ class LiveReplanner:
             self._thread.join()
 
     def summary(self) -> str:
-        """How often it solved, how long that took, and why the law before was kept where it was, in a line."""
+        """The number of solves, their times, and the reasons why the previous law was kept, in a line."""
         return self.log.summary(times=True)
 
     def change(self, **parts: Any) -> None:
         """Change the problem from the next solve on: `live.change(final_cost=...)`; see `dataclasses.replace`.
 
-        Goals, weights, obstacles, parameters and limits can change. So that a new estimate of what disturbs the robot
-        can, plan with `dynamics.disturbed` from the beginning. What plans are stepped by (dt, steps, states and
-        controls) cannot.
+        Goals, weights, obstacles, parameters and limits can change. To change an estimate of a disturbance, plan with
+        `dynamics.disturbed` from the beginning. dt, steps, states and controls cannot.
 
         Args:
           **parts: field of `Problem` -> new value.
@@ -149,7 +149,7 @@ class LiveReplanner:
         return policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
 
     def _due(self, step: int) -> bool:
-        """Whether a solve begins in a control period: that is so of the first, too, and of one after those left out."""
+        """Whether a solve begins in a control period: also in the first, and in the next one after periods left out."""
         rule = self._rule
         left = rule.horizon == "moving" or step + rule.delay < rule.problem.steps
         return left and step // rule.periods > self._asked // rule.periods
@@ -167,12 +167,12 @@ class LiveReplanner:
         self._queue.put(solve)
 
     def _take(self, step: int) -> None:
-        """Put an answer into force whose time has come; what is not there by then is not used."""
+        """Put an answer into force when its time has come; an answer that is late is not used."""
         solve = self._solve
         if solve is None or step < solve.request.first:
             return
         if solve.answer is None and solve.error is None:
-            solve.missed = True  # its thread goes on until it is done with it, and the next solve waits for that
+            solve.missed = True  # its thread continues until the solve is done, and the next solve waits for it
             return
         self._solve = None
         if solve.answer is None:
@@ -195,7 +195,7 @@ Computing = float | str | Callable[[np.random.Generator], float]
 
 
 class Replanner(Controller):
-    """Solves again and again from where the robot will be when the answer comes; until then the law before goes on.
+    """Solves again and again from where the robot will be when the answer comes; until then the previous law continues.
 
         rollout = ls.simulate(plant, controller=replanner)  # in a simulation
 
@@ -203,34 +203,34 @@ class Replanner(Controller):
             while (t := robot.time()) < 20:
                 robot.apply(live.step(robot.state(), t))
 
-    Each solve begins with the law in force, and its plan is no worse than to go on with that; see `Replan`. What is not
-    ready by the deadline is not used. Costs that depend on the step's number are not supported. A re-planner is not
-    changed by running it, so several runs can have the same one.
+    Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
+    plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported. A
+    re-planner is not changed by running it, so several runs can have the same one.
 
     In a simulation a solve takes as long as `computing` says. With a number or a function the results are the same to
     the last bit wherever they are computed; "measured" is as fast as this machine is. The rollout's `controller_run`
     has a `log` of the solves, as a `LiveReplanner` has, and the plans in force, `active`.
 
     Args:
-      problem: that was solved.
+      problem: the problem that was solved.
       solution: its solution, or another plan of it.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default one control period, or as long as `computing` takes, where that is a number and longer.
-      horizon: "shrinking", what is left of the first plan's, or "moving", always as long as that.
+      horizon: "shrinking", the rest of the first plan's, or "moving", always as long as the first plan's.
       predict: whether to solve from where the law in force leads by the deadline, by the model. Without it, plans begin
         where the robot was, not where it is.
       changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
-        goals, obstacles or parameters. What plans are stepped by (dt, steps, states and controls) cannot change, nor
-        what would have to be compiled.
+        goals, obstacles or parameters. dt, steps, states and controls cannot change, nor anything that would have to be
+        compiled.
       when: a funnel of the solution, for the horizon "shrinking": solve only for states that are outside at the time,
-        about the plan in force. What is certified is the first plan's; about a later one, or after a change, the same
+        about the plan in force. The certificate is for the first plan; about a later one, or after a change, the same
         ellipsoids are a rule of thumb.
-      share: of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and loses
-        fewer trials, for a plan that begins at the boundary often comes too late.
+      share: share of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and
+        loses fewer trials, for a plan that begins at the boundary often comes too late.
       computing: how long a solve takes in simulations, in seconds: a number; a function of a `numpy.random.Generator`,
         which draws it; or "measured".
-      seed: of what `computing` draws.
+      seed: seed of the random numbers for `computing`.
 
     Raises:
       InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.
@@ -274,7 +274,7 @@ class Replanner(Controller):
         Args:
           interpolate: whether laws are blended between two knots, for loops that are faster than the plan; see
             `AffinePolicy`.
-          clock: what time it is, in seconds, for deadlines.
+          clock: returns the time in seconds, for deadlines.
 
         Returns:
           A LiveReplanner, for one run.
@@ -363,7 +363,7 @@ class ReplannerRun(ControllerRun):
         elif isinstance(computing, float):
             took = computing
         else:
-            # From what this trial is shown, so that it draws the same whatever other trials there are.
+            # Seeded by the state of this trial, so that other trials do not change its draws.
             drawn = int.from_bytes(bytes.fromhex(sha256(state)[:16]), "big")
             assert callable(computing)
             given = computing(np.random.default_rng([self._of.seed, step, drawn]))

@@ -26,9 +26,9 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 
-PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may take to be gone
-# What a tube of twice the width of the narrowest counts for as a chance of failing: little, so that it decides where
-# the plan is clear of everything, or collides whatever the law.
+PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may take to decay
+# The chance of failure that a tube of twice the narrowest width counts for: small, so that width decides only where the
+# plan is far from everything, or collides with any law.
 NARROW = 0.02
 # What the square of the share of commands beyond the limits adds to the chance of failing. A choice of ours: small
 # where few commands are limited, and near 1 where half of them are, for then the linear model says little.
@@ -49,7 +49,8 @@ class Choice:
     """Tolerances, with the prediction for their law.
 
     Attributes:
-      tolerate: of each state, (n,). settle: the time in s that they are of. weights: for the law. predicted: of it.
+      tolerate: tolerated deviation of each state, (n,). settle: their settling time in s. weights: for the law.
+        predicted: prediction with it.
     """
 
     tolerate: Array
@@ -64,8 +65,8 @@ def choose_tolerances(
     """Return the tolerances for a law about a plan.
 
     Args:
-      predicted: predicts for each of C weights what their law leads to.
-      effort: what may be added to each control, (m,).
+      predicted: predicts the results of the laws of C weights.
+      effort: the most that may be added to each control, (m,).
       at_end: as in `track`.
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
@@ -77,7 +78,7 @@ def choose_tolerances(
         Choice(tolerate, periods * model.plan.dt, weights, prediction)
         for (periods, tolerate), weights, prediction in zip(tried.items(), each, predicted(all_weights), strict=True)
     ]
-    # What is a thousandth of the plan's extent is narrow enough.
+    # A thousandth of the plan's extent is narrow enough.
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
     narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
 
@@ -114,7 +115,7 @@ def prediction_of(
     """The prediction for moments of the states' deviations, as in `collision_chance`.
 
     Args:
-      radius: of the goal, in metres; None without one.
+      radius: radius of the goal, in metres; None without one.
     """
     plan = model.plan.states
     place = list(model.dynamics.state_coordinates.position)
@@ -135,8 +136,8 @@ def with_filter(
 ) -> list[Prediction]:  # fmt: skip
     """Predictions for the laws of C weights that follow a filter's estimates.
 
-    The filter is taken to be right about the noise: then its error is independent of what it estimates, and there is
-    less to compute than in `linear_loop.py`.
+    The filter is assumed to be right about the noise. Then its error is independent of its estimate, and there is less
+    to compute than in `linear_loop.py`.
     """
     n, own, steps, count = model.n, model.n + model.lagging, model.plan.steps, len(weights.state)
     gain, offset = tracking_laws(model, weights)
@@ -157,11 +158,11 @@ def with_filter(
         planned = model.plan.controls[t]
         slope, level, left = limited(planned + offset[:, t] + (law @ mean[:, :, None])[:, :, 0], std, *limits)
         beyond += (1 - slope) / steps
-        # M estimate M' of M = F + G slope law. Of G only the rows of the state and the actuators are not zero.
+        # M estimate M' of M = F + G slope law. Only the rows of G for the state and the actuators are not zero.
         law = slope[:, :, None] * law
         moved = F @ estimate
         moved[:, :own] += G @ (slope[:, :, None] * response)
-        # The true state is the estimate and its error, of which the control moves the first alone.
+        # The true state is the estimate plus its error; the control moves only the estimate.
         across[:, t] = moved[:, :n, :n] + unlearned[t]
         estimate = moved @ F.T
         estimate[:, :, :own] += moved @ law.transpose(0, 2, 1) @ G.T
@@ -192,16 +193,17 @@ def track(
     and drawn as any other policy.
 
     Args:
-      problem: that was solved.
+      problem: the problem that was solved.
       solution: its solution, or any with a plan of the same system.
       tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
         the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
         under the uncertainty.
-      effort: what may be added to each control to get back; by default a quarter of its range.
-      at_end: the tolerances of the position at the plan's end, relative to before; of all states where there is none.
-      uncertainty: what runs will meet, as `uncertainty_of` makes it; only for choosing tolerances.
-      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise, as that is along
-        the plan; above 0 large deviations are dreaded. Tolerances must then be given.
+      effort: the most that may be added to each control to return to the plan; by default a quarter of its range.
+      at_end: the tolerances of the position at the plan's end, relative to before; of all states if there is no
+        position.
+      uncertainty: the uncertainty in a run, as from `uncertainty_of`; only for choosing tolerances.
+      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise along the plan;
+        above 0 it penalises large deviations more. Tolerances must then be given.
 
     Returns:
       The policy.

@@ -32,8 +32,8 @@ class Weights:
 
     Attributes:
       state: the diagonal of Q, (n,); or of several to compare, (C, n).
-      control: of R, (m,).
-      end: of Q_T, likewise.
+      control: diagonal of R, (m,).
+      end: diagonal of Q_T, likewise.
     """
 
     state: Array
@@ -45,7 +45,7 @@ class Weights:
         """The weights for tolerances in the states' units and efforts (m,) in the controls'.
 
         Args:
-          at_end: of the position, relative to before; of all states where there is none.
+          at_end: tolerance of the position at the end, relative to before; of all states if there is no position.
 
         Raises:
           InputError: a name or unit that there is not, or a tolerance that is not positive.

@@ -27,19 +27,20 @@ from lqrsim.results.solution_parts import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class Tube:
-    """Where the closed loop will be about its plan.
+    """Predicted distribution of the closed loop about its plan.
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: what the states are.
-      mean: of the deviation of the state, (T+1, n).
-      covariance: of it, (T+1, n, n).
-      across: of the deviation with that of the knot before, (T, n, n).
-      estimate_covariance: of the error of the estimate, before each measurement, (T+1, n, n); None without a filter.
+      state_coordinates: names and units of the states.
+      mean: mean of the deviation of the state, (T+1, n).
+      covariance: covariance of that deviation, (T+1, n, n).
+      across: covariance of the deviation with that at the knot before, (T, n, n).
+      estimate_covariance: covariance of the error of the estimate, before each measurement, (T+1, n, n); None without a
+        filter.
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
       step_chance: the chance of being in collision at each knot, (T+1,); bounded by the sum over obstacles.
-      collision_chance: of colliding at all.
+      collision_chance: chance of colliding at all.
 
     Raises:
       InputError: arrays that do not fit together.
@@ -80,7 +81,7 @@ class Tube:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
         Args:
-          rollout: of the same plan.
+          rollout: rollout of the same plan.
 
         Returns:
           The rollout with its `tube` and `collision_chance`.
@@ -99,13 +100,13 @@ class Tube:
 def predict_tube(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: ControllerLike | None = None
 ) -> Tube:
-    """Where a run will be about its plan, and how likely it is to collide, before any run.
+    """Predict the distribution of a run about its plan, and its chance of collision.
 
     Args:
-      problem: that was solved, with the obstacles in its costs and constraints.
-      solution: with the plan.
-      uncertainty: what the run meets.
-      controller: what runs it: an OffsetFree or an AffinePolicy; by default the solution's policy.
+      problem: the problem that was solved, with the obstacles in its costs and constraints.
+      solution: the solution whose plan is run.
+      uncertainty: the uncertainty in a run.
+      controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
 
     Returns:
       The Tube.
@@ -131,13 +132,15 @@ def predict_tube(
 
 
 def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
-    """The tube of a closed loop among obstacles. Raises InputError for what the linear model does not have."""
+    """The tube of a closed loop among obstacles. Raises InputError for a controller that the linear model does not
+    cover.
+    """
     model = loop.model
     for field in ("latency", "delay"):
         if getattr(model.uncertainty, field):
             raise InputError(
                 f"Uncertainty: {field}: got {getattr(model.uncertainty, field)} control periods, want 0 for a tube:"
-                " it takes measurements and commands as they come"
+                " it has neither latency nor delay"
             )
     moments = loop.moments()
     n, size = model.n, model.size

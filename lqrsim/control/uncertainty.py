@@ -1,7 +1,7 @@
-"""What a run meets that its plan does not know, in numbers: what filters, tracking laws and tubes are made of.
+"""The uncertainty in a run that its plan does not know, in numbers: the basis of filters, tracking laws and tubes.
 
-All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one of disturbances as `simulate` takes them; a
-person with a robot of their own can write one down.
+All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one from the disturbances of `simulate`; for a robot
+of your own you can state one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ from lqrsim.results.coordinates import Coordinates
 # A number for all, one for each, or by name or by unit: {"m": 0.05, "m/s": 0.2}, {"x": 0.05}.
 PerEntry = float | Sequence[float] | Mapping[str, float]
 
-MEAN = 0.5  # standard deviation of the mean of what varies, for a filter, relative to its own
+MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to its own
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 
@@ -43,10 +43,11 @@ class Unknown:
         more than commanded, or "offset of <control>"; or several of them with their shares, {"wind_x": 0.6, "wind_y":
         0.8} for what blows in that direction.
       std: standard deviation from the plan's value, in its unit.
-      time_constant: seconds in which the correlation falls to 1/e; infinite for a constant, 0 for what is drawn anew in
-        each control period.
-      order: 1, or 2 for what passes (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and upward.
-      drift: by how much a constant wanders off, as a random walk, per root of a second; others have none.
+      time_constant: seconds in which the correlation falls to 1/e; infinite for a constant, 0 for a value that is drawn
+        anew in each control period.
+      order: 1, or 2 for noise filtered by (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and
+        upward.
+      drift: random walk of a constant, per square root of a second; other unknowns have none.
 
     Raises:
       InputError: a number is out of range.
@@ -78,12 +79,12 @@ class Unknown:
 
     @property
     def shares(self) -> dict[str, float]:
-        """What it is of -> its share."""
+        """Parameters or disturbances, with their shares."""
         return {self.of: 1.0} if isinstance(self.of, str) else dict(self.of)
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return " and ".join(self.shares)
 
     @property
@@ -106,16 +107,16 @@ class Uncertainty:
     Attributes:
       unknowns: parameters, winds, forces, actuators' gains and offsets.
       start: standard deviation of where a run begins, of each state.
-      control: of white noise on each control.
-      measurement: of white noise on each state that is measured.
-      model_error: of what the model mispredicts of each state in one control period, white noise as well. A filter
+      control: strength of white noise on each control.
+      measurement: strength of white noise on each measured state.
+      model_error: strength of the model's error in each state over one control period, white noise as well. A filter
         assumes some whatever is stated here; see `OffsetFree`.
       lag: time constant in s with which the actuators follow their commands.
       delay: control periods by which commands come late.
-      latency: by which measurements do.
+      latency: delay of measurements.
       loss: share of the measurements that get lost.
       obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
-      left_out: what was stated besides and no linear model has; for the record.
+      left_out: disturbances that no linear model can represent, for the record.
 
     Raises:
       InputError: a number is out of range.
@@ -149,7 +150,7 @@ class Uncertainty:
         """Check that it fits a system.
 
         Args:
-          dynamics: of the system.
+          dynamics: dynamics of the system.
 
         Raises:
           InputError: something does not fit.
@@ -164,14 +165,14 @@ class Uncertainty:
                 check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))
 
     def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
-        """The same for a filter: what varies may have a mean that is not zero, and what is constant may change.
+        """The same for a filter: varying unknowns may have a mean that is not zero, and constant ones may change.
 
-        By the linear model, that leaves no steady error: a filter that believes in a constant stops listening, and one
-        that believes in a wind that always comes back to zero is always a little wrong about one that does not.
+        In the linear model, this leaves no steady error: a filter that assumes a constant stops adapting, and one that
+        assumes a wind of mean zero is biased for a steady wind.
 
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
-          share: of what varies, the standard deviation of its mean, relative to its own.
+          share: standard deviation of a varying unknown's mean, relative to its own.
 
         Returns:
           An Uncertainty.
@@ -213,7 +214,7 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
     """Numbers as one for each entry, (len(space),); those by name win over those by unit, the rest are 0.
 
     Args:
-      above: what each must exceed; by default they must not be negative, and need not be there for all.
+      above: a bound that each must exceed; by default they must be nonnegative, and some may be missing.
 
     Raises:
       InputError: a name or unit that there is not, another number of them, or one that is out of range.
@@ -288,7 +289,7 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
 def triangular_root(root: Array) -> Array:
     """The lower triangular (..., n, n) whose product with its transpose is that of root (..., n, k).
 
-    By an orthogonal transformation: nothing is squared, so that each row keeps its own precision, whatever its size.
+    By an orthogonal transformation: nothing is squared, so that each row keeps its own relative precision.
     """
     rows, columns = root.shape[-2:]
     if columns < rows:
@@ -297,7 +298,7 @@ def triangular_root(root: Array) -> Array:
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
-    """Several as one: what is of the same kind adds up.
+    """Several as one: those of the same kind add up.
 
     Raises:
       InputError: the numbers of two are not of the same form.

@@ -9,6 +9,8 @@
 Importing this registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0.
 """
 
+from typing import Any
+
 try:
     import gymnasium
 except ModuleNotFoundError as error:
@@ -16,9 +18,46 @@ except ModuleNotFoundError as error:
 
 from lqrsim.gym.environment import Environment
 from lqrsim.gym.expert import Expert
-from lqrsim.gym.registered import make_env, make_vec, register
 from lqrsim.gym.vector import VectorEnvironment
+from lqrsim.scenarios.packaged import Scenario
 
 __all__ = ["Environment", "Expert", "VectorEnvironment", "make_env", "make_vec"]
 
-register(gymnasium.registry)
+SCENARIOS = {"lqrsim/Quadrotor-v0": "quadrotor", "lqrsim/DifferentialDrive-v0": "differential_drive"}
+ANY = "lqrsim/Scenario-v0"
+
+
+def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any]:
+    """Make the environment of any scenario, with Gymnasium's usual wrappers.
+
+    Args:
+      scenario: a Scenario, or a reference as on the command line: a name with settings, "quadrotor,query=3"; a function
+        of yours, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
+      options: those of `Environment`, and those of `gymnasium.make`.
+
+    Raises:
+      InputError: as `Environment` does.
+    """
+    return gymnasium.make(ANY, scenario=scenario, **options)
+
+
+def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+    """Make many environments of one scenario, run by MuJoCo as one batch: see `VectorEnvironment`.
+
+    Args:
+      scenario: as in `make_env`. num_envs: number of environments. options: those of `VectorEnvironment`.
+
+    Raises:
+      InputError: as `VectorEnvironment` does.
+    """
+    return VectorEnvironment(scenario, num_envs=num_envs, **options)
+
+
+for _name, _scenario in {**SCENARIOS, ANY: None}.items():
+    if _name not in gymnasium.registry:
+        gymnasium.register(
+            _name,
+            entry_point="lqrsim.gym:Environment",
+            vector_entry_point="lqrsim.gym:VectorEnvironment",
+            kwargs={} if _scenario is None else {"scenario": _scenario},
+        )

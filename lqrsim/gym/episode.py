@@ -55,7 +55,7 @@ class Moment:
 
 
 class Resettable:
-    """What `Environment` and `VectorEnvironment` share: a task, and its current episode."""
+    """Base class of `Environment` and `VectorEnvironment`: a task, and its current episode."""
 
     task: Task
     _seed: int | None = None
@@ -96,7 +96,7 @@ class Episode:
     """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
     Attributes:
-      ended: (K,) whether each episode has ended. outcomes: (K,) how; empty for those that go on.
+      ended: (K,) whether each episode has ended. outcomes: (K,) how; empty for those still running.
     """
 
     def __init__(self, task: Task, trials: EpisodeTrials, count: int, *, frames: bool, threads: int | None) -> None:

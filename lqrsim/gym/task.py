@@ -53,7 +53,7 @@ class Task:
     """The task of an environment. The arguments are those of `Environment`.
 
     Attributes:
-      scenario, plant: what is run. low, high: limits of the controls, (m,) each.
+      scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
 
     Raises:
       InputError: as `Environment` does.

@@ -1,4 +1,4 @@
-"""What an iteration with an active set evaluates, and its pivots. The kernels' subset.
+"""The evaluations of an iteration with an active set, and its pivots. The kernels' subset.
 
 The rows are those of all constraints, then the limits of the controls; the active set holds some of them at zero.
 `solvers/active_set.py` has the method.
@@ -25,7 +25,7 @@ from lqrsim.kernels.rollouts import larger
 # the control, 1 for the lower one and -1 for the upper one, and its value.
 KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
-ROUNDING = 1e-10  # of a row's size: a model may violate it by that much
+ROUNDING = 1e-10  # relative to a row's size: the violation that a model may have
 
 
 def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows, out, active):
@@ -134,8 +134,8 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
       policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.
 
     Returns:
-      The step whose control block is not positive definite, T + 1 if it is the start's, or -1; and how many rows are
-      wrong.
+      The step whose control block is not positive definite (T + 1 for the start's, -1 for none), and the number of rows
+      with the wrong state.
     """
     stage, slope = stack(W, W), stack(W)
     for t in range(steps, -1, -1):

@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: what is added to the cost for a constraint. The kernels' subset.
+"""The augmented Lagrangian: the cost that is added for a constraint. The kernels' subset.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
@@ -6,9 +6,9 @@ For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
 and for equalities d = 0, with multipliers of either sign, the same without the max: sum -lambda d + mu/2 d^2. At the
 optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is the value less
-the tolerance to which the constraint is solved, so that what is within the tolerance satisfies the constraint itself.
-A constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where
-its force would be. Of its curvature only `mu n n'` is used, n the gradient of d: the rest can be negative.
+the tolerance to which the constraint is solved, so that a plan within the tolerance satisfies the constraint itself. A
+constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where its
+force would be. Only the part `mu n n'` of its curvature is used, with n the gradient of d: the rest can be negative.
 
 `multipliers` is one array a constraint: mu (0 where the constraint does not act yet), the number of values at a step,
 the first step at which they act, the tolerance, the price (infinite where there is none), and from HEADER on lambda,

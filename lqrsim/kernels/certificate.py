@@ -1,8 +1,8 @@
 """Certification of a plan, computed from the problem on a short path of its own. The kernels' subset.
 
-Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's functions, their
-derivatives, and a Cholesky factor. The cost is the value that comes with the derivatives, not what rollouts added up.
-`certify.py` compares the results with what a solver claims.
+It uses only the problem's functions, their derivatives and a Cholesky factor: nothing from the passes, rollouts and
+line searches that found the plan. The cost is the value that comes with the derivatives, not what rollouts added up.
+`certify.py` compares the results with a solver's claims.
 """
 
 from math import nan
@@ -17,16 +17,16 @@ def certify(settings, own, plan, policy, to_go, model, found):
     """Write cost, residuals and predicted decrease of a plan and its policy.
 
     The predicted decrease is `1/2 sum e' E^-1 e` with the gradients e of the cost in the offsets of the policy, later
-    controls responding with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It is what a Riccati
-    pass predicts about the plan where the gains are that pass's. Controls go no further than their limits. Cost and
+    controls responding with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the prediction
+    of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their limits. Cost and
     decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy as it is with controls at their limits,
-        and write them to `to_go`: a Riccati pass's assume that controls respond that cannot.
+        and write them to `to_go`: those of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       found: row of CERTIFICATE, written.
-        scale: what the curved part of the cost would be if nothing in it cancelled; rounding is a share of it.
+        scale: the curved part of the cost, if nothing in it cancelled; rounding errors are relative to it.
         dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
         policy_residual: the largest difference of a control from the policy's, within its limits, relative to the terms
         of that sum.
@@ -41,7 +41,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         size[i] = 1.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    # What constraints add is never part of the sum: a large penalty would leave its rounding.
+    # Constraint terms are never part of the sum: a large penalty would leave its rounding errors.
     cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
     augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)

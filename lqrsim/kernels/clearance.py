@@ -1,4 +1,4 @@
-"""Distances to obstacles, less what they must be: values of a constraint. The kernels' subset.
+"""Distances to obstacles minus the required ones: values of a constraint. The kernels' subset.
 
 The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
 Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
@@ -43,7 +43,7 @@ def slope(x, u, t, row, data, gradient):
 
 
 def place(x, row, data):
-    """Where the ball of a row is."""
+    """The place of a row's ball."""
     if BALLS:
         first = 3 * (row // int(data[AT + 2]))
         return x[first], x[first + 1], x[first + 2]
@@ -51,6 +51,6 @@ def place(x, row, data):
 
 
 def obstacle_at(t, row, data):
-    """Where the numbers of the obstacle of a row begin."""
+    """The index at which the numbers of a row's obstacle begin."""
     obstacles, tables = int(data[AT + 2]), AT + 4 + BALLS + int(data[AT]) * int(data[AT + 1])
     return tables + ROW * (obstacles * min(t, int(data[AT + 3]) - 1) + (row % obstacles if BALLS else row))

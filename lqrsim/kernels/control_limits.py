@@ -42,7 +42,7 @@ def fix_controls_at_limits(u, gain, limits, stage, step):
 
 
 def fix_control(i, value, stage):
-    """Make control i a constant in a stage about the origin; return what the stage's constant gains.
+    """Make control i a constant in a stage about the origin; return the change of the stage's constant.
 
     A control without effect, of cost `1/2 (u - value)^2`, takes its place.
     """

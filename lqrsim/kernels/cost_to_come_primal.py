@@ -73,7 +73,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
         for j in range(M):
             joint[N + i, N + j] = cost[N + i, N + j]
     if crossed != 0:
-        # What the cross term u'P x_t becomes in (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
+        # The cross term u'P x_t in terms of (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
         for i in range(M):
             for k in range(N):
                 factor = cost[N + i, k]

@@ -1,6 +1,18 @@
-"""One step of the Riccati recursion, which makes the cost-to-go at t of that at t + 1. The kernels' subset.
+"""One step of the Riccati recursion, from the cost-to-go at t + 1 to that at t. The kernels' subset.
 
-Paper: Eqs. (9)-(13), in discrete time.
+Paper: Eqs. (9)-(13), in discrete time. The step is linear and the cost quadratic in z = (x, u):
+
+    x_{t+1} = J z + c cost_t = 1/2 z'Hz + h'z + k v_{t+1} = 1/2 x'S1 x + s1'x + k1
+
+Their sum is again quadratic in z, with the paper's blocks for x and u:
+
+    G = H + J'S1 J = [D C'; C E] g = h + J'(S1 c + s1) = (d, e)
+
+The control u = L x + l minimises it, and leaves the cost-to-go v_t = 1/2 x'Sx + s'x + constant:
+
+    L = -E^-1 C,    l = -E^-1 e
+    S = D + C'L,    s = d + C'l
+    constant = k + k1 + 1/2 c'S1 c + s1'c + 1/2 e'l
 """
 
 from lqrsim.kernels.declarations import M, N, stack
@@ -35,9 +47,7 @@ def add_cost_to_go(t, step, stage, constant, to_go):
 
 
 def minimize_control(g, h, gain, feedforward, hessian, gradient):
-    """Minimise `1/2 z'gz + h'z` over the control in z = (x, u); the minimiser is `u = gain x + feedforward`.
-
-    With the paper's blocks [D C'; C E] of g and (d, e) of h: L = -E^-1 C, l = -E^-1 e, S = D + C'L, s = d + C'l.
+    """Minimise `1/2 z'gz + h'z` over the control in z = (x, u), as above; the minimiser is `u = gain x + feedforward`.
 
     Args:
       g: (W, W). h: (W,).

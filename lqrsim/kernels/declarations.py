@@ -115,7 +115,7 @@ def load(words, index) -> int:
 
 
 def store(words, index, value: int) -> None:
-    """Atomically write an int64 that threads share; what was written before is visible to whoever loads it."""
+    """Atomically write an int64 that threads share; earlier writes are visible to every thread that loads it."""
 
 
 def fetch_add(words, index, value: int) -> int:

@@ -1,7 +1,7 @@
-"""What distances that a model brings leave to spare beyond margins. The kernels' subset.
+"""Distances from a model, minus margins. The kernels' subset.
 
-`data` has what the distances read, and from AT on for how many steps there are margins, of which the last hold from
-there on, how many at a step, of each row the number of its obstacle, and the margins, a step after the other.
+`data` has the data of the distances. From AT on it has the number of steps with margins (the last ones hold from there
+on), the number of margins at a step, the number of each row's obstacle, and the margins, step by step.
 """
 
 from lqrsim.kernels.declarations import N
@@ -11,7 +11,7 @@ ROWS = 1  # how many there are
 
 
 def value(at, u, t, row, data):
-    """What the row's distance leaves to spare, of all distances."""
+    """The row's distance minus its margin, given all distances."""
     steps, each = int(data[AT]), int(data[AT + 1])
     return at[row] - data[AT + 2 + ROWS + min(t, steps - 1) * each + int(data[AT + 2 + row]) % each]
 

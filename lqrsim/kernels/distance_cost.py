@@ -1,8 +1,8 @@
-"""The cost of obstacles at distances that a model brings. The kernels' subset.
+"""The cost of obstacles at distances from a model. The kernels' subset.
 
 It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
-from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has what the
-distances read, and from AT on the sharpness, the weight and D. `places` and `places_jacobian` are the distances here.
+from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has the data of the
+distances, and from AT on the sharpness, the weight and D. `places` and `places_jacobian` are the distances here.
 """
 
 from lqrsim.kernels.declarations import N, places, places_jacobian, stack

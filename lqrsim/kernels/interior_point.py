@@ -1,4 +1,4 @@
-"""What an iteration of the interior point evaluates, and the step that it makes. The kernels' subset.
+"""The evaluations of an interior-point iteration, and its step. The kernels' subset.
 
 The plan need not satisfy the dynamics: between where a step leads and the next state there is a gap, which the
 iterations close. `solvers/interior_point.py` has the method.
@@ -177,7 +177,8 @@ def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
 
     Args:
       stage: (W, W) and slope: (W,) of the model at the plan; overwritten. jacobian: (N, W). gap: (N,).
-      policy: offsets are the changes of the controls where the state does not change. to_go: of changes of the state.
+      policy: its offsets are the changes of the controls for an unchanged state. to_go: the cost-to-go of changes of
+        the state.
 
     Returns:
       Whether the control block is positive definite.
@@ -247,7 +248,7 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
 
     Args:
       part: the fraction. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
-      limits: of the controls at each step, (T, M) each. out: Motion, written.
+      limits: limits of the controls at each step, (T, M) each. out: Motion, written.
     """
     copy(plan.states[0], N, out.states[0])
     for t in range(steps):

@@ -1,9 +1,9 @@
 """Distances between the geoms of a robot and those of obstacles, by MuJoCo's `mj_geomDistance`. The kernels' subset.
 
-`data` has the address of what `mjcf_dynamics.py` calls p, how many rows and how many pairs of geoms there are, the
-largest distance of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's
-geom, how far both reach from their middles together, and whether the obstacle is a plane. A row is the least distance
-of its pairs. Pairs whose bounding spheres are farther apart than that are not looked at.
+`data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
+of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's geom, how far both
+reach from their middles together, and whether the obstacle is a plane. A row is the least distance of its pairs. Pairs
+whose bounding spheres are farther apart than that are skipped.
 """
 
 from math import sqrt
@@ -53,7 +53,7 @@ def distances_jacobian(x, data, out, slopes):
 def distances_of(count, states, each, displaced, moved, data, out, which, segments):
     """Write the distances, row by row, at states (count, N).
 
-    If obstacles have moved, each of so many states has the same displaced, three numbers a row.
+    If obstacles have moved, the same displacements, three numbers a row, hold for `each` consecutive states.
     """
     rows = int(data[1])
     for i in range(count):
@@ -111,7 +111,7 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
 def look(p, one, data, displaced, moved, first, out, which, segments):
     """As `find`, of an MjData that has its positions.
 
-    Where obstacles have moved, which is told by moved from 0 on, it is by displaced[moved + 3 row] and what follows.
+    If `moved` is not negative, obstacles are displaced by the three numbers from displaced[moved + 3 row] on.
     """
     middles, axes, segment = at(one[GEOM_XPOS]), at(one[GEOM_XMAT]), stack(6)
     for row in range(int(data[1])):

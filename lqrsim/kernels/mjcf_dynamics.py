@@ -24,30 +24,30 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
-# Where p has what. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
-# slot, where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step,
-# mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
-# physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
-# is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# what lets others run; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
-# mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and places in qpos and qvel,
-# three numbers each.
+# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which slot,
+# where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step, mj_forwardSkip
+# and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the physics, in s.
+# NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those is that the
+# controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of the
+# function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
+# mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and
+# places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
 RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, TABLE = 22, 23, 24, 25, 26, 27
 
-# What a slot has of each of its two MjData: addresses.
+# Addresses that a slot has for each of its two MjData.
 SLOT, SIZE = 24, 12
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 # The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
-# many are done, whether to stop, how many helpers there are.
-BUSY, TICKET, DONE, STOP, HELPERS = 0, 1, 2, 3, 4
+# many are done, whether to stop, how many helpers there are, whether a signal came: then all steps are NaN.
+BUSY, TICKET, DONE, STOP, HELPERS, SIGNALLED = 0, 1, 2, 3, 4, 5
 JOBS = 65536  # the ticket is JOBS * job + column
 PATIENT = 2000  # looks at the ticket before a helper lets others run
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
-LARGEST = 1e10  # MuJoCo's mjMAXVAL: what is beyond is no state of anything
+LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are no valid state
 
 
 def advance(x, u, p, h, out):
@@ -66,8 +66,7 @@ def advance(x, u, p, h, out):
 def step_jacobian(x, u, p, h, out, jacobian):
     """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
 
-    If there are helpers and nobody has them, they do columns, too; which thread did one makes no difference to the
-    last bit.
+    Free helpers compute columns, too; the bits do not depend on which thread computed one.
     """
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
@@ -115,9 +114,9 @@ def step_jacobian(x, u, p, h, out, jacobian):
 
 
 def help_out(p):
-    """Do columns of what others linearise about, until told to stop.
+    """Compute columns for the threads that linearise, until told to stop.
 
-    A column is taken first and its job looked at then: as long as it is not done, nobody writes another job.
+    A thread takes a column first, and reads its job afterwards: until the column is done, nobody writes another job.
     """
     team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
     address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)
@@ -144,12 +143,12 @@ def help_out(p):
 
 
 def job_columns(p):
-    """Where the columns of a job go: rows of W numbers."""
+    """Destination of a job's columns: rows of W numbers."""
     return rows_at(p[JOB] + 8 * (1 + W + 6), W)
 
 
 def run(z, p, wrench, substeps, two, out):
-    """Write where so many physics steps lead."""
+    """Write the state after this number of physics steps."""
     write_to(z, p, two)
     begin(p, wrench, two)
     for _ in range(substeps):
@@ -169,9 +168,10 @@ def linearize_here(z, p, wrench, address, warm):
 
 
 def column(k, z, p, wrench, substeps, address, warm, jacobian):
-    """Write a column of the Jacobian: the k-th, of the controls first, which leave the stage of velocities as it is.
+    """Write the k-th column of the Jacobian. Controls come first: they do not change the stage of velocities.
 
-    What a perturbed velocity or control does not change of the first physics step, the stage of positions, is kept.
+    A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
+    reused.
     MuJoCo's solver starts at the solution of the step that is not perturbed, so that both sides end equally near to
     their own: its tolerance is not divided by the difference.
     """
@@ -200,12 +200,14 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
 def steps_in(x, u, p, h, z):
     """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN.
 
-    Writes the state and the control one after the other, (W,).
+    0, too, once a signal came. Writes the state and the control one after the other, (W,).
     """
     for i in range(W):
         z[i] = x[i] if i < N else u[i - N]
         if not abs(z[i]) < LARGEST:
             return 0
+    if p[TEAM] != 0 and load(p[TEAM], SIGNALLED) != 0:
+        return 0
     return int(h / p[TIMESTEP] + 0.5) if h > 0 else 0
 
 
@@ -262,7 +264,7 @@ def start_from(p, one, guess):
 
 
 def step_from(z, p, one, two, guess, kept):
-    """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
+    """A physics step to `two`; it reuses the stages of `one` that the state and control share."""
     write_to(z, p, one)
     start_from(p, one, guess)
     call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(kept), int32(1))
@@ -323,7 +325,7 @@ def write_quaternion(x, first, qpos, q):
 
 
 def rotation_vector_near(qpos, q, near, first, out):
-    """Write the rotation vector of a quaternion to out[first], of all those the one nearest to that of `near`."""
+    """Write the rotation vector of a quaternion to out[first]: the one nearest to that of `near`."""
     sine, along, length = 0.0, 0.0, 0.0
     for i in range(3):
         sine += qpos[q + 1 + i] * qpos[q + 1 + i]

@@ -1,7 +1,7 @@
-"""Where MuJoCo has the balls of a robot: points fixed to bodies of an MJCF. The kernels' subset.
+"""The places of a robot's balls in MuJoCo: points fixed to bodies of an MJCF. The kernels' subset.
 
-`data` has the address of what `mjcf_dynamics.py` calls p, how many balls there are, on how many of the states they
-depend, and of each the number of its body and its place in the axes of that. It goes with functions of that module.
+`data` has the address that `mjcf_dynamics.py` calls p, the number of balls, the number of states that they depend on,
+and for each ball the number of its body and its place in the body's axes. It goes with functions of that module.
 """
 
 from lqrsim.kernels.declarations import N, at, call, stack, store

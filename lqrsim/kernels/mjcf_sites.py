@@ -1,6 +1,6 @@
 """How far a site of an MJCF is from a place, and how far it is turned from an orientation. The kernels' subset.
 
-`data` has the address of what `mjcf_dynamics.py` calls p, the site's body, its place and axes (3 x 3) in those of the
+`data` has the address that `mjcf_dynamics.py` calls p, the site's body, its place and axes (3 x 3) in those of the
 body, and the place and axes where it is wanted. The rows are three of the place, in the world's axes, and three of the
 rotation vector that turns the wanted axes to the site's; either or both.
 """
@@ -30,7 +30,7 @@ from lqrsim.kernels.rotation_ratios import cotangent_ratio
 
 PLACED = 1  # whether there are rows of the place
 TURNED = 1  # whether there are rows of the orientation
-BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # where data has what
+BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # layout of data
 
 
 def errors(x, data, out):
@@ -108,7 +108,7 @@ def write_errors(one, data, out, point):
 
 
 def write_inverse(out, first, inverse):
-    """Write what takes an angular velocity in the wanted axes to the rate of the rotation vector."""
+    """Write the matrix from an angular velocity in the wanted axes to the rate of the rotation vector."""
     a, b, c = out[first], out[first + 1], out[first + 2]
     square = a * a + b * b + c * c
     ratio = cotangent_ratio(square)

@@ -40,7 +40,7 @@ def cost_value(x, u, t, cost):
 
 
 def cost_added(x, u, t, cost):
-    """What the augmented Lagrangian adds to the cost for constraints."""
+    """The terms of the augmented Lagrangian for constraints."""
     total, constraints = 0.0, cost.constraints
     for k in range(constraints.size):
         total += call_for_value(
@@ -86,7 +86,7 @@ def cost_alone(x, u, t, cost, share, hessian, gradient):
 
 
 def augment_cost(x, u, t, cost, hessian, gradient):
-    """Add the quadratic model of what the augmented Lagrangian adds for constraints; return its value."""
+    """Add the quadratic model of the augmented Lagrangian's terms for constraints; return their value."""
     total, constraints = 0.0, cost.constraints
     for k in range(constraints.size):
         total += call_for_value(

@@ -38,7 +38,8 @@ MORE = 3  # further steps at most, while the smoothed states are not at the plan
 def newton_iterations(first, last, settings, model, work, memory, log):
     """Newton steps from the plan, each of which lowers its merit.
 
-    A step of which no fraction lowers the merit is tried again without the second order; then the method has stalled.
+    If no fraction of a step lowers the merit, it is tried again without the second order; if that fails too, the method
+    has stalled.
     At the end, the value functions are those of smoothing, without the second order: convex, so that the minimum of
     their sum is at the plan. Where it is not, up to MORE further steps follow: in flat directions a plan may be far off
     though the predicted decrease is small.
@@ -95,7 +96,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
 def newton_pass(settings, model, work, memory):
     """A pass about the plan, with the largest share of the second order, up to the memory's, that has a minimum.
 
-    Where even convex models have none, as where a control costs nothing, changes of the controls get a weight.
+    Where even convex models have none, for example where a control costs nothing, changes of the controls get a weight.
 
     Args:
       work: SmootherArrays. The policy is written, relative to the plan; so is `x_hat`, where the start is to move. The

@@ -88,7 +88,7 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
     Args:
       risk: (2,); the second entry is written: 1 where the risk is too high. The Hessian is then made indefinite, so
         that the pass fails.
-      convex: 1 to keep what is added positive semidefinite with a negative risk, too.
+      convex: 1 to keep the added terms positive semidefinite with a negative risk, too.
     """
     values, slopes = stack(COUNT, SIZE), zeros(SIZE, COUNT, PADDED_COUNT)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)

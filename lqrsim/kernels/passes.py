@@ -1,4 +1,4 @@
-"""The passes of LQR smoothing. The kernels' subset; `records.py` has what they are given.
+"""The passes of LQR smoothing. The kernels' subset; `records.py` has their arguments.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
@@ -123,7 +123,7 @@ def backward_pass(settings, model, about, work):
 
 
 def opening_pass(steps, guided, guess, prior, model, policy, to_go):
-    """A backward pass before there is a cost-to-come: it linearises about minimisers of the cost-to-go alone.
+    """A backward pass before there is a cost-to-come: it linearises about the minimisers of the cost-to-go.
 
     From the minimiser of c_l, first quadratised at the guess, the dynamics run backwards with the guessed controls.
     With `guided`, the pass linearises about the guess.

@@ -116,7 +116,7 @@ class CostToCome(NamedTuple):
 
 
 class SmootherGains(NamedTuple):
-    """What leads from the smoothed state at t + 1 to the state and control at t.
+    """The maps from the smoothed state at t + 1 to the state and control at t.
 
     In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`. In the
     primal form the control is `control_gain x + control`, the inverse policy, and the others are not used.
@@ -154,8 +154,8 @@ class ModelOrder(NamedTuple):
 
     Attributes:
       damping: weight on changes of the controls.
-      share: of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for Newton's,
-        with true Hessians of the costs, and those of the dynamics times the costate.
+      share: share of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
+        Newton's, with true Hessians of the costs, and those of the dynamics times the costate.
       known: the cost-to-go that weighs noise, if `share` is above 0.
     """
 
@@ -172,8 +172,8 @@ class LinearStep(NamedTuple):
 
 
 class NextStep(NamedTuple):
-    """What follows a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there, Hessian (N, N) and
-    gradient at the origin (N,).
+    """The rest of the problem after a step: its Jacobian [A B] (N, W), the next state (N,), and the cost-to-go there,
+    Hessian (N, N) and gradient at the origin (N,).
     """
 
     jacobian: Arrays
@@ -236,7 +236,7 @@ class ActiveRows(NamedTuple):
       table: (size, 6) properties of each row; see `active_set.py`.
       live, held: ((T+1) size,) 1 for rows that act, and for those in the active set, else 0.
       numbers: their values. force: their multipliers. pressing: their multipliers after a step.
-      wrong: how far a row is on the wrong side after a step, relative, negative; else 0.
+      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
     """
 
     size: int
@@ -341,7 +341,7 @@ class IlqrArrays(NamedTuple):
 
 
 class Predictor(NamedTuple):
-    """What predicts estimates over a control period; see `estimation.py`.
+    """The model that predicts estimates over a control period; see `estimation.py`.
 
     Attributes:
       dynamics, dt: as in `ProblemModel`. places: (P,) indices of the unknown parameters.
@@ -402,5 +402,5 @@ MEMORY = _row(
 # A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")
 
-# What `certificate.certify` writes; see there.
+# The results of `certificate.certify`.
 CERTIFICATE = _row("cost", "scale", "dynamics_residual", "policy_residual", "beyond_limits", "decrease")

@@ -1,6 +1,6 @@
-"""`1/2 sum of weight * error^2` of errors that a model brings. The kernels' subset.
+"""`1/2 sum of weight * error^2` for errors from a model. The kernels' subset.
 
-`data` has what the errors read, and from AT on a weight for each. `places` and `places_jacobian` are the errors here.
+`data` has the data of the errors, and from AT on a weight for each. `places` and `places_jacobian` are the errors here.
 """
 
 from lqrsim.kernels.declarations import N, places, places_jacobian, stack

@@ -45,7 +45,7 @@ def noise_cost(steps, plan, model, to_go):
 
 
 def plan_cost(steps, plan, model, to_go):
-    """The cost of a trajectory with the expected cost of noise, and what the augmented Lagrangian adds to it."""
+    """The cost of a trajectory with the expected cost of noise, and the augmented Lagrangian's terms."""
     states, controls = plan.states, plan.controls
     cost, added = cost_value(states[0], controls[0], 0, model.initial), 0.0
     for t in range(steps):
@@ -173,7 +173,7 @@ def larger(a, b):
 def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
 
-    The merit is the true cost, expected where there is noise, and what the augmented Lagrangian adds to it.
+    The merit is the true cost, expected where there is noise, plus the augmented Lagrangian's terms.
 
     Args:
       shift: (N,) of the start. work: its policy has the changes of the controls, about its plan.

@@ -23,7 +23,7 @@ def advance(x, u, p, h, out):
 def chain(fx, fu, previous, a, out):
     """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the Jacobian of one Runge-Kutta stage in (x, u).
 
-    Dynamics with known zeros bring a `chain` of their own; see `write_chain` of `codegen/symbolic.py`.
+    Dynamics with known zeros have a `chain` of their own; see `write_chain` in `codegen/symbolic.py`.
 
     Args:
       fx: (N, N). fu: (N, M). previous: (N, W) of the stage before. a: how far ahead of x the stage is, in s.

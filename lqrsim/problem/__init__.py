@@ -1,1 +1,1 @@
-"""What a user states: dynamics, costs, constraints, and the problem made of them."""
+"""The user's problem: dynamics, costs, constraints, and the problem made of them."""

@@ -14,7 +14,9 @@ from lqrsim.scenes.world import World
 
 
 class Clearance(Constraint):
-    """A distance of at least `margin` between the robot and each obstacle, walls included, at the steps.
+    """`distance(x_t, obstacle) - radius >= margin` for each obstacle, walls included, at the steps.
+
+        ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
 
     It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
     the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,
@@ -22,9 +24,10 @@ class Clearance(Constraint):
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
+      radius: radius of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
       balls: the robot's balls, as for an ObstacleCost.
-      geoms: what collides of a robot from an MJCF, as for an ObstacleCost: one distance for each body and obstacle.
+      geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
+        obstacle.
       margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 
@@ -60,9 +63,6 @@ class Clearance(Constraint):
 
         Args:
           margin: as of a Clearance.
-
-        Returns:
-          A Clearance.
         """
         radius = self.radius if self.balls is None and self.geoms is None else None
         return Clearance(self.world, radius=radius, balls=self.balls, geoms=self.geoms, margin=margin)

@@ -15,16 +15,16 @@ from lqrsim.scenes.world import World
 
 @dataclass(frozen=True)
 class GeomDistances:
-    """Distances between parts of a robot and obstacles, made for one system: what gets compiled, and what it reads.
+    """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
 
     Attributes:
       source: defines `distances(x, data, out)`, which writes one number a row, and `distances_jacobian(x, data, out,
         slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
-      parts: what messages call the part of the robot that each row is of. obstacles: the number of the obstacle that
-        each row is to; -1 for the nearest of all.
-      moved: how many of the states the distances depend on, from the first on.
-      functions: what the source calls with `call`; their addresses come first in what it is given.
+      parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle; -1
+        for the nearest of all.
+      moved: number of states, from the first one on, that the distances depend on.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: Source
@@ -45,7 +45,7 @@ class GeomDistances:
 
 
 class CollisionGeoms(abc.ABC):
-    """What collides of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
+    """The colliding geoms of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
 
     `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all of it clear.
     """
@@ -60,10 +60,7 @@ class CollisionGeoms(abc.ABC):
         """Bind the distances to a system.
 
         Args:
-          dynamics: of the robot. world: the obstacles. reach: in metres, the largest distance of interest.
-
-        Returns:
-          The GeomDistances.
+          dynamics: dynamics of the robot. world: the obstacles. reach: in metres, the largest distance of interest.
 
         Raises:
           InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
@@ -76,8 +73,8 @@ class CollisionGeoms(abc.ABC):
         """Signed distances to the obstacles.
 
         Args:
-          dynamics: of the robot. world: the obstacles. states: (..., n). displaced: (K, O, 3), by how much obstacles
-            are elsewhere in each trial, in metres; states are then (K, ..., n).
+          dynamics: dynamics of the robot. world: the obstacles. states: (..., n). displaced: (K, O, 3), by how much
+            obstacles are elsewhere in each trial, in metres; states are then (K, ..., n).
 
         Returns:
           (..., O) in metres.
@@ -91,7 +88,7 @@ class CollisionGeoms(abc.ABC):
         """Signed distances to the obstacles, and their derivatives in the states.
 
         Args:
-          dynamics: of the robot. world: the obstacles. states: (K, n).
+          dynamics: dynamics of the robot. world: the obstacles. states: (K, n).
 
         Returns:
           (K, O) in metres and (K, O, n).
@@ -105,7 +102,7 @@ class CollisionGeoms(abc.ABC):
         """Whether these are the geoms of that scene, with its obstacles.
 
         Args:
-          scene: of a plant.
+          scene: the scene of a plant.
 
         Returns:
           Whether they are.

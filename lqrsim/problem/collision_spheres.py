@@ -35,7 +35,7 @@ from lqrsim.scenes.world import SPACE, World
 
 @dataclass(frozen=True)
 class SphereCenters:
-    """Where balls are, made for one system: what gets compiled, and the numbers it reads.
+    """Places of balls, made for one system: the source to compile, and its data.
 
     Attributes:
       source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
@@ -43,8 +43,9 @@ class SphereCenters:
         not zero, to zeros. As the source of a `costs.CostTerm`.
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
-      in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
-      functions: what the source calls with `call`; their addresses come first in what it is given.
+      in_plane: whether the places are in the plane of the robot's position, with third coordinate 0, instead of in
+        space.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: str | Source
@@ -72,7 +73,7 @@ class SphereCenters:
 
     @property
     def numbers(self) -> int:
-        """How many numbers of the data that compiled code is given are the places'."""
+        """Number of entries in compiled code's data that belong to the places."""
         return len(self.functions) + len(self.data)
 
     def world_seen(self, world: World, space: Coordinates) -> World:
@@ -81,9 +82,6 @@ class SphereCenters:
         Args:
           world: the obstacles.
           space: the coordinates of the states.
-
-        Returns:
-          A World.
         """
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
 
@@ -109,9 +107,9 @@ class CollisionSpheres:
         in a plane, and then they see the world as the position does: see `World.seen_by`. p has the dynamics'
         parameters as attributes.
       radii: (K,) of the balls, in metres.
-      names: of the balls, by which messages call them; by default "ball 0", "ball 1", ....
-      sites: of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that the
-        middle of each is where the formula has it.
+      names: names of the balls, by which messages call them; by default "ball 0", "ball 1", ....
+      sites: names of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that
+        the middle of each is where the formula has it.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
         to slopes (K, 3 or 2, n), which it gets as zeros. Without it they are central differences.
       depends_on: names of the states that the places depend on, for the compiled and the plain level; all by default.
@@ -120,7 +118,7 @@ class CollisionSpheres:
 
     Raises:
       InputError: a radius is negative, there are no balls, names are not one a ball and different, or the level does
-        not fit the function. What `places` returns is looked at when it is first needed.
+        not fit the function. The result of `places` is checked when it is first needed.
     """
 
     def __init__(
@@ -159,7 +157,7 @@ class CollisionSpheres:
             self.depends_on = check_items("CollisionSpheres: depends_on", depends_on, str, "a tuple of names of states")
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
-        """What each ball has, checked."""
+        """The attributes of each ball, checked."""
         self.radii = check_array("CollisionSpheres: radii", radii, (None,))
         count = len(self.radii)
         if not count:
@@ -185,14 +183,14 @@ class CollisionSpheres:
 
     @property
     def name(self) -> str:
-        """What messages call the function."""
+        """The function's name in messages."""
         return f"{name_of(self.function)}(x, p)"
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
         """Bind the places to a system.
 
         Args:
-          dynamics: of the system whose states move the balls.
+          dynamics: dynamics of the system whose states move the balls.
 
         Returns:
           The `SphereCenters`.
@@ -267,7 +265,7 @@ class CollisionSpheres:
         return SphereCenters(source, dynamics.data, axes, size == 2, functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
-        """How many coordinates a compiled or plain function returns of each ball, which is seen by trying it."""
+        """The number of coordinates that a compiled or plain function returns for each ball, found by calling it."""
         plain: Any = getattr(self.function, "py_func", self.function)
         p = symbolic.Parameters(**dynamics.parameters)
         try:
@@ -294,10 +292,10 @@ class CollisionSpheres:
     def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
         """The middle of each ball, (..., K, 3), at states (..., n), in the world and in metres.
 
-        Of places in a plane that is seen from above, the height is 0.
+        Places in a plane that is seen from above have height 0.
 
         Args:
-          dynamics: of the system whose states move the balls.
+          dynamics: dynamics of the system whose states move the balls.
           states: (..., n).
 
         Returns:
@@ -313,7 +311,7 @@ class CollisionSpheres:
 def check_outline(
     field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
 ) -> float:
-    """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest; of geoms, 0.
+    """The radius that is kept clear of obstacles, checked: of balls, that of the largest; of geoms, 0.
 
     Raises:
       InputError: it is negative, these are no balls or geoms, or it is not one of the three.
@@ -349,7 +347,7 @@ def bind_outline(
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
-    """Where so many balls are, compiled: (..., count, 3) at states (..., n), as `places` has it."""
+    """Places of this number of balls, compiled: (..., count, 3) at states (..., n), as `places` has it."""
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))
@@ -358,7 +356,9 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
 
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
-    """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
+    """Places of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states (K,
+    n).
+    """
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
     _call(places, "jacobians_of", flat, out, slopes)
@@ -366,7 +366,7 @@ def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[A
 
 
 def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> None:
-    """Call a function of `kernels/sphere_centers.py`; what a user's function raises comes through."""
+    """Call a function of `kernels/sphere_centers.py`; exceptions of a user's function pass through."""
     filled = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
     data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
@@ -389,9 +389,11 @@ def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states
 
 
 def _points(returned: Any, count: int) -> list[list[Any]]:
-    """What a function returned, as points. Raises InputError unless they are so many, of 2 or 3 coordinates alike."""
+    """The points that a function returned. Raises InputError unless their number is right and all have 2, or all 3,
+    coordinates.
+    """
     if returned is None:
-        raise InputError("got None, want the middle of each ball: is a return missing?")
+        raise InputError("got None, want the centre of each ball: is a return missing?")
     listed = returned.tolist() if hasattr(returned, "tolist") else returned
     try:
         points = [point.tolist() if hasattr(point, "tolist") else list(point) for point in listed]

@@ -1,4 +1,4 @@
-"""What a plan must keep to, besides the limits of the controls: numbers that are not to be negative, or to be zero.
+"""Constraints on a plan besides the limits of the controls: numbers that must be nonnegative, or zero.
 
 To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Constraint` and write `bind`.
 """
@@ -37,22 +37,22 @@ STEPS = ("all", "final")  # at which a constraint can act
 
 @dataclass(frozen=True)
 class ConstraintTerm:
-    """A constraint, made for one system: so many numbers at each step that are not to be negative, or are to be zero.
+    """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
 
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
         gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.CostTerm`.
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
-      rows: how many numbers there are at a step.
-      describe: what a message calls a row.
+      rows: number of entries at a step.
+      describe: returns the name of a row for messages.
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
-      equality: whether they are to be zero.
-      final_only: whether they act at the last step alone.
+      equality: whether the entries must be zero.
+      final_only: whether they act only at the last step.
       shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
         source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
         these numbers (shared,) and their derivatives (shared, n) in place of x and u.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: str | Source
@@ -93,7 +93,7 @@ class Constraint(abc.ABC):
         """Bind the constraint to a system.
 
         Args:
-          dynamics: of the system.
+          dynamics: dynamics of the system.
 
         Returns:
           The ConstraintTerm that solvers use.
@@ -116,27 +116,29 @@ class Constraint(abc.ABC):
 
         Args:
           steps: how many steps are over.
-
-        Returns:
-          A Constraint.
         """
         check_count("steps", steps, at_least=0)
         return self
 
 
 class SymbolicConstraint(Constraint):
-    """A constraint stated as a formula.
+    """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
+
+        def slower_than_2(x, u, p):  # a planar speed, in m/s
+            return p.speed**2 - x[2] ** 2 - x[3] ** 2
+
+        ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 
     One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
     the last, too, but not at a start that is given exactly, which cannot change.
 
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
-        are not to be negative. All of them depend on u, or none does. They are solved for to one tolerance, so their
-        units are best such that numbers about 1 matter.
+        must be nonnegative. All of them depend on u, or none does. They are solved for to one tolerance, so their units
+        are best such that numbers about 1 matter.
       parameters: name -> value, as in `Dynamics`.
-      equality: the expressions are to be zero, and are to 1e-6, or to `constraint_tolerance` where that is smaller.
-      at: "all" steps, or the "final" one alone, where it must not depend on u.
+      equality: whether the expressions must be zero; they are to 1e-6, or to `constraint_tolerance` if that is smaller.
+      at: "all" steps, or only the "final" one, where it must not depend on u.
     """
 
     def __init__(
@@ -190,7 +192,7 @@ class SymbolicConstraint(Constraint):
     def _trace(self, n: int, m: int) -> dict[str, Any]:
         traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
         if not traced:
-            raise InputError(f"{self.name}: got no entries, want at least one: what is not to be negative, or zero")
+            raise InputError(f"{self.name}: got no entries, want at least one: each must be nonnegative, or zero")
         parts, choices = [], {"value": [], "slope": []}
         for row, entry in enumerate(traced):
             if not entry.free_symbols & {*x, *u}:
@@ -212,11 +214,13 @@ class SymbolicConstraint(Constraint):
 
 
 class GoalState(Constraint):
-    """The final state equals a goal, exactly; where a cost only draws it there.
+    """The final state equals a goal: `x_T = goal`. A final cost only draws it there.
+
+        ls.GoalState([1.0, 0.0], states=("x", "velocity"))
 
     Args:
-      goal: (n,) the state, or with `states` as many numbers, in the states' units. Angles count whole turns, as for a
-        QuadraticCost.
+      goal: (n,) the state, or with `states` one number for each, in the states' units. Angles count whole turns, as for
+        a QuadraticCost.
       states: names of the states that it is for; all by default.
     """
 
@@ -227,7 +231,7 @@ class GoalState(Constraint):
             raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
 
     def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
-        """What is asked of which state, by its index. Raises InputError if it does not fit."""
+        """The required value or bounds of each state, by its index. Raises InputError if it does not fit."""
         names = dynamics.state_coordinates.names
         wanted = names if self.states is None else self.states
         if len(self.goal) != len(wanted):
@@ -247,7 +251,9 @@ class GoalState(Constraint):
 
 
 class StateBounds(Constraint):
-    """Bounds on states, kept at each step; only at a start that is given exactly they do not act.
+    """Bounds on states, `low <= x_t <= high`, at each step; only at a start that is given exactly they do not act.
+
+        ls.StateBounds(low={"height": 0.1}, high={"height": 2.0, "velocity": 1.5})
 
     Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
@@ -269,7 +275,7 @@ class StateBounds(Constraint):
         return self._bind_to_goal(dynamics, {}, 0)
 
     def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
-        """As `bind`, where some states, by their indices, must be at a goal after so many steps.
+        """As `bind`, where some states, by their indices, must be at a goal after this number of steps.
 
         Raises:
           InputError: a goal is outside the bounds.
@@ -289,7 +295,9 @@ class StateBounds(Constraint):
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
-    """What all GoalStates ask of which state, by its index. Raises InputError if two contradict each other."""
+    """The values that all GoalStates require, by the index of the state. Raises InputError if two contradict each
+    other.
+    """
     goals: dict[int, float] = {}
     for constraint in constraints:
         for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
@@ -316,13 +324,15 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:
-    """By how much the worst of a constraint's values is missed; 0 where none is, infinite if one is NaN."""
+    """The largest violation of a constraint, given its values; 0 if there is none, infinite if one is NaN."""
     missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
     return missed if not np.isnan(missed) else np.inf
 
 
 def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
-    """The violation that is none. Where `tolerance` is aimed at to spare, inequalities may not be missed at all."""
+    """The largest violation that counts as none. Where `tolerance` is a margin, inequalities may not be violated at
+    all.
+    """
     if term.equality:
         return min(tolerance, EQUALITY_TOLERANCE)
     return 0.0 if spared else tolerance

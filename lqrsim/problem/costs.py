@@ -51,10 +51,10 @@ class CostTerm:
       nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
         sum of all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
-      factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
+      factor: index in `data` of a number that the whole term is proportional to, if it may be reduced in the first
         iterations; see `InitialPrior`. None where there is none.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
-      exact_hessian: whether the Hessian is all of it. Where a part is left out on purpose, `check_derivatives` does not
+      functions: functions that the source calls with `call`; their addresses come first in its data.
+      exact_hessian: whether the Hessian is complete. Where a part is left out on purpose, `check_derivatives` does not
         compare it with differences.
     """
 
@@ -93,7 +93,7 @@ class Cost(abc.ABC):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return type(self).__name__
 
     @abc.abstractmethod
@@ -101,7 +101,7 @@ class Cost(abc.ABC):
         """Bind the cost to a system.
 
         Args:
-          dynamics: of the system.
+          dynamics: dynamics of the system.
 
         Returns:
           The CostTerm that solvers use.
@@ -124,7 +124,7 @@ class Cost(abc.ABC):
 
 
 class CostSum(Cost):
-    """What `+` makes: the terms, in order."""
+    """The result of `+`: the terms, in order."""
 
     def __init__(self, terms: tuple[Cost, ...]) -> None:
         self.terms = terms
@@ -134,7 +134,7 @@ class CostSum(Cost):
 
 
 def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
-    """The terms of a sum; a single cost is its own. Raises InputError for what is no cost."""
+    """The terms of a sum; a single cost is its own. Raises InputError for an object that is no cost."""
     if isinstance(cost, CostSum):
         return cost.terms
     if not isinstance(cost, Cost):
@@ -185,15 +185,16 @@ class ObstacleCost(Cost):
     Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
     the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
 
-    Of a robot of several balls it is the sum over these, too. The Hessian is then that in the balls' places, taken to
-    the states by the first derivatives of the places; their second derivatives are left out.
+    For a robot of several balls it is also the sum over the balls. The Hessian is then that in the balls' places, taken
+    to the states by the first derivatives of the places; their second derivatives are left out.
 
     Args:
       world: the obstacles.
-      radius: of the robot at its position, in metres.
+      radius: radius of the robot at its position, in metres.
       balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
-      geoms: what collides of a robot from an MJCF, as `robot.geoms`, at MuJoCo's distances: the sum is over its bodies
-        and the obstacles, and what is farther away than 16 / sharpness costs nothing. One of radius, balls and geoms.
+      geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances: the sum is over its
+        bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. Give one of radius, balls
+        and geoms.
       sharpness: in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """
@@ -220,9 +221,6 @@ class ObstacleCost(Cost):
 
         Args:
           weight: cost of touching one obstacle, with one ball, for one step.
-
-        Returns:
-          An ObstacleCost.
         """
         radius = self.radius if self.balls is None and self.geoms is None else None
         return ObstacleCost(
@@ -335,7 +333,7 @@ class SymbolicCost(Cost):
 
 
 class FunctionCost(Cost):
-    """A cost given as a numba or a plain Python function, for what `SymbolicCost` cannot express.
+    """A cost given as a numba or a plain Python function, where `SymbolicCost` cannot express it.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.

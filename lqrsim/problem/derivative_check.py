@@ -1,19 +1,22 @@
-"""Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
+"""Checks the values and derivatives of a user's functions: before the first iteration, and where derivatives are in
+doubt.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.user_functions import UserFunction, address_of, brief, plain_calls
-from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
+from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.fields import Line, check_fields
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
@@ -70,7 +73,7 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
 
 
 def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
-    """The cost terms, with what messages call them."""
+    """The cost terms, with their names in messages."""
     for name in ("initial", "stage_cost", "final_cost"):
         cost = getattr(problem, name)
         if not isinstance(cost, FixedState):
@@ -86,7 +89,7 @@ def evaluate(term: CostTerm, dynamics: Dynamics, x: Array, u: Array) -> tuple[fl
 
 
 def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
-    """What a term's source defines, as plain Python, and the data that it is given."""
+    """A term's functions as plain Python, and its data."""
     first = term.functions[:1]
     parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
     wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
@@ -99,7 +102,8 @@ def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[
 def _constraints(
     problem: Problem,
 ) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
-    """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
+    """The constraints' numbers in plain Python: the name of each in messages, its value and its slope (n+m,) at (x,
+    u)."""
     n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
     for term in problem.constraint_terms:
         names, data = _run_plainly(term, n, m)
@@ -139,27 +143,21 @@ class DerivativeCheck:
       difference: the difference quotient there.
       state: (n,), where that was.
       control: (m,), where that was.
-      tolerance: what the error must not exceed.
+      tolerance: the largest acceptable error.
     """
 
-    what: str
+    what: Line
     error: float
-    row: str
-    column: str
+    row: Line
+    column: Line
     stated: float
     difference: float
-    state: Array
-    control: Array
+    state: Annotated[Array, "n"]
+    control: Annotated[Array, "m"]
     tolerance: float
 
     def __post_init__(self) -> None:
-        for name in ("what", "row", "column"):
-            check_text(f"DerivativeCheck: {name}", getattr(self, name), at_most=1000)
-        for name in ("error", "stated", "difference", "tolerance"):
-            object.__setattr__(self, name, float(shaped(f"DerivativeCheck: {name}", getattr(self, name), ())))
-        for name in ("state", "control"):
-            numbers = real(f"DerivativeCheck: {name}", getattr(self, name))
-            object.__setattr__(self, name, shaped(f"DerivativeCheck: {name}", numbers, (None,)))
+        check_fields(self)
 
     @property
     def good(self) -> bool:
@@ -181,15 +179,15 @@ def check_derivatives(
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
     Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
-    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, for theirs are
-    central differences themselves.
+    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, because theirs
+    are central differences themselves.
 
     Args:
-      subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
+      subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
       samples: how many points.
       spread: their standard deviation, in the units of states and controls.
-      tolerance: of the error, relative to each entry.
-      seed: of the points.
+      tolerance: tolerance of the error, relative to each entry.
+      seed: seed of the points.
 
     Returns:
       One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
@@ -222,8 +220,8 @@ class _Derivative(NamedTuple):
     """A matrix of derivatives at a point.
 
     Attributes:
-      what: as messages call it. rows, columns: names.
-      stated: by the function that is checked. differences: what `_differences` returns.
+      what: its name in messages. rows, columns: names.
+      stated: derivatives from the function that is checked. differences: the result of `_differences`.
       x, u: the point.
     """
 

@@ -30,11 +30,12 @@ from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functi
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
-LONGEST = 1500  # operations of a formula whose second derivatives are derived: that takes up to some five seconds
+# Most operations of a formula whose second derivatives are derived, which takes up to about five seconds.
+LONGEST = 1500
 
 
 class Dynamics:
-    """`xdot = f(x, u)`: Eq. (1), with what its states and controls mean.
+    """`xdot = f(x, u)`: Eq. (1), with the meaning of its states and controls.
 
     A pendulum, swung by a motor:
 
@@ -51,8 +52,8 @@ class Dynamics:
 
     The same function can be stated at three levels, which differ in speed and in what the function may contain:
 
-      symbolic  called once with SymPy symbols; exact derivatives follow. As fast as it gets, and the default.
-      compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
+      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default. compiled  a
+      numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
                 differences, good to some eight digits, and an iteration takes longer.
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
@@ -62,30 +63,30 @@ class Dynamics:
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
-      disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
-        the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
-        and are not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
+      disturbances: quantities unknown when planning, such as a wind or the remaining share of a motor's force: name ->
+        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants and are
+        not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane: in which plane a position of 2 states is, as "xz"; see `Coordinates`. By default that of the names, if they
-        are two of x, y and z.
+      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they are
+        two of x, y and z.
       offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
-      control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
+      control_limits: lowest and highest control, numbers or (m,); the actuators' range, for execution.
       jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
         that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
 
     Raises:
-      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. What f
-        returns is looked at when it is first needed.
+      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. The result
+        of f is checked when it is first needed.
     """
 
     # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
     discrete: ClassVar[bool] = False
-    # Hash of what else defines the dynamics besides source and parameters; empty for functions.
+    # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
 
     def __init__(
@@ -167,7 +168,7 @@ class Dynamics:
         self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is derived and cannot be pickled."""
+        """Without derived attributes that cannot be pickled."""
         return {
             name: value
             for name, value in vars(self).items()
@@ -176,7 +177,7 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        """What messages call the dynamics: the name of `f`."""
+        """The name of the dynamics in messages: that of `f`."""
         return name_of(self.f)
 
     def with_parameters(self, **values: float) -> "Dynamics":
@@ -185,9 +186,6 @@ class Dynamics:
 
         Args:
           **values: parameter -> number.
-
-        Returns:
-          Dynamics.
 
         Raises:
           InputError: there is no such parameter, or the value is not finite.
@@ -215,7 +213,9 @@ class Dynamics:
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
     def _functions(self) -> tuple[UserFunction, ...]:
-        """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
+        """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there
+        is one.
+        """
         if self.level == "symbolic":
             return ()
         n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
@@ -310,7 +310,7 @@ class Dynamics:
     def _trace_curvature(self) -> dict[str, Any]:
         """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
 
-        Of a formula of more than LONGEST operations there is no source: deriving it would take minutes.
+        A formula of more than LONGEST operations has no source: deriving it would take minutes.
         """
         import sympy
 
@@ -360,9 +360,6 @@ class Dynamics:
 
         Args:
           threads: how many threads the solver may use for one trajectory.
-
-        Returns:
-          A context manager.
         """
         check_count("threads", threads)
         return contextlib.nullcontext()
@@ -388,9 +385,6 @@ class Dynamics:
         Args:
           state: (n,).
           control: (m,).
-
-        Returns:
-          df/dx (n, n) and df/du (n, m).
         """
         x, u = self._check(state, control)
         n, m = len(x), len(u)
@@ -405,9 +399,6 @@ class Dynamics:
           state: (n,).
           control: (m,), held over the step.
           dt: seconds; negative steps lead backwards in time.
-
-        Returns:
-          (n,).
         """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
@@ -421,9 +412,6 @@ class Dynamics:
           state: (n,).
           control: (m,), held over the step.
           dt: seconds.
-
-        Returns:
-          A (n, n), B (n, m) and c (n,).
         """
         x, u = self._check(state, control)
         n, m = len(x), len(u)
@@ -447,14 +435,14 @@ class Dynamics:
         return plain_functions(self.step_source, {"N": n, "M": m, "W": n + m}, names, calls)
 
     def _numbers(self) -> Array:
-        """What `p` is in the compiled functions, with the places of the functions for their addresses."""
+        """The `p` of the compiled functions, with places for the addresses of functions."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
 
 
 def _parameters_of(
     parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Both, checked; where nothing is gained from taking disturbances for constants, they are among the parameters."""
+    """Parameters and disturbances, checked; disturbances that would gain nothing as constants become parameters."""
     own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
     twice = own.keys() & unknown.keys()
     if twice:
@@ -463,7 +451,9 @@ def _parameters_of(
 
 
 def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
-    """The lowest and the highest of each of so many controls. Raises InputError for what is no such pair."""
+    """The lowest and the highest value of each of this number of controls. Raises InputError for anything but such a
+    pair.
+    """
     limits = control_limits if control_limits is not None else (-np.inf, np.inf)
     try:
         low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)

@@ -17,8 +17,8 @@ class Stage:
         step (discrete) or rate (continuous) of x:   A x + B u + c
         cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
 
-    A leading axis of T, if there is one, is time: one stage a step; what has none is the same at each. Everything but
-    A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
+    A leading axis of T, if there is one, is time: one stage a step; an array without it is the same at every step.
+    Everything but A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
 
     Attributes:
       A: (..., n, n).
@@ -66,7 +66,7 @@ class Stage:
                 if field.name in ("A", "R"):
                     raise InputError(f"Stage: {field.name}: got None, want an array of shape {shapes[field.name]}")
                 value = np.zeros(want)
-            with contextlib.suppress(Exception):  # what is ragged or no array has no shape, and is refused below
+            with contextlib.suppress(Exception):  # ragged, or no array: refused below for its shape
                 if time and np.ndim(value) == len(want):  # the same at each step
                     value = np.broadcast_to(value, (*time, *np.shape(value)))
             array = check_array(f"Stage: {field.name}", value, (*time, *want))
@@ -101,7 +101,7 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
 
 
 def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
-    """() for what is ragged and has none."""
+    """() for ragged input, which has none."""
     try:
         return np.asarray(value).shape
     except Exception:  # or raises whatever it likes when it is asked

@@ -1,7 +1,6 @@
 """Noise that dynamics are driven by, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
 
-The same object is what a plan takes into account, `Problem(noise=...)`, and what a trial meets, as one of the
-disturbances of `simulate`.
+The same object serves for planning, as `Problem(noise=...)`, and in trials, as one of the disturbances of `simulate`.
 """
 
 import copy
@@ -37,15 +36,15 @@ MOST = 100  # independent normal numbers
 
 @dataclass(frozen=True)
 class NoiseTerm:
-    """A noise, made for one system: what gets compiled, and the numbers it reads.
+    """A noise, made for one system: the source to compile, and its data.
 
     Attributes:
       source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
         `kernels/declarations.py`.
       data: (any,) the parameters or the matrix, then the strength.
-      rows: the states that noise acts on at once. size: of w.
+      rows: the states that noise acts on at once. size: number of entries of w.
       active: the entries of (x, u), states before controls, that M depends on.
-      functions: what the source calls with `call`; their addresses come first in the data that it is given.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: Source
@@ -91,7 +90,7 @@ class Noise:
       level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
 
     Raises:
-      InputError: an argument is not as described. What the function returns is looked at when it is first needed.
+      InputError: an argument is not as described. The result of the function is checked when it is first needed.
     """
 
     def __init__(
@@ -130,7 +129,7 @@ class Noise:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return "a matrix" if self.matrix is not None else f"{name_of(self.function)}(x, u, p)"
 
     def __repr__(self) -> str:
@@ -175,10 +174,10 @@ class Noise:
         """The noise for a system.
 
         Args:
-          dynamics: of the system, with its states and controls.
+          dynamics: dynamics of the system, with its states and controls.
 
         Returns:
-          What gets compiled, and the numbers that it reads.
+          The source to compile, and its data.
 
         Raises:
           InputError: the noise does not fit the system.
@@ -228,7 +227,7 @@ class Noise:
         return {"source": "\n\n".join(source), "rows": rows, "active": active}
 
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
-        """What the function returned, as n rows. Raises InputError for another shape."""
+        """The result of the function, as n rows. Raises InputError for another shape."""
         wanted = f"{n} rows, one a state, of {self.size} entries"
         if returned is None:
             raise InputError(f"got None, want {wanted}: is a return missing?")
@@ -263,7 +262,7 @@ class Noise:
         """M at given states and controls.
 
         Args:
-          dynamics: of the system, with its states and controls.
+          dynamics: dynamics of the system, with its states and controls.
           states: (K, n).
           controls: (K, m).
 
@@ -292,5 +291,5 @@ class Noise:
 
 
 def numbers_of(term: NoiseTerm) -> Array:
-    """What its source reads: the addresses of its functions, then its own numbers."""
+    """The data of its source: the addresses of its functions, then its own numbers."""
     return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)

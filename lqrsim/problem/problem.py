@@ -64,24 +64,24 @@ class Problem:
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
-      control_limits: (lowest, highest) control, each a number or (m,); by default what the actuators can do. Infinite
-        ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
-      constraints: what the plan must keep to at the steps; see `SymbolicConstraint`, `GoalState`, `StateBounds` and
-        `Clearance`.
+      control_limits: (lowest, highest) control, each a number or (m,); by default the actuators' range. Infinite ones
+        plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
+      constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
+        `StateBounds` and `Clearance`.
       begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
-      noise: what drives the dynamics besides: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
+      noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
         worked out to second order about the plan. None for none.
-      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
-        runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
-      duration: (shortest, longest) in s: the final time is free. `dt` and `steps` say what a solve begins with, and the
-        solution has a dt of its own, with as many steps. The stage cost is still that of each step, whatever dt is.
-        None for the duration that dt and steps say.
-      time_weight: what a second of a free duration costs. It is not in the solution's cost, whose duration is settled.
+      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
+        risk-averse, below 0 risk-seeking; 0 is the expectation.
+      duration: (shortest, longest) in s: the final time is free. A solve begins with `dt` and `steps`; the solution has
+        as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is. None for the
+        duration that dt and steps say.
+      time_weight: cost of a second of a free duration. It is not in the solution's cost, whose duration is settled.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits out of order or beyond what the actuators can do, or a start
-        that collides.
+        cost that depends on the control, control limits out of order or beyond the actuators' range, or a start that
+        collides.
     """
 
     dynamics: Dynamics
@@ -113,7 +113,7 @@ class Problem:
         costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
             state = check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
-            # Costs nothing, and lets a fixed and a soft start share what is compiled.
+            # A zero cost, with which fixed and soft starts share compiled code.
             costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
         else:
             costs["initial"] = terms_of(self.initial, "initial")
@@ -159,7 +159,7 @@ class Problem:
         return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
-        """The costs for the system. Raises InputError if what is bound is no term."""
+        """The costs for the system. Raises InputError if `bind` does not return a term."""
         return tuple(
             check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
@@ -173,9 +173,6 @@ class Problem:
         Args:
           state: (n,).
           after: how many steps are over.
-
-        Returns:
-          A Problem.
 
         Raises:
           InputError: the state is not one, or no step is left.
@@ -198,11 +195,8 @@ class Problem:
         """The same with other costs. It may begin within an obstacle if this does; see `from_state`.
 
         Args:
-          stage_cost: or None for the one there is.
-          final_cost: or None for the one there is.
-
-        Returns:
-          A Problem.
+          stage_cost: the stage cost, or None for the present one.
+          final_cost: the final cost, or None for the present one.
 
         Raises:
           InputError: a cost does not belong to the system.
@@ -213,7 +207,7 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later begin: moving obstacles are where they are then.
+        """The same problem with a later beginning: moving obstacles are where they are then.
 
         Args:
           seconds: how much later, in seconds.
@@ -225,7 +219,7 @@ class Problem:
         return other._bound_anew() if self.moving else other
 
     def _bound_anew(self) -> "Problem":
-        """The same with all that depends on the steps or on when it begins as it then is."""
+        """The same problem, with everything updated that depends on the steps or on its beginning."""
         stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
         terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
         constraints = bind_all(self.constraints, self.dynamics, self.times)
@@ -234,7 +228,7 @@ class Problem:
     def _with(self, **changed: Any) -> "Problem":
         """The same with other parts, without a check.
 
-        All of it was checked when it was stated, and this is done at every solve of a robot that plans as it goes.
+        Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
         """
         other = copy.copy(self)
         for name, value in changed.items():
@@ -423,17 +417,17 @@ class Problem:
             if distances.min() < -TOUCHING:
                 name = world.names[int(distances.argmin())]
                 raise InputError(
-                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or, where"
-                    f" that is none, obstacles= of the robot without it"
+                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or,"
+                    " if that geom is no obstacle, obstacles= of the robot without it"
                 )
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:
-    """Raises InputError if the actuators can do nothing of what is within the limits."""
+    """Raises InputError if the limits and the actuators' range have nothing in common."""
     sides = zip(limits.names, limits.low, limits.high, actuators.low, actuators.high, strict=True)
     for name, low, high, lowest, highest in sides:
         if not max(low, lowest) < min(high, highest):
             raise InputError(
-                f"control_limits: got {low:g} to {high:g} for {name}, want some of what the actuator can do,"
+                f"control_limits: got {low:g} to {high:g} for {name}, want a range that overlaps the actuator's,"
                 f" {lowest:g} to {highest:g}"
             )

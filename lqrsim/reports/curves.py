@@ -39,7 +39,7 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
 
     Args:
       curves: policy -> strength -> low, middle and high.
-      label: of the vertical axis.
+      label: label of the vertical axis.
     """
     with style.figure(path, size=SIZE) as figure:
         axes = figure.add_subplot()

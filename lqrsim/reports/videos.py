@@ -12,7 +12,7 @@ from lqrsim.stress.results import Results, replay
 from lqrsim.view import gl
 
 LARGEST = 1_500_000  # bytes of a video
-SIZES = (640, 360), (480, 270), (320, 180)  # of which the first is taken whose video is small enough
+SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
 FPS = 15
 
 

@@ -1,1 +1,1 @@
-"""What comes out: solutions, policies, value functions, rollouts, and their files. NumPy only."""
+"""Results: solutions, policies, value functions, rollouts, and their files. NumPy only."""

@@ -45,7 +45,7 @@ class Header(NamedTuple):
 
 
 class Other(InputError):
-    """A file that is intact, but of another format or version."""
+    """An intact file of another format or version."""
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
@@ -77,7 +77,7 @@ class Archive:
 
     Attributes:
       meta: the object of the JSON text, unchecked.
-      headers: of each array; the arrays have not been read yet.
+      headers: headers of each array; the arrays have not been read yet.
     """
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
@@ -112,7 +112,7 @@ class Archive:
             length = int.from_bytes(start[8:10], "little")
             match = _HEADER.fullmatch(file.read(length)) if start[:8] == b"\x93NUMPY\x01\x00" else None
         if match is None:
-            raise InputError(f"{excerpt(name)}: got no array as lqrsim writes it, want one")
+            raise InputError(f"{excerpt(name)}: got an array in another format, want one that lqrsim wrote")
         shape = tuple(int(length) for length in (match[2] or b"").decode().replace(",", " ").split())
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
@@ -141,7 +141,7 @@ class Archive:
 
 @contextlib.contextmanager
 def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
-    """Open a file of this kind, or of any in `versions`; all that the block raises is put down to the file.
+    """Open a file of this kind, or of any in `versions`; any exception in the block is reported as a fault of the file.
 
     Raises:
       InputError: the file does not exist, has another kind or version, or is damaged.

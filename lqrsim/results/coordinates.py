@@ -31,8 +31,8 @@ class Coordinates:
     """The meaning of the entries of a vector.
 
     Attributes:
-      names: of the entries.
-      units: of the entries; "" for none.
+      names: names of the entries.
+      units: units of the entries; "" for none.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
         without a position, and two of x, y and z for a planar one. By default it follows from names that end in these
@@ -158,9 +158,6 @@ class Coordinates:
           places: (..., d), d position coordinates in metres.
           height: in metres, of positions in a horizontal plane without a height.
 
-        Returns:
-          Points (..., 3).
-
         Raises:
           InputError: not numbers of such a shape, or there is no position.
         """
@@ -259,9 +256,6 @@ class Coordinates:
 
         Args:
           other: coordinates of as many entries.
-
-        Returns:
-          Coordinates with the narrower limits.
 
         Raises:
           InputError: the numbers of entries differ, or nothing is within both limits.

@@ -41,11 +41,11 @@ class Bounds(NamedTuple):
 
 
 class Declared(NamedTuple):
-    """What an annotation says of a field.
+    """The content of a field's annotation.
 
     Attributes:
-      kinds: of which one is meant; what `typing` names them by.
-      dtype: of an array, float64 or int64; None for anything else.
+      kinds: the kinds that are allowed; `typing`'s names.
+      dtype: type of an array, float64 or int64; None for anything else.
       letters: the shape of an array, or the length of something else; empty where none is said.
       longest: characters of a text that is one printable line; None for any text.
       optional: whether it may be None.
@@ -80,14 +80,14 @@ def check_fields(record: Any) -> Sizes:
 
 @cache
 def declarations(kind: type) -> dict[str, Declared]:
-    """What is declared of each field of a record, but for those that are no part of its value (`compare=False`)."""
+    """The declaration of each field of a record, except those that are no part of its value (`compare=False`)."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: declared(hints[field.name]) for field in fields(kind) if field.compare}
 
 
 @cache
 def declared(annotation: Any) -> Declared:
-    """What an annotation says."""
+    """The content of an annotation."""
     said: list[Any] = []
     optional = False
     kinds: tuple[Any, ...] = (annotation,)
@@ -141,8 +141,12 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
         items = check_items(field, value, object, "a tuple")
         if said.letters:
             _check_length(field, len(items), said.letters, sizes)
-        inner = declared(get_args(kind)[0])
-        return tuple(_checked(f"{field}[{i}]", item, inner, sizes) for i, item in enumerate(items))
+        inner = get_args(kind)
+        each = inner[:1] * len(items) if inner[-1] is Ellipsis else inner
+        if len(each) != len(items):
+            raise InputError(f"{field}: got {len(items)} entries, want {len(each)}")
+        pairs = enumerate(zip(items, each, strict=True))
+        return tuple(_checked(f"{field}[{i}]", item, declared(one), sizes) for i, (item, one) in pairs)
     if origin is not None:  # a Mapping
         value = check_kind(field, value, Mapping, "a dictionary by name")
         inner = declared(get_args(kind)[1])
@@ -200,7 +204,7 @@ def _length_of(letter: str, sizes: Sizes) -> str:
 
 
 def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:
-    """Raises InputError unless something has as many entries as the letter says."""
+    """Raises InputError unless something has the number of entries that the letter stands for."""
     if length != (want := sizes.setdefault(letter, length)):
         raise InputError(f"{field}: got {length} entries, want {want}")
 
@@ -234,7 +238,7 @@ def _number(field: str, value: Any) -> float:
 
 
 def check_string(field: str, value: Any, longest: int | None = None) -> str:
-    """`value` if it is text that a file can hold; with `longest`, one printable line of so many characters.
+    """`value` if it is text that a file can hold; with `longest`, one printable line of at most that many characters.
 
     Lines are printed as they are, and a terminal obeys control characters.
 

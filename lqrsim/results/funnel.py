@@ -35,15 +35,15 @@ class Funnel:
 
     The ellipsoid at a knot is `{plan + e: e' shape^-1 e <= level^2}`. The rate is the share of runs that succeed, over
     states drawn uniformly from the volume of the ellipsoid and over the disturbances. With the stated confidence it is
-    at least `rate` at all knots at once. It says nothing of a single state, nor of other knots, where the level is
-    interpolated; see `level`.
+    at least `rate` at all knots at once. It says nothing about a single state, nor about other knots, where the level
+    is interpolated; see `level`.
 
     T steps, n states, k knots; d of the states may be off the plan, all others are on it.
 
     Attributes:
       plan: nominal states and controls.
-      state_coordinates: what the states are.
-      control_coordinates: what the controls are.
+      state_coordinates: names and units of the states.
+      control_coordinates: names and units of the controls.
       states: names of the d states that may be off the plan.
       shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
@@ -59,9 +59,9 @@ class Funnel:
       policy_digest: hash of the controller.
       goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
       disturbances: a description of each.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       options: the settings of the search.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
 
     Raises:
       InputError: the parts do not fit together, or the trials do not show the rate.
@@ -139,9 +139,6 @@ class Funnel:
         Args:
           t: seconds since the start of the plan.
 
-        Returns:
-          A level.
-
         Raises:
           InputError: `t` is negative or not finite.
         """
@@ -157,9 +154,6 @@ class Funnel:
           x: (..., n).
           t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
-
-        Returns:
-          (...).
 
         Raises:
           InputError: states of another size; `t` is negative or not finite.
@@ -198,9 +192,6 @@ class Funnel:
         Args:
           rollout: K trials of the funnel's plan.
 
-        Returns:
-          (K,).
-
         Raises:
           InputError: the rollout has another plan.
         """
@@ -216,7 +207,7 @@ class Funnel:
         Args:
           knot: number of the knot.
           points: (..., d).
-          level: of the ellipsoid.
+          level: level of the ellipsoid.
 
         Returns:
           (..., n).
@@ -235,7 +226,7 @@ class Funnel:
         """(T+1, p, p) in m^2: its one-sigma ellipsoids are the funnel's projection onto the position.
 
         Raises:
-          InputError: the robot has no position, or some of it is not among `states`.
+          InputError: the robot has no position, or not all of it is among `states`.
         """
         place = self.state_coordinates.position
         names = [self.state_coordinates.names[i] for i in place]
@@ -298,7 +289,7 @@ class Funnel:
 
 
 def flat(shape: Array) -> bool:
-    """Whether an ellipsoid of this shape (d, d) has no volume, whatever the units of its states."""
+    """Whether an ellipsoid of this shape (d, d) has no volume, in any units of its states."""
     size = np.sqrt(np.maximum(np.diagonal(shape), 0.0))
     if not (np.isfinite(shape).all() and (size > 0).all()):
         return True
@@ -306,7 +297,7 @@ def flat(shape: Array) -> bool:
 
 
 def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:
-    """The chance of at most so many failures in independent trials that succeed at this rate."""
+    """The chance of at most this number of failures in independent trials that succeed at this rate."""
     i = np.arange(failures)
     ratios = np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)  # of successive terms
     return float(np.exp(trials * np.log(rate) + np.concatenate([[0.0], np.cumsum(ratios)])).sum())

@@ -40,7 +40,7 @@ class Target:
     """The goal of a run, or the end of its plan where the final cost names no goal.
 
     Args:
-      space: of the states.
+      space: space of the states.
       goal: (n,), NaN in the states that do not count; None if there is none.
       plan: (T+1, n), the planned states.
 
@@ -100,7 +100,7 @@ class Target:
         Args:
           robot_radius: in metres, the default where distances are in metres.
           goal_radius: in metres.
-          goal_tolerance: of the scaled error, TOLERANCE by default.
+          goal_tolerance: bound of the scaled error, TOLERANCE by default.
 
         Raises:
           InputError: one of them is out of range, or is not in the unit of this target.
@@ -148,8 +148,8 @@ def endings(
     """How trials ended, and when. The first event ends a trial; later ones do not count.
 
     Args:
-      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. Of events at the same time
-        the one that is named first counts.
+      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. If events happen at the same
+        time, the one named first counts.
       distance: (K,) from the target at the end. radius: within which it counts as reached. horizon: in seconds.
 
     Returns:

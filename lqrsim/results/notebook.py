@@ -71,7 +71,7 @@ def _page(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], p
     """A heading, remarks, a table and a picture side by side.
 
     Args:
-      rows: of the table.
+      rows: rows of the table.
       head: whether the first row names the columns; otherwise the first column names the rows.
     """
     lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)

@@ -96,9 +96,6 @@ class OutputFeedbackPolicy:
           measurement: (..., Y), angles in any representative; None if it was lost, for a prediction alone.
           t: seconds since the start.
 
-        Returns:
-          Controls (..., m), and z (..., Z) for the next period.
-
         Raises:
           InputError: `t` is negative or not finite, or an array is not finite or has another length.
         """

@@ -46,7 +46,7 @@ class Plan:
         check_fields(self)
         if self.cost_to_go is not None:
             check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
-        _ = self.target  # which refuses what is no goal
+        _ = self.target  # which refuses anything but a goal
         if self.status.success and not self.trajectory.finite:
             raise InputError(
                 f"{who}: trajectory: got NaN or infinity in a plan that is {self.status.name}, want numbers"
@@ -106,13 +106,13 @@ class Replan(Plan):
     """The result of a prepared solver: a plan from a given state, no worse than the rollout of the law it began with.
 
     No worse means: its violation is no larger, and if both keep the constraints, its cost is no higher. It can be used
-    whatever its status, unless `cost` is not finite.
+    with any status, unless `cost` is not finite.
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
-      cost: of the plan, start and end included.
+      cost: cost of the plan, start and end included.
       before: cost of the rollout of the law that the solve began with.
-      violation: of the worst constraint at the steps; 0 where all are kept.
+      violation: violation of the worst constraint at the steps; 0 where all are kept.
       iterations: number of iterations.
       seconds: time that the solve took.
       iterating: part of `seconds` in iterations and in the first rollout.

@@ -59,9 +59,6 @@ class AffinePolicy:
         Args:
           steps: steps that are over.
           horizon: "moving" or "shrinking", as in `Solution.shifted`.
-
-        Returns:
-          An AffinePolicy.
         """
         steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
         filled = check_name("horizon", horizon, HORIZONS) == "moving"
@@ -74,9 +71,6 @@ class AffinePolicy:
         Args:
           state: (..., n), in the nominal's representative.
           step: number of the step, from 0.
-
-        Returns:
-          Controls (..., m), before saturation.
 
         Raises:
           InputError: there is no such step, or the states have another shape.

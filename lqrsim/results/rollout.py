@@ -18,7 +18,7 @@ from lqrsim.results.solution_parts import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class BallRecord:
-    """Where the balls of a robot were in its runs, and where they should have been: what pictures of it need.
+    """Places of a robot's balls in its runs, and in the plan, for pictures.
 
     K trials of T control periods, B balls; the last ball stands for a robot without a position.
 
@@ -71,7 +71,7 @@ class Rollout:
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
         scaled error where the goal has no position.
-      radius: of the robot's collision circle or sphere, in metres.
+      radius: radius of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) states as measured, which the controller gets.
       commanded: (K, T, m) the controller's commands.
@@ -93,9 +93,9 @@ class Rollout:
       frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
       disturbances: a description of each.
-      seed: of the random numbers.
+      seed: seed of the random numbers.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
@@ -159,7 +159,7 @@ class Rollout:
         self._check_endings()
 
     def _check_tube(self) -> None:
-        """Raises InputError unless a predicted tube is covariances of the position."""
+        """Raises InputError unless a predicted tube consists of covariances of the position."""
         if self.tube is not None:
             size = len(self.state_coordinates.position)
             if self.tube.shape[1] != size or not size:
@@ -247,9 +247,6 @@ class Rollout:
         Args:
           places: (..., 2 or 3), in metres.
           height: in metres, of places in a horizontal plane that has no height of its own.
-
-        Returns:
-          Points (..., 3).
         """
         space = self.state_coordinates
         if space.position or self.balls is None:
@@ -312,8 +309,8 @@ class Rollout:
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Which knots count, (K, T+1): those before the trial ended, the last if no event ended it, and always the
-        first.
+        """Mask of the knots that count, (K, T+1): those before the trial ended, the last if no event ended it, and
+        always the first.
 
         They do not depend on whether obstacles stop the robot.
         """

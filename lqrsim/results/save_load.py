@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin, overload
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
-from lqrsim.results.archive import Arrays, Header, opened, write
+from lqrsim.results.archive import Arrays, Header, digest, opened, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
@@ -52,9 +52,20 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
       The path.
 
     Raises:
-      InputError: the file cannot be written; or what it would hold could not be read again.
+      InputError: the file cannot be written, or its content could not be read again.
     """
     path = check_path("output", path)
+    write(path, *_content(result))
+    return path
+
+
+def hash_of(result: Saved) -> str:
+    """The `sha256` of the file that `save` writes of this. Raises InputError as `save`."""
+    return digest(*_content(result))
+
+
+def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
+    """The arrays and the JSON tree of a file. Raises InputError for what could not be read again."""
     kinds = ", ".join(f"{'an' if kind.__name__[0] in 'AO' else 'a'} {kind.__name__}" for kind in FORMATS)
     check_kind("result", result, tuple(FORMATS), f"one of: {kinds}")
     kind = next(kind for kind in FORMATS if isinstance(result, kind))
@@ -67,8 +78,7 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
         raise InputError(f"result: got a {name}, {reason}, want one as lqrsim makes it") from None
-    write(path, arrays, {"format": f"lqrsim {name}", "version": version, **tree})
-    return path
+    return arrays, {"format": f"lqrsim {name}", "version": version, **tree}
 
 
 @overload
@@ -81,9 +91,9 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         solution = ls.load("plan.npz", ls.Solution)
 
     Args:
-      path: of a file that `save` wrote.
-      kind: what it has to be: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
-        By default, whatever it is.
+      path: path of a file that `save` wrote.
+      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
+        By default, any.
 
     Returns:
       What was saved.
@@ -132,7 +142,7 @@ def _check_arrays(kind: type, headers: Mapping[str, Header]) -> None:
     for name, header in headers.items():
         said = _declared_at(kind, name)
         if said is None or said.dtype is None:
-            raise InputError(f"{excerpt(name)}: got an unknown array, want only those of its format")
+            raise InputError(f"{excerpt(name)}: got an unknown array, want only arrays of this format")
         if header.dtype != (dtype := np.dtype(said.dtype).str):
             raise InputError(f"{name}: got numbers of type {header.dtype}, want {dtype}")
         check_sizes(name, header.shape, said.letters, {} if said.letters.startswith("...") else sizes)
@@ -157,7 +167,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         raise InputError(f"{path}: got {excerpt(tree)}, want an object")
     known = declarations(kind)
     if unknown := sorted(tree.keys() - known.keys()):
-        raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want no other than {', '.join(known)}")
+        raise InputError(f"{path or 'meta'}: got {excerpt(unknown[0])}, want only {', '.join(known)}")
     found = {}
     for name, said in known.items():
         field = _join(path, name)
@@ -168,7 +178,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         else:
             raise InputError(f"{field}: got none, want it")
     if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
-        raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in it or in offset, want finite numbers")
+        raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
     try:
         return kind(**found)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Checks of JSON that anyone may have written; each reports in one line what is wrong.
+"""Checks of JSON from untrusted files; each reports in one line what is wrong.
 
 A check takes the name of a field and its value, and returns the value. `parse` reads the text, `canonical` writes it.
 """
@@ -110,7 +110,7 @@ def record(checks: Mapping[str, Check]) -> Check:
         if missing := sorted(checks.keys() - value.keys()):
             raise InputError(f"{field}: got none of {excerpt(missing[0])}, want it")
         if unknown := sorted(value.keys() - checks.keys()):
-            raise InputError(f"{field}: got {excerpt(unknown[0])}, want no other than {', '.join(checks)}")
+            raise InputError(f"{field}: got {excerpt(unknown[0])}, want only {', '.join(checks)}")
         return {name: check(f"{field}.{name}", value[name]) for name, check in checks.items()}
 
     return each

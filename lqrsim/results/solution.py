@@ -32,11 +32,11 @@ class Solution(Plan):
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
         where the problem has no obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
-      gap: of the plan; see `Iteration.gap`. NaN if there is none.
+      gap: gap of the plan; see `Iteration.gap`. NaN if there is none.
       solver: name of the function that was called.
       options: its settings; with noise, a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
-      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       scenario: the scenario that the command line solved; empty where a program called the solver.
       candidates: the starts that were tried, if there were several.
     """
@@ -61,9 +61,6 @@ class Solution(Plan):
         Args:
           later: name -> function that makes it, for parts without a default.
           **parts: all other parts.
-
-        Returns:
-          A Solution.
         """
         solution = object.__new__(cls)
         vars(solution).update(parts, _later=later)
@@ -73,7 +70,7 @@ class Solution(Plan):
         later = vars(self).get("_later", {})
         if name not in later:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return vars(self).setdefault(name, later[name]())  # of two threads that read it both get the same
+        return vars(self).setdefault(name, later[name]())  # two threads that read it get the same object
 
     def __getstate__(self) -> dict[str, Any]:
         """With all parts made."""
@@ -128,7 +125,7 @@ class Solution(Plan):
         }  # fmt: skip
 
     def open_loop(self) -> "Solution":
-        """The same plan with zero gains, to compare with: the planned controls, whatever the state."""
+        """The same plan with zero gains, for comparison: the planned controls, independent of the state."""
         policy = replace(self.policy, gain=np.zeros_like(self.policy.gain), offset=self.trajectory.controls)
         return replace(self, policy=policy, inverse_policy=None)
 

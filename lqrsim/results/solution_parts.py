@@ -149,8 +149,8 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the constraints
-        are to be met.
+      cost: cost of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the
+        constraints are to be met.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. In damped iterations with
         constraints this and the optimality refer to the augmented Lagrangian.
       gap: largest difference between the states of minimal total cost and the rollout, each state relative to its
@@ -164,8 +164,8 @@ class Iteration:
       dynamics_residual: largest defect of the dynamics between two states of minimal total cost, relative as the gap
         is, and evaluated where the optimality is. The plan itself is a rollout and has no defect. In the interior point
         method it equals the gap.
-      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
-        equalities, which have rounding errors at least; NaN where it was not evaluated.
+      violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
+        are no equalities, which have rounding errors at least; NaN where it was not evaluated.
       seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
         "restoration", a descent on cost and penalised violation; in the safeguard "damped", or "ilqr" where its step is
@@ -194,7 +194,7 @@ class Iteration:
         """This iteration as a line of the table under `HEADER`.
 
         Args:
-          number: of the iteration, from 1.
+          number: number of the iteration, from 1.
 
         Returns:
           A line of text.
@@ -217,16 +217,16 @@ class Certificate:
     For a CONVERGED solution optimality and violation are within tolerance, the other residuals within rounding.
 
     Attributes:
-      cost: of the plan; see `Solution.cost`.
+      cost: cost of the plan; see `Solution.cost`.
       start: largest difference between its first state and a `FixedState`; 0 where the start is not fixed.
       dynamics_residual: largest difference between a state and one step of the dynamics from the state before, each
         state relative to its largest size along the plan, at least 1 unit.
       policy_residual: largest difference between a control and the policy's at that state, relative to the terms of
         `L x + l`.
       limits: how far a control is beyond its limits, in its unit.
-      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
-        equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6, unless
-        constraints are elastic.
+      violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
+        are no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
+        unless constraints are elastic.
       optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
         relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient.
     """
@@ -265,7 +265,7 @@ class Candidate:
 
     Attributes:
       start: its name.
-      cost: of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
+      cost: cost of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
       iterations: number of iterations.
       status: how it ended; None where it was dropped after a few iterations.
       trajectory: its last plan.

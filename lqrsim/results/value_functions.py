@@ -13,7 +13,7 @@ from lqrsim.results.fields import check_fields
 
 
 def _check(value: object) -> None:
-    """Check the fields of a quadratic function. Raises InputError, also where it is of no state."""
+    """Check the fields of a quadratic function. Raises InputError, also if there are no states."""
     if not check_fields(value)["n"]:
         raise InputError(f"{type(value).__name__}: got no state, want at least one")
 

@@ -1,4 +1,4 @@
-"""What a robot is: its constants, its analytic dynamics, its MJCF names, and the maps between the two."""
+"""Robots: constants, analytic dynamics, MJCF names, and the maps between the two."""
 
 import abc
 from collections.abc import Sequence
@@ -18,18 +18,19 @@ class Robot(abc.ABC):
     """Subclass it to add a robot; see `quadrotor.py` for an example and `docs/adding_a_robot.md` for the steps.
 
     Attributes:
-      name: what the command line calls it.
-      body: the body in the MJCF that is the robot; its origin is where the states say that its position is. Obstacles
-        are everything else that is fixed to the world.
+      name: its name on the command line.
+      body: the robot's body in the MJCF; its origin is the position in the states. Obstacles are everything else that
+        is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
-      radius: of its collision circle (seen from above) or ball (the rest), in metres.
-      balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
-        default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
-      geoms: what collides, in place of both, where a simulator has distances: of a robot from an MJCF. None by default.
+      radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
+      balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
+        None by default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
+      geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
+        None by default.
     """
 
     name: str
@@ -45,7 +46,7 @@ class Robot(abc.ABC):
 
     @property
     def shape(self) -> "dict[str, Any]":
-        """What collides, as a keyword for ObstacleCost and Clearance: geoms, else balls, else radius."""
+        """The collision shape as a keyword for ObstacleCost and Clearance: geoms, else balls, else radius."""
         if self.geoms is not None:
             return {"geoms": self.geoms}
         return {"balls": self.balls} if self.balls is not None else {"radius": self.radius}

@@ -57,36 +57,39 @@ class MjcfRobot(Robot):
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
     `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
-    actuators' names, limited by their ctrlrange. What has no name in the MJCF gets one, as `unnamed_joint_0`.
+    actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
+    `unnamed_joint_0`.
 
     Where the file has no camera, or no light, it gets one named overview.
 
-    Obstacles are the geoms that are fixed to the world and can touch the robot, but its own base, which carries it, and
-    the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of them, at
-    MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are MuJoCo's.
+    Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
+    and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
+    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are
+    MuJoCo's.
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
       body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
         that moves and has mass.
-      position: the 2 or 3 states that are the body's place in the world, in metres; by default those of which MuJoCo's
-        kinematics says so. () for none.
-      radius: of a ball about the body's origin that has in it all that may collide; by default the least that is sure.
+      position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
+        MuJoCo's kinematics. () for none.
+      radius: radius of a ball about the body's origin that contains everything that may collide; by default the
+        smallest guaranteed one.
       outline: whether there are `balls`, fixed to the bodies, about all that collides; by default where there is no
-        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. They are what
-        pictures follow, and cheap bounds of what collides.
+        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. Pictures follow them,
+        and they are cheap bounds of the colliding geoms.
       floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
-      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. What is
-        none collides as MuJoCo has it, in the plan, too.
+      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. Geoms
+        that are not obstacles collide by MuJoCo's contacts, in the plan, too.
 
     Attributes:
-      scene: what it moves in.
+      scene: the scene that it moves in.
       dynamics: MuJoCo's steps.
-      geoms: what collides of it. balls: an outline of it, or None.
+      geoms: its colliding geoms. balls: an outline of it, or None.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: equality constraints but those that couple joints linearly, delays, plugins with states.
+        describe: equality constraints except those that couple joints linearly, delays, plugins with states.
     """
 
     def __init__(
@@ -161,7 +164,7 @@ class MjcfRobot(Robot):
     def _position(
         self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
     ) -> tuple[tuple[int, ...], str]:
-        """Which states are the position, and in which plane."""
+        """The states that are the position, and its plane."""
         if asked is None:
             found = sorted(axes, key=lambda dof: axes[dof])
             if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
@@ -171,11 +174,11 @@ class MjcfRobot(Robot):
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
-            raise InputError(f"{who}: position: got {got}, want 2 or 3 that say where the body is, of: {told}")
+            raise InputError(f"{who}: position: got {got}, want 2 or 3 that are the body's position, among: {told}")
         return tuple(found), plane if len(found) == 2 else ""
 
     def _balls_at(self, state: Array) -> Array:
-        """Where the balls are, (K, 3), by MuJoCo's bindings."""
+        """Places of the balls, (K, 3), by MuJoCo's bindings."""
         assert isinstance(self.balls, MjcfBalls)
         outline = self.balls.outline
         return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)
@@ -243,7 +246,7 @@ class MjcfRobot(Robot):
           goal: (n,), a state.
           steps: the number of control periods.
           dt: the control period in seconds; by default about 0.02.
-          weights: of the final error, one number for all states, or (n,).
+          weights: weights of the final error, one number for all states, or (n,).
           effort: weights of the controls, (m,); by default such that a control at its limit costs 1/2.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
 

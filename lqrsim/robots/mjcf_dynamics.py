@@ -4,12 +4,13 @@ import contextlib
 import copy
 import threading
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim import process
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
@@ -22,7 +23,7 @@ from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics
 from lqrsim.scenes.scene import unlogged
 
-# What may push the robot's body, in the world's axes: names that `uncertainty_of` knows.
+# Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
 _forming = threading.Lock()  # of teams
@@ -93,17 +94,17 @@ class MjcfDynamics(Dynamics):
     def numbers(self) -> dict[str, float]:
         """The numbers of the MJCF that `with_parameters` takes, and what they are.
 
-        `mass` in kg, of all that moves, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
-        `_frictionloss`; `<geom>_friction`, sliding, of what collides; `<actuator>_gear`, where there are several
-        numbers the largest; `density` and `viscosity` of what it moves in. In MuJoCo's units.
+        `mass` in kg, of all moving bodies, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
+        `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, where there are several
+        numbers the largest; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
         return {name: one.value for name, one in numbers_of(self.xml, self.physics.model).items()}
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
 
-        A body's inertia is as many times its own as its mass is; several numbers of a gear keep their ratios. What is
-        pushed is pushed otherwise, too: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+        A body's inertia scales with its mass; several numbers of a gear keep their ratios. What is pushed is pushed
+        otherwise, too: `dynamics.disturbed.with_parameters(force_x=1.0)`.
 
         Raises:
           InputError: there is no such number, the value is out of range, or the masses are those of all and of one.
@@ -167,13 +168,14 @@ class MjcfDynamics(Dynamics):
 
     @contextlib.contextmanager
     def solving(self, threads: int) -> Iterator[None]:
-        """While it lasts, so many threads linearise together, and MuJoCo says nothing of what statuses tell.
+        """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
 
-        More threads than processors would wait for each other, and are not begun.
+        More threads than processors would wait for each other, and are not begun. After a signal that raises
+        KeyboardInterrupt all steps are NaN, so that it need not wait for an iteration, which may take half a minute.
         """
         threads = min(check_count("threads", threads), processors())
         team, helpers = self.physics.team, list[threading.Thread]()
-        with unlogged():
+        with unlogged(), process.on_interrupt(partial(team.__setitem__, kernel.SIGNALLED, 1)):
             with _forming:
                 if team[kernel.HELPERS] == 0:
                     numbers, help_out = self.data, self.compiled.help_out
@@ -184,6 +186,7 @@ class MjcfDynamics(Dynamics):
             try:
                 yield
             finally:
+                team[kernel.SIGNALLED] = 0
                 if helpers:
                     team[kernel.STOP] = 1
                     for helper in helpers:

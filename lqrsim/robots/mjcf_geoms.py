@@ -1,4 +1,4 @@
-"""What collides of a robot from an MJCF, at MuJoCo's own distances."""
+"""The colliding geoms of a robot from an MJCF, with MuJoCo's own distances."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ class MjcfGeoms(CollisionGeoms):
     """All that moves and collides in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
 
     Args:
-      scene: of the robot, in which all geoms have names.
+      scene: the robot's scene, in which all geoms have names.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -116,7 +116,7 @@ class MjcfGeoms(CollisionGeoms):
         return dynamics, np.array(found, dtype=np.int64)
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
-        """What the kernel reads, but the address of p."""
+        """The kernel's data, except the address of p."""
         columns = [
             rows, self._pairs[chosen, 0], self._bodies[chosen], self._pairs[chosen, 1], self._bounds[chosen],
             self._plane[chosen],

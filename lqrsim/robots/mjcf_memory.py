@@ -8,7 +8,7 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 
 
 class MjcfMemory(UserFunction):
-    """The address of what kernels call p, in the place of a function's: they find MuJoCo's memory there."""
+    """The address that kernels call p, in the place of a function's: they find MuJoCo's memory there."""
 
     @classmethod
     def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":

@@ -17,7 +17,7 @@ _AXES = "xyz"
 
 
 class _Pose:
-    """Where a site is wanted, checked.
+    """The wanted place of a site, checked.
 
     Args:
       what: messages call it. site: name of it. position: (3,) or None. orientation: (4,) or None.
@@ -37,7 +37,7 @@ class _Pose:
 
     @property
     def rows(self) -> list[str]:
-        """What messages call each row."""
+        """The name of each row in messages."""
         placed = [f"{self.site} at its {axis}" for axis in _AXES] if self.position is not None else []
         return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
 
@@ -69,8 +69,8 @@ class SiteCost(Cost):
       position: (3,) where it is wanted, in the world, in metres; None for anywhere.
       orientation: (4,) the quaternion (w, x, y, z) of how it is wanted in the world; None for any. The angle is that of
         the turn from there, less than half a turn.
-      weight: of the place, a number or one an axis of the world, (3,).
-      turn_weight: of the turn, a number or one an axis of what is wanted, (3,).
+      weight: weight of the place, a number or one an axis of the world, (3,).
+      turn_weight: weight of the turn, a number or one an axis of what is wanted, (3,).
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class SiteConstraint(Constraint):
       site: its name in the MJCF.
       position: (3,) as in a SiteCost.
       orientation: (4,) as in a SiteCost.
-      at: "final", or "all" steps, but a start that is given exactly.
+      at: "final", or "all" steps except a start that is given exactly.
     """
 
     def __init__(

@@ -28,12 +28,12 @@ def mjcf(
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
 
     Args:
-      path: of the MJCF.
+      path: path of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
-      goal: in the same form.
-      weights: of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the others
-        then have none.
+      goal: the goal, in the same form.
+      weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
+        others then have none.
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a
         control at its limit, or at 1 without one, costs 1; see `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
@@ -42,9 +42,6 @@ def mjcf(
       floors: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
-
-    Returns:
-      The Scenario.
 
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.

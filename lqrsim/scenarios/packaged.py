@@ -33,7 +33,7 @@ class Scenario:
       problem: the problem to solve; change it with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
       disturbances: those of the demo: clearly visible, but within the reach of the policy.
-      start: for the solver, as in `smooth`, whenever the scenario is solved; by default several starts are tried.
+      start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several are tried.
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
@@ -71,9 +71,6 @@ class Scenario:
         Args:
           goal_radius: in metres, or None.
           goal_tolerance: a scaled error, or None.
-
-        Returns:
-          The distance.
 
         Raises:
           InputError: as `simulate` does.
@@ -119,9 +116,6 @@ def get(name: str) -> Scenario:
     Args:
       name: one of `names()`.
 
-    Returns:
-      The Scenario.
-
     Raises:
       InputError: there is no such scenario.
     """
@@ -139,11 +133,7 @@ def _functions() -> dict[str, Callable[..., Scenario]]:
 
 
 def differential_drive() -> Scenario:
-    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights.
-
-    Returns:
-      The Scenario.
-    """
+    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights."""
     robot, scene = DifferentialDrive(), load_scene("arena")
     start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
     weight = (5000.0, 5000.0, 50.0)
@@ -174,10 +164,7 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
 
     Args:
       query: number of the random start and goal, from 0; see `quadrotor_queries`.
-      seed: of the random starts and goals.
-
-    Returns:
-      The Scenario.
+      seed: seed of the random starts and goals.
     """
     starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")
@@ -217,7 +204,7 @@ def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndar
 
     Args:
       count: number of pairs.
-      seed: of the random numbers.
+      seed: seed of the random numbers.
 
     Returns:
       Starts and goals, each (count, 12).

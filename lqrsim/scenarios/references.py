@@ -1,4 +1,4 @@
-"""Scenarios and sets of disturbances from what a user types.
+"""Scenarios and sets of disturbances from a user's input.
 
 A scenario is the name of a registered one, a function of the user's own or an MJCF, with settings:
 
@@ -36,7 +36,7 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     """The scenario that `reference` names; see the top of this file for its forms.
 
     Args:
-      reference: what the user typed.
+      reference: the user's input.
       registered_only: refuse a user's own function. For references that are read from a file, which must not choose the
         code that runs.
 

@@ -26,7 +26,7 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
     """Solve a scenario's problem from the scenario's start.
 
     Args:
-      scenario: with the problem and the start.
+      scenario: the scenario with the problem and the start.
       solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
       **options: of the solver; a `start` among them replaces the scenario's.
 
@@ -49,7 +49,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 
     Args:
       scenario: to solve.
-      path: of a solution, a policy, or a rollout or funnel, for its plan.
+      path: path of a solution, of a policy, or of a rollout or funnel, for its plan.
 
     Returns:
       The solution, the policy or the plan.
@@ -78,7 +78,7 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     It may be without convergence, or of another problem: `remarks` says so.
 
     Args:
-      scenario: in which it is to run.
+      scenario: the scenario in which it is to run.
       solution: a Solution, or the path of one.
 
     Returns:

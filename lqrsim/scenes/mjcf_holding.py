@@ -32,8 +32,8 @@ class Holding:
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
     """The controls of actuators, in that order, with which nothing accelerates at rest.
 
-    Forces of actuators are taken to be affine in the controls, as those of motors and servos are: inverse dynamics say
-    what is wanted of them, and least squares within the controls' limits find it.
+    Actuator forces are assumed to be affine in the controls, like those of motors and servos: inverse dynamics give the
+    required forces, and least squares within the controls' limits finds the controls.
     """
     from scipy.optimize import lsq_linear
 
@@ -73,7 +73,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 
 
 def _carried(model: mujoco.MjModel) -> Array:
-    """What forces on all joints come to on those that are free to move, (free, nv), through coupled ones."""
+    """The map from forces on all joints to those on the free ones, (free, nv), through couplings."""
     moves, coupled = np.eye(model.nv), couplings_of(model)
     for one in coupled:
         moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0

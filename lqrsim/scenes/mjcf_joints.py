@@ -1,4 +1,4 @@
-"""What the joints, actuators and keyframes of an MJCF are, as a robot's states and controls need it."""
+"""Joints, actuators and keyframes of an MJCF, for a robot's states and controls."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -50,8 +50,8 @@ class Coupling:
     """A joint that an equality constraint moves with another one: by how much it is linear.
 
     Attributes:
-      dof: of the joint. other: of the one that it follows; -1 where it stands still. offset: of its position, where the
-        other's is 0, in m or rad. ratio: of both.
+      dof: index of the joint's velocity. other: that of the joint it follows; -1 where it stands still. offset: its
+        position where the other's is 0, in m or rad. ratio: of both.
     """
 
     dof: int
@@ -133,7 +133,7 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
 
 
 def _unit(model: mujoco.MjModel, number: int) -> str:
-    """The unit of a control: of plain motors and servos of joints; of the rest it depends on what they are for."""
+    """The unit of a control: of plain motors and servos of joints; that of other actuators depends on their use."""
     joint = int(model.actuator_trnid[number, 0])
     gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
     if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:
@@ -174,7 +174,7 @@ def is_linear(model: mujoco.MjModel, number: int) -> bool:
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
-    """The id of the body of that name; without one, of what moves first in the world. Raises InputError."""
+    """The id of the body of that name; without a name, of the first moving body in the world. Raises InputError."""
     if name is not None:
         names = [model.body(number).name for number in range(1, model.nbody)]
         return int(model.body(check_name(f"{what}: body", name, names)).id)
@@ -193,9 +193,10 @@ def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array,
 
 
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
-    """Which axis of the world (0 to 2) each degree of freedom is along which a body's origin is told by it alone.
+    """For each degree of freedom that alone moves a body's origin along an axis of the world: that axis (0 to 2).
 
-    Found by moving it: the origin must be where the free joint or the slides say, whatever the other joints do.
+    Found by moving it: the origin must be where the free joint or the slides put it, for any positions of the other
+    joints.
     """
     data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
     candidates = {
@@ -214,7 +215,7 @@ def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
 
 
 def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
-    """Where points (K, 3) in the axes of bodies (K,) are in the world, at MuJoCo's positions (nq,)."""
+    """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -222,7 +223,7 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
 
 
 def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
-    """The body of a site, and its place (3,) and axes (3, 3) in those of the body."""
+    """The body of a site, and its place (3,) and axes (3, 3) in the body's axes."""
     return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
 
 
@@ -234,7 +235,7 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:
-    """How far from a body's origin what collides of it and of all it carries can be, at most, in metres.
+    """The largest distance from a body's origin of its colliding geoms and of those it carries, in metres.
 
     If no geom collides, the visual geoms count instead.
     """

@@ -1,6 +1,6 @@
 """The numbers of an MJCF that may be others: masses, damping, friction, gears; read from a model, changed in the text.
 
-In the text, for it alone makes the model again: what MuJoCo derives of a number, it derives when it compiles that.
+The text is changed because MuJoCo derives other numbers when it compiles the text.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -30,14 +30,14 @@ class Number:
 def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     """All of them, by the names that parameters have: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
 
-    Only of what is in the text by its name, and has the number: bodies that move, geoms that collide.
+    Only for elements that have a name and this number in the text: bodies that move, geoms that collide.
 
     Args:
       xml: an MJCF in which all has a name. model: compiled from it.
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
-    if _bodies(model) == elements["body"].keys():  # else there are some whose mass the text has no place for
+    if _bodies(model) == elements["body"].keys():  # otherwise the text has no place for the mass of some
         found += [Number("mass", "", sum(masses.values()))] if masses else []
         found += [Number("mass", name, mass) for name, mass in masses.items()]
     for number in range(model.njnt):
@@ -59,14 +59,13 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
 def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], what: str) -> str:
     """The MJCF with others of its numbers, by name, as in `numbers_of`.
 
-    A body's inertia is as many times its own as its mass is, and so it is for all bodies with `mass`. The numbers of a
-    gear keep their ratios.
+    A body's inertia scales with its mass; `mass` scales those of all bodies. The numbers of a gear keep their ratios.
 
     Args:
-      what: it is, for messages.
+      what: the MJCF's name in messages.
 
     Raises:
-      InputError: a value is out of range, or both the whole mass and that of a body are there.
+      InputError: a value is out of range, or both the whole mass and that of a body are given.
     """
     numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
     elements, scales = _elements(root), dict[str, float]()
@@ -99,7 +98,8 @@ def _state_masses(
     model: mujoco.MjModel,
     scales: Mapping[str, float],
 ) -> None:
-    """Write the mass and inertia of each body, times its scale: as compiled, in place of how they came about."""
+    """Write the mass and inertia of each body, times its scale: as compiled, in place of the elements that they came
+    from."""
     for name, body in bodies.items():
         for inertial in body.findall("inertial"):
             body.remove(inertial)
@@ -116,7 +116,7 @@ def _state_masses(
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
-    """What has a name, by kind and name. Replicas have other names in the model, and are not found by these."""
+    """The named elements, by kind and name. Replicas have other names in the model, and are not found by these."""
     found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
     for world in root.iter("worldbody"):
         for element in world.iter():
@@ -138,7 +138,7 @@ def _heavy(model: mujoco.MjModel) -> list[str]:
 
 
 def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
-    """What comes after the number that is linear in the text: damping and stiffness may be polynomials."""
+    """The rest of the attribute after its linear coefficient: damping and stiffness may be polynomials."""
     joint = model.joint(one.part).id
     if one.what == "stiffness":
         return model.jnt_stiffnesspoly[joint].tolist()

@@ -1,4 +1,4 @@
-"""What is in the way of a robot that is all that moves in an MJCF, and which of its geoms can touch it."""
+"""The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
 import mujoco
 import numpy as np
@@ -55,7 +55,7 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs whose distances matter: those that can touch, and of an obstacle that nothing can touch, all.
+    """The pairs whose distances matter: those that can touch, and all pairs of an obstacle that nothing can touch.
 
     Such an obstacle was asked for by name, or by a rule.
     """
@@ -78,7 +78,7 @@ def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
 def levers(model: mujoco.MjModel) -> Array:
     """How far any point of the robot moves at most for each degree of freedom, (nv,): in m/rad, or 1 for slides.
 
-    Wherever the joints are; slides between a joint and what it turns count with their range, or 1 m without one.
+    For any joint angles; slides between a joint and the body that it turns count with their range, or 1 m without one.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
     found = np.ones(model.nv)
@@ -139,7 +139,7 @@ def _touches(model: mujoco.MjModel, ground: int) -> bool:
 
 
 def _sinks(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of what carries it."""
+    """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     while body:

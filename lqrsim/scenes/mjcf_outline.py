@@ -1,4 +1,4 @@
-"""What may collide of the bodies of an MJCF that move, as balls that are fixed to them."""
+"""The colliding geoms of an MJCF's moving bodies, as balls fixed to the bodies."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim.capsules import Capsule
 from lqrsim.errors import Array
 
-# Of its radius: by how much a capsule may stick out of the balls that stand for it.
+# Relative to its radius: by how much a capsule may stick out of the balls that stand for it.
 TOLERANCE = 0.25
 
 
@@ -31,9 +31,9 @@ class Outline:
 
 
 def outline_of(model: mujoco.MjModel) -> Outline:
-    """Spheres as they are, capsules as chains, the rest as the ball about its middle that it is in.
+    """Spheres as they are, capsules as chains, other geoms as a ball about their middle that contains them.
 
-    What is only drawn counts where nothing collides. The last ball is in the middle of a geom.
+    Geoms that are only drawn count if nothing collides. The last ball is in the middle of a geom.
     """
     moves = model.body_weldid[model.geom_bodyid] != 0
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)

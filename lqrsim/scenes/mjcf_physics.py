@@ -15,7 +15,7 @@ from lqrsim.machine import processors
 from lqrsim.scenes.mjcf_joints import is_linear
 from lqrsim.scenes.scene import model_from_xml
 
-_CONVERGED = 1e-14  # the constraint solver's tolerance: what it leaves is divided by the difference of a derivative
+_CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _CLOSE, _LOOKS = 1e-10, 100  # m, and iterations at most, of distances
 _PARTS = {
     mujoco.mjtIntegrator.mjINT_EULER: "mj_Euler",
@@ -25,9 +25,9 @@ _PARTS = {
 
 
 class MjcfPhysics:
-    """What `kernels/mjcf_dynamics.py` needs of an MJCF.
+    """The data of an MJCF for `kernels/mjcf_dynamics.py`.
 
-    The model is the MJCF's own, but that
+    The model is the MJCF's own, except that
 
     - obstacles do not collide: they are for costs and constraints to keep clear of;
     - controls are not cut off at their range, which would hide from a solver which way to go from there;
@@ -36,13 +36,13 @@ class MjcfPhysics:
 
     Args:
       xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
-      actuators: ids of those that the controls are for, in order. obstacles: ids of the geoms that are obstacles.
+      actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
 
     Attributes:
       model: MuJoCo's. numbers: what the kernel takes, with no wrench. team: the words that its threads share.
 
     Raises:
-      InputError: it has what a state of joints and actuators does not describe.
+      InputError: joints and actuators do not describe its whole state.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:
 
 @cache
 def _yield() -> int:
-    """The address of what lets other threads run; 0 where there is none."""
+    """The address of a function that yields to other threads; 0 where there is none."""
     if platform.system() == "Windows":
         return 0
     return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0

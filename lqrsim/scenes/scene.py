@@ -5,14 +5,14 @@ collide is an obstacle.** Fixed to the world: no joint and no mocap between the 
 contype or conaffinity is not zero, and contacts are not switched off by a flag. So
 
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
-- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
+- planes are walls, floors and ceilings, infinite, at any drawn size, and solid behind. One that is parallel
   to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
 - plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out. A robot
   from an MJCF has MuJoCo's distances, to all types;
 - a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
 
-`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out what is not in the way
-of that robot.
+`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out geoms that are not in
+the way of that robot.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 try:
     import mujoco
 except Exception as error:
-    # MuJoCo chooses its OpenGL while it is imported: told to take one that is not there, it raises what comes along.
+    # MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it can raise anything.
     if "MUJOCO_GL" not in os.environ:
         raise
     raise InputError(
@@ -45,7 +45,7 @@ except Exception as error:
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
 _FLAGS = mujoco.mjtDisableBit
 DEEPEST = 490  # MuJoCo's reader refuses a little more
-_FLAT = 1e-9  # m, for what has no thickness
+_FLAT = 1e-9  # m, for geoms without a thickness
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
 MOST_COPIES = 1_000_000  # elements that <replicate> makes: some minutes of MuJoCo's, and GBs
@@ -62,7 +62,7 @@ class Scene:
     """A place for a robot to move in.
 
     Attributes:
-      name: of the packaged scene, or the stem of the file.
+      name: name of the packaged scene, or the stem of the file.
       xml: the whole MJCF as text, includes resolved. It alone makes the model again.
       model: compiled from `xml`.
       world: the obstacles, as the module's docstring defines them.
@@ -94,12 +94,9 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
 
     Args:
       name_or_path: a name in models/, or the path of an MJCF file.
-      obstacles: what is an obstacle of all that is fixed to the world: all that can collide; none, with False; names of
-        geoms, or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says
-        whether it is one.
-
-    Returns:
-      The Scene.
+      obstacles: which geoms fixed to the world are obstacles: all that can collide; none, with False; names of geoms,
+        or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says whether it
+        is one.
 
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
@@ -131,7 +128,7 @@ def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
     """The model of an MJCF given as text, without includes.
 
     Args:
-      what: it is, for messages.
+      what: its name in messages.
 
     Raises:
       InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
@@ -173,7 +170,7 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
     """Ids of the geoms that are obstacles by a choice, as `load_scene` has it.
 
     Args:
-      default: those with True. what: it is, for messages.
+      default: those with True. what: its name in messages.
 
     Raises:
       InputError: no geom or body that is fixed to the world has such a name, or it is no choice.
@@ -207,9 +204,10 @@ _quiet, _count, _before = threading.Lock(), 0, None
 
 @contextlib.contextmanager
 def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console about what is told or recorded otherwise.
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
+    otherwise.
 
-    Several threads may be in it: the last to leave puts back what was there before the first.
+    Several threads may be in it: the last to leave restores the state before the first.
     """
     global _count, _before
     with _quiet:
@@ -228,7 +226,7 @@ def unlogged() -> Iterator[None]:
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """The name, with underscores after it if it is taken: for what has none in the MJCF."""
+    """A name for an element without one in the MJCF: this, with underscores after it if it is taken."""
     while name in taken:
         name += "_"
     return name
@@ -250,7 +248,7 @@ def geom_names(model: mujoco.MjModel) -> list[str]:
 
 
 def _check_elements(xml: str, what: str) -> None:
-    """Raises InputError for what MuJoCo would not survive or not say: too much of something, or NaN for unknown.
+    """Raises InputError where MuJoCo would crash or not complain: excessive counts, or NaN for unknown numbers.
 
     It takes a NaN for the mass or density of a geom as if there were none.
     """
@@ -286,7 +284,7 @@ def _check_elements(xml: str, what: str) -> None:
 
 
 def _whole(text: str) -> int:
-    """A count in an MJCF; 1 for what MuJoCo refuses itself."""
+    """A count in an MJCF; 1 if MuJoCo itself refuses it."""
     return int(text) if text.strip().isdecimal() else 1
 
 

@@ -11,12 +11,12 @@ from lqrsim.errors import Array, InputError, check_array, check_items, check_nam
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance
 
-# What a position may be of: space, or a plane by its two axes in their order.
+# Spaces of a position: "xyz", or a plane by its two axes in their order.
 SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
-# Of MuJoCo's, without a distance here: those of a robot from an MJCF are MuJoCo's own.
+# MuJoCo's types without a distance here; distances of a robot from an MJCF are MuJoCo's own.
 OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 
@@ -25,7 +25,7 @@ class Obstacle:
     """One primitive; sizes and axes as MuJoCo has them.
 
     Attributes:
-      name: of the geom in the MJCF.
+      name: name of the geom in the MJCF.
       kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` has one.
       position: (3,) in metres.
       rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
@@ -33,7 +33,7 @@ class Obstacle:
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths, and for other kinds those of the bounding box; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
-        it into account; the scene that MuJoCo simulates is another matter, and stands still.
+        it into account; in the scene that MuJoCo simulates it stands still.
     """
 
     name: str
@@ -170,9 +170,6 @@ class World:
           plane: as in `Coordinates`.
           offset: as in `Coordinates`, in metres.
 
-        Returns:
-          A World in the plane's coordinates.
-
         Raises:
           InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
             so that it has no outline among the primitives.
@@ -237,7 +234,7 @@ class World:
         return np.array(flat).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Which obstacle is nearest, (...), at points (..., 2 or 3).
+        """The index of the nearest obstacle, (...), at points (..., 2 or 3).
 
         Args:
           points: (..., 3), or (..., 2) in a plane, in metres.
@@ -256,7 +253,7 @@ class World:
 
 
 def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
-    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for what is none."""
+    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for anything else."""
     array = real(field, points)
     if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
         raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")

@@ -63,16 +63,16 @@ def simulate(
         `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
       disturbances: in the order in which they act. Each has its own stream of random numbers. A `Noise` of a problem is
         one, too.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       trials: number of trials.
-      first_trial: number of the first one; trial `i` of a seed is bit-identical whatever trials run beside it.
+      first_trial: number of the first one; trial `i` of a seed is bit-identical, independent of the trials beside it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` has the details.
-      frames: whether to record what drawing needs, between the control periods, too; without it there is no video.
+      frames: whether to record the data for drawing, also between the control periods; without it there is no video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
         through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome.
-      threads: of MuJoCo; by default one per processor.
+      threads: number of MuJoCo's threads; by default one per processor.
       generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
       progress: called after each control period with the number of finished periods and that of all.
       watch: called with each frame: its time, MuJoCo's qpos (K, nq), and which trials are unstable (K,).
@@ -224,7 +224,7 @@ class ClosedLoop:
             self.collisions.touch(int(row), plan.horizon, touching[row])
 
     def so_far(self) -> Rollout:
-        """A Rollout of the records so far, as if the controller had failed now. The loop can go on."""
+        """A Rollout of the records so far, as if the controller had failed now. The loop can continue."""
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
         if self.step < self.settings.trajectory.steps:

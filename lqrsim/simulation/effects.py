@@ -1,4 +1,4 @@
-"""The effects of a run's disturbances, applied one after the other, with checks of what they return."""
+"""The effects of a run's disturbances, applied one after the other, with checks of the values they return."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,7 +18,7 @@ class Effects:
     """The effects of disturbances on K trials, started.
 
     Args:
-      plan: of the run. trials: numbers of the trials.
+      plan: plan of the run. trials: numbers of the trials.
       generators: (trial, number of the disturbance) -> its random generator.
 
     Attributes:

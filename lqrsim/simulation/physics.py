@@ -51,7 +51,7 @@ class Physics:
     Args:
       substeps: physics steps per control period.
       contacts: whether obstacles may become solid; without, it takes a quarter less time.
-      threads: by default one per processor.
+      threads: number of threads; by default one per processor.
 
     Attributes:
       simulations: MuJoCo's. senses_contacts: whether contacts are sensed without a force.

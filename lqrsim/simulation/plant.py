@@ -30,8 +30,8 @@ class Plant:
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot: with the dynamics and the limits.
-      scene: with the MJCF and the obstacles.
+      robot: the robot, with its dynamics and limits.
+      scene: the scene, with its MJCF and obstacles.
       geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
       balls, places: the robot's balls and their centres; None if it is one ball at its position.
       world: the obstacles for the robot's geoms, its balls or its position; none without any.
@@ -42,7 +42,7 @@ class Plant:
       body: id of the robot's body.
       qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
-      timestep: of the physics, in seconds.
+      timestep: timestep of the physics, in seconds.
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
@@ -93,9 +93,6 @@ class Plant:
         Args:
           period: seconds, such as `solution.trajectory.dt`.
 
-        Returns:
-          A Plant.
-
         Raises:
           InputError: the period is not positive.
         """
@@ -111,9 +108,6 @@ class Plant:
 
         Args:
           period: seconds.
-
-        Returns:
-          A count.
 
         Raises:
           InputError: the period is not a multiple of the physics step.
@@ -240,9 +234,6 @@ class Plant:
         Args:
           before: (..., B, 2 or 3), as of `middles`.
           after: likewise.
-
-        Returns:
-          (...).
         """
         if self.geoms is not None:
             return self.geoms.travel(before[..., 0, :], after[..., 0, :])
@@ -254,9 +245,6 @@ class Plant:
         Args:
           middles: (B, 2 or 3), as of `middles`.
           displaced: (obstacles, 3), by how much they are elsewhere.
-
-        Returns:
-          A name.
         """
         if self.geoms is not None:
             return self.world.names[int(self._distances(middles[None], displaced[None])[0, 0].argmin())]
@@ -359,11 +347,11 @@ class Plant:
             spec.add_sensor(
                 name=sensor,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and what is attached to it
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and everything attached to it
                 objname=self.robot.body,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
                 refname=name,
-                # What to report, how to sort, how many.
+                # The items to report, their order, and their number.
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
         return spec.compile()
@@ -372,8 +360,8 @@ class Plant:
 def extent(plant: Plant) -> float:
     """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
 
-    From above for a robot that is seen from above; else in space, whatever its plane. Moving parts count in all places
-    that their joints allow without limits.
+    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places that
+    their joints allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
     space, rng = dynamics.state_coordinates, np.random.default_rng(0)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,12 +13,11 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_count,
-    check_items,
     check_number,
     check_seed,
     excerpt,
-    shaped,
 )
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.physics import UNSTABLE
@@ -33,8 +32,8 @@ class PlantCheck:
     """The differences between a robot's dynamics and MuJoCo over one control period.
 
     Attributes:
-      names: of the states.
-      units: of the states.
+      names: names of the states.
+      units: units of the states.
       errors: (n,) the largest difference of each state over the samples, in its unit.
       changes: (n,) the largest change of each state that the dynamics predict.
       period: in seconds.
@@ -48,39 +47,25 @@ class PlantCheck:
         not know of these contacts.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    errors: Array
-    changes: Array
-    period: float
-    state: Array
-    control: Array
-    simulated: Array
-    predicted: Array
-    tolerance: float
+    names: Annotated[tuple[Line, ...], "n"]
+    units: Annotated[tuple[Line, ...], "n"]
+    errors: Annotated[Array, "n"]
+    changes: Annotated[Array, "n"]
+    period: Annotated[float, Bounds(above=0.0)]
+    state: Annotated[Array, "n"]
+    control: Annotated[Array, "m"]
+    simulated: Annotated[Array, "n"]
+    predicted: Annotated[Array, "n"]
+    tolerance: Annotated[float, Bounds(above=0.0)]
     samples: int
     contacts: tuple[tuple[str, str, int], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("names", "units"):
-            found = check_items(f"PlantCheck: {name}", getattr(self, name), str, "texts, one a state")
-            object.__setattr__(self, name, found)
-        n = len(self.names)
-        if not n or len(self.units) != n:
-            raise InputError(f"PlantCheck: units: got {len(self.units)} for {n} names, want one a state, at least one")
-        for name in ("errors", "changes", "state", "simulated", "predicted", "control"):
-            size = None if name == "control" else n
-            object.__setattr__(self, name, shaped(f"PlantCheck: {name}", getattr(self, name), (size,)))
-        for name in ("period", "tolerance"):
-            object.__setattr__(self, name, check_number(f"PlantCheck: {name}", getattr(self, name), above=0.0))
-        object.__setattr__(self, "samples", check_count("PlantCheck: samples", self.samples))
-        wanted = "(geom, geom, in how many samples) of each pair that touched"
-        pairs = check_items("PlantCheck: contacts", self.contacts, tuple, wanted)
-        for pair in pairs:
-            if len(pair) != 3 or not all(isinstance(name, str) for name in pair[:2]):
-                raise InputError(f"PlantCheck: contacts: got {excerpt(pair)}, want {wanted}")
-            check_count("PlantCheck: contacts: count", pair[2], at_most=self.samples)
-        object.__setattr__(self, "contacts", pairs)
+        if not check_fields(self)["n"]:
+            raise InputError("PlantCheck: names: got none, want at least one state")
+        check_count("PlantCheck: samples", self.samples)
+        for *_, count in self.contacts:
+            check_count("PlantCheck: contacts: count", count, at_most=self.samples)
 
     @property
     def relative(self) -> Array:
@@ -134,12 +119,12 @@ def check_plant(
     """Compare a robot's dynamics with its MJCF over one control period, from random states.
 
     A different mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
-    What runs do not count as an obstacle stays: the floor that the robot stands on, or planes parallel to its own.
+    Geoms that are no obstacles in runs stay: the floor that the robot stands on, or planes parallel to its own.
     Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
-      robot: with the dynamics.
-      scene: with the robot in its MJCF.
+      robot: the robot, with its dynamics.
+      scene: a scene whose MJCF has the robot.
       period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
       around: (n,) mean of the random states, zero by default.
       spread: their standard deviation, in each state's unit.
@@ -148,10 +133,7 @@ def check_plant(
         wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
       tolerance: largest allowed error, relative to the largest change of the state.
-      seed: of all random numbers.
-
-    Returns:
-      The PlantCheck.
+      seed: seed of all random numbers.
 
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the

@@ -21,16 +21,13 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
 
     A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation. A
     truncated normal distribution counts with its own standard deviation. Losses in bursts count as independent ones,
-    and displaced obstacles as displaced by the same along all axes. `left_out` has, with the reasons, what the robot's
-    dynamics do not declare, and what is not small, lasting and linear: pushes, narrower limits, the loss of an
-    actuator.
+    and displaced obstacles as displaced by the same along all axes. `left_out` lists, with reasons, disturbances that
+    the robot's dynamics do not declare, and those that are not small, lasting and linear: pushes, narrower limits, the
+    loss of an actuator.
 
     Args:
-      plant: what is run.
+      plant: the simulated robot.
       disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
-
-    Returns:
-      The Uncertainty.
 
     Raises:
       InputError: a disturbance does not fit the plant.
@@ -53,12 +50,13 @@ def tube_under(
     disturbances: Sequence[Disturbance],
     controller: ControllerLike | None = None,
 ) -> tuple[Tube | None, str]:
-    """Predict the tube of a run if possible. Returns it with a line that says what it leaves out, or why there is none.
+    """Predict the tube of a run if possible. Returns it with a line that says what it leaves out, or why there is no
+    uncertainty.
 
     Without disturbances there is neither a tube nor a line.
 
     Args:
-      problem: that was solved. solution: its solution. plant, disturbances, controller: as in `simulate`.
+      problem: the problem that was solved. solution: its solution. plant, disturbances, controller: as in `simulate`.
     """
     if not disturbances:
         return None, ""

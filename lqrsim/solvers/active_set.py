@@ -7,7 +7,7 @@ neighbouring steps only the worst, since holding one usually keeps them all. Whe
 fall, they change one at a time, which terminates for convex models.
 
 Second-order models have a minimum only with the right rows held. Where the known rows do not suffice, convex models
-choose the rows first; the step itself uses as much of the second order as leaves a minimum.
+choose the rows first; the step itself uses the largest share of the second order that leaves a minimum.
 """
 
 import time
@@ -32,9 +32,9 @@ class ActiveSet:
     """Steps from one plan.
 
     Args:
-      stages: of the problem.
+      stages: stages of the problem.
       plan: states (T+1, n) and controls (T, m), not necessarily a motion; the first state is the start.
-      multipliers: of the constraints, (T+1, rows) each, or none.
+      multipliers: multipliers of the constraints, (T+1, rows) each, or none.
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
@@ -72,7 +72,7 @@ class ActiveSet:
         """Take steps until the measures are within tolerance; return whether they are.
 
         Args:
-          tolerance: of stationarity, gaps and complementarity.
+          tolerance: tolerance of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
           late: called with a duration in seconds before work that takes about that long; True abandons the step.
         """
@@ -144,7 +144,7 @@ class ActiveSet:
         return True
 
     def _due(self) -> bool:
-        """Whether a pivot and new models would end too late, with the time of another such pair to spare."""
+        """Whether a pivot and new models would end too late, with the time of another such pair as a margin."""
         return self._late(2 * self.looking)
 
     def _from_convex(self) -> bool:

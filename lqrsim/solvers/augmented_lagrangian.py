@@ -25,12 +25,13 @@ from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess
 
-PENALTY = 8.0  # initial penalty, relative to what it costs to change the constraint's value
+PENALTY = 8.0  # initial penalty, relative to the cost of changing the constraint's value
 GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and in all before it is given up
 STUCK = 3  # how often in a row the penalty may grow to no avail
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
-ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
-ROUGHEST_GAP = 3e-2  # the same gap of damped iterations, which come to their minimum slowly
+# When a run has converged enough to update the multipliers, and the iterations after which they are updated anyway.
+ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
+ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
 
 
@@ -40,19 +41,19 @@ def finish(run: SolveRun) -> RunResult:
         found = satisfy(run, None)
         if found.success or run.budget.over:
             return run.certified(found)
-        # What is known of another problem does not help here.
+        # Knowledge of another problem does not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
     run, found = _with_constraints(run, run.solve())
     return run.certified(found)
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
-    """Another run, with what is left of the budget."""
+    """Another run, with the rest of the budget."""
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
 
 
 def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
-    """Go on from what was found without the constraints; also which run has the answer in its memory."""
+    """Continue from the result without the constraints; also returns which run has the answer in its memory."""
     if run.budget.over:
         if found.success and not run.work.keeps(run.work.constraint_values(found.states, found.controls)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
@@ -64,7 +65,7 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
 
 
 def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
-    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
+    """Continue from the result without the constraints or, without one, from another solution's multipliers."""
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
@@ -98,7 +99,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
         if kept.success and not budget.over:
             kept = satisfy(without, kept)
     if not kept.success or budget.over:
-        # Of the plan, only what the constraints say is known: its certificate tells the cost.
+        # Only the constraints of the plan are known; its certificate has the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
         return run, dataclasses.replace(kept, status=status, final=not kept.success, values={})
     initial_guess = dataclasses.replace(
@@ -171,9 +172,9 @@ def _damped(
 
 
 def refine(run: SolveRun) -> RunResult:
-    """Run to the end by steps that lower the cost alone, from where the first policy leads; certified.
+    """Run to the end, only by steps that lower the cost, from the rollout of the first policy; certified.
 
-    So it stays on the way round that it begins with, which undamped iterations would leave.
+    So it stays in the homotopy class that it begins with, which undamped iterations would leave.
     """
     run.roll_out()
     cost = float(run.work.memory["plan_cost"])
@@ -183,7 +184,7 @@ def refine(run: SolveRun) -> RunResult:
     if not run.problem.constraints:
         run.work.memory["merit"] = cost
         damped = run.damped()
-        if run.second_order and damped.success and not run.budget.over:  # damped ones do not come to all digits
+        if run.second_order and damped.success and not run.budget.over:  # damped ones do not reach all digits
             return run.certified(run.newton())
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
@@ -224,7 +225,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
 
 
 def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
-    """What the multipliers become: lambda - mu d, of inequalities not below 0; 0 where they do not act."""
+    """The new multipliers: lambda - mu d, for inequalities not below 0; 0 where they do not act."""
     acting = np.where(np.isinf(values), 0.0, values)
     forces = np.clip(array[declarations.HEADER :] - array[0] * acting, -array[4] if term.equality else 0.0, array[4])
     return np.where(np.isinf(values), 0.0, forces)
@@ -244,22 +245,22 @@ class AugmentedLagrangian:
     Inequalities and equalities each have a tolerance, and their penalties grow on their own.
 
     Attributes:
-      kept: whether the plan that was evaluated last keeps the constraints.
+      kept: whether the last evaluated plan keeps the constraints.
       solved: whether it does so as well as is aimed at: inequalities with the tolerance to spare, and where more than
         that is left, with a multiplier that is not off by more: `|min(d, lambda / mu)|`; equalities `|d|`.
-      nearly: whether it would if equalities could be missed by as much as inequalities have to spare.
-      grown: by how much a penalty has grown. stuck: how often in a row that did not help.
+      nearly: whether it would with the inequalities' tolerance for equalities, too.
+      grown: factor by which a penalty has grown. stuck: number of times in a row that this did not help.
     """
 
     def __init__(self, run: SolveRun) -> None:
         self._problem, self._work = run.problem, run.work
         self._terms = run.problem.constraint_terms
         self._near = tolerance = run.settings.violation_tolerance(run.problem)
-        # Of inequalities and of equalities, if there are any.
+        # The tolerances of inequalities and of equalities, if there are any.
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
+        self._first = [array[0] for array in self._work.multipliers]  # zero, except those of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
@@ -282,12 +283,12 @@ class AugmentedLagrangian:
         self.nearly = not self.kept and beyond <= 0
 
     def start(self) -> None:
-        """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
+        """No multipliers, and for each constraint a penalty that fits the cost of changing it."""
         self._restart()
         for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
             array[declarations.HEADER :] = 0.0
             if not self._first[which] > 0:
-                # Only now: once there is a penalty, it is what the passes say of curvature.
+                # Only now: once there is a penalty, the passes' curvature contains it.
                 self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
             array[0] = self._first[which]
 
@@ -312,7 +313,7 @@ class AugmentedLagrangian:
         self._last = missed
 
     def added(self) -> float:
-        """What the augmented Lagrangian adds to the cost of the plan."""
+        """The augmented Lagrangian's terms in the cost of the plan."""
 
         def one(term: ConstraintTerm, array: Array, values: Array) -> float:
             known, acting = array[declarations.HEADER :], np.where(np.isinf(values), 0.0, values)
@@ -330,7 +331,7 @@ class AugmentedLagrangian:
         return tuple(self._each(one))
 
     def worst(self) -> str:
-        """Which constraint is missed most, by how much and when."""
+        """The worst violated constraint, by how much, and when."""
         if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
@@ -344,27 +345,27 @@ class AugmentedLagrangian:
         return f"{self._terms[which].describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
 
     def _constraints(self) -> Iterator[tuple[ConstraintTerm, Array, Array]]:
-        """Of each what it is, its multipliers, and its numbers as they are aimed at."""
+        """For each constraint: its term, its multipliers, and its values relative to its target."""
         return zip(self._terms, self._work.multipliers, self._values, strict=True)
 
     def _each(self, function: Callable[[ConstraintTerm, Array, Array], "float | Multipliers"]) -> list:
         return [function(*one) for one in self._constraints()]
 
     def _worst_of(self, which: int) -> int:
-        """Which of a constraint's numbers is missed most; of equals the first, or an equality's last, which acts."""
+        """The worst violated entry of a constraint: the first of equal ones, or an equality's last, which acts."""
         values = self._values[which]
         if self._terms[which].equality:
             return len(values) - 1 - int(np.abs(values[::-1]).argmax())
         return int(values.argmin())
 
     def _curvature(self, which: int) -> float:
-        """What it costs to change what is missed most: of an equality the most that it costs for any of its numbers."""
+        """The cost of changing the worst violation; for an equality, the largest cost for any of its entries."""
         step, row = divmod(self._worst_of(which), self._terms[which].rows)
         rows = range(self._terms[which].rows) if self._terms[which].equality else (row,)
         return max(self._curvature_of(which, step, row) for row in rows)
 
     def _curvature_of(self, which: int, step: int, row: int) -> float:
-        """What it costs to change one of a constraint's numbers: twice the total cost of a change by 1 unit.
+        """The cost of changing one entry of a constraint: twice the total cost of a change by 1 unit.
 
         `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
         """

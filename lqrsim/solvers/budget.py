@@ -1,4 +1,4 @@
-"""What a solve may take: time, iterations, and how it learns that the caller wants it to end."""
+"""The budget of a solve: time, iterations, and how it learns that the caller wants it to end."""
 
 import contextlib
 import time
@@ -17,8 +17,8 @@ Callback = Callable[[Iteration], object]
 class Stop:
     """Why a solve ends early: a deadline on the clock of `time.perf_counter`, or an exception.
 
-    What the callback raises, and Ctrl-C, end a solve as a deadline does: with the best plan so far. `finish` raises the
-    exception again, with that plan as its `solution`.
+    An exception of the callback, and Ctrl-C, end a solve as a deadline does: with the best plan so far. `finish` raises
+    the exception again, with that plan as its `solution`.
     """
 
     deadline: float = np.inf
@@ -27,7 +27,7 @@ class Stop:
     reserve: float = 0.0
 
     def begin(self, seconds: float | None) -> None:
-        """Have a deadline so many seconds from now; None for no deadline."""
+        """Set a deadline this many seconds from now; None for no deadline."""
         self.deadline = np.inf if seconds is None else time.perf_counter() + seconds
 
     @property
@@ -48,10 +48,10 @@ class Budget:
     """Iterations, time and callback of one run. Runs of one solve share a `Stop`; each has its own iterations.
 
     Attributes:
-      log: the iterations so far, by whatever method.
-      stop: the deadline, or what the callback raised.
-      attentive: whether compiled code returns now and then, to heed Ctrl-C. Where many problems are solved at once, it
-        does not.
+      log: the iterations so far, by any method.
+      stop: the deadline, or the exception of the callback.
+      attentive: whether compiled code returns regularly, so that Ctrl-C ends it. Where many problems are solved at
+        once, it does not.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Budget:
         self.log: list[Iteration] = []
 
     def another(self) -> "Budget":
-        """The same for another run, which has as many iterations."""
+        """The same for another run, with the same number of iterations."""
         return Budget(self._most, self.stop, callback=self._callback, attentive=self.attentive)
 
     @property
@@ -86,7 +86,7 @@ class Budget:
         self._tell((iteration,))
 
     def report_to(self, callback: Callback | None) -> None:
-        """Have a callback from now on, which is told of the iterations so far at once."""
+        """Set a callback; it is called at once with the iterations so far."""
         self._callback = callback
         self._tell(self.log)
 
@@ -101,7 +101,7 @@ class Budget:
 
     @contextlib.contextmanager
     def limited(self, most: int) -> Iterator[None]:
-        """For a while: at most so many further iterations."""
+        """Temporarily allow at most this number of further iterations."""
         before, self._most = self._most, min(self._most, len(self.log) + most)
         try:
             yield
@@ -110,7 +110,7 @@ class Budget:
 
     @contextlib.contextmanager
     def without_costs(self) -> Iterator[None]:
-        """For a while: the costs of iterations are those of another problem, and are not logged."""
+        """Temporarily: iterations are of another problem, and their costs are not logged."""
         begin, callback = len(self.log), self._callback
 
         def hidden(iteration: Iteration) -> Iteration:
@@ -127,7 +127,7 @@ class Budget:
     def joined_with_last(self, method: str) -> Iterator[None]:
         """For a while: a single iteration that follows is a look at the plan, and counts as part of the last one.
 
-        The callback is told at the end.
+        The callback is called at the end.
         """
         begin, callback, self._callback = len(self.log), self._callback, None
         try:

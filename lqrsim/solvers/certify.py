@@ -1,7 +1,7 @@
 """Certificates: before a solver reports success, its plan is checked against the problem itself.
 
 `kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a code path of its own; this module
-compares them with what the solver claims.
+compares them with the solver's claims.
 """
 
 from collections.abc import Callable
@@ -46,9 +46,9 @@ def certified(
     Args:
       work: runs the compiled `certify` for a task and a cost-to-go, and writes its results to an array (1,).
       states: (T+1, n) of the plan. value: the cost-to-go; None where there is none.
-      violation: by how much the worst constraint is missed. kept: whether that is within the equalities' tolerance.
+      violation: violation of the worst constraint. kept: whether that is within the equalities' tolerance.
       claimed: the last cost in the log; None where the solver does not claim success.
-      tolerance: of the optimality; None where only the cost was asked for.
+      tolerance: tolerance of the optimality; None where only the cost was asked for.
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
 
@@ -96,8 +96,8 @@ def faults(
     """List what contradicts a claim of convergence, in words; empty if nothing does.
 
     Args:
-      claimed: the cost that the log ends with. rest: the rounding error of a cost whose terms cancel.
-      tolerance: of the optimality; None where only the cost was asked for.
+      claimed: the last cost in the log. rest: the rounding error of a cost whose terms cancel.
+      tolerance: tolerance of the optimality; None where only the cost was asked for.
       kept: whether the violation is that of equalities within their tolerance.
     """
     found = []

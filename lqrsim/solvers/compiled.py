@@ -88,7 +88,7 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_ord
     """The arguments of the passes; compiles the problem's functions if they are new.
 
     Args:
-      multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
+      multipliers: multipliers of each constraint, as `augmented_lagrangian.py` has them; by default none act.
       second_order: whether the passes need second derivatives of the dynamics.
     """
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]

@@ -178,7 +178,7 @@ class Ladder:
         return self._after_multipliers(found)
 
     def _after_multipliers(self, found: RunResult) -> RunResult | None:
-        """The interior point from the plan that the method of multipliers came to."""
+        """The interior point from the last plan of the method of multipliers."""
         plan = _plan(found)
         self._without_multipliers()
         if self._budget.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
@@ -319,7 +319,7 @@ class Ladder:
     def _polished(self, found: Found) -> RunResult | None:
         """Finish a converged plan: put controls at their limits there, and compute the policy by Newton's method.
 
-        That minimises the augmented Lagrangian with the multipliers found, of which the plan is a minimum.
+        It minimises the augmented Lagrangian with these multipliers, whose minimum the plan is.
         """
         work, stages = self._run.work, self._stages
         low, high = stages.low, stages.high
@@ -340,7 +340,7 @@ class Ladder:
             array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             # Chosen so that the forces of the augmented Lagrangian at this plan are the multipliers found.
             force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
-            presses = found.multipliers[k] > array[0] * (numbers - array[3])  # others are what the barrier leaves
+            presses = found.multipliers[k] > array[0] * (numbers - array[3])  # others are left over from the barrier
             acts = np.isfinite(numbers) & (term.equality | presses)
             array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls

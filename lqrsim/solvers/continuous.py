@@ -1,6 +1,6 @@
 """LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
 
-`riccati_ode.py` has the equations and integrates them; `continuous_solution.py` has what comes out.
+`riccati_ode.py` has the equations and integrates them; `continuous_solution.py` has the result.
 """
 
 import math
@@ -135,16 +135,16 @@ def smooth_continuous(
     """Compute a locally optimal feedback policy by iterated LQR smoothing in continuous time. Paper: Sec. V.
 
     The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
-    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step is
-    given the one in which the time lies, and at least 1: what is off at the first instant costs nothing there. Controls
-    have no limits here.
+    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step
+    gets the step in which the time lies, but at least 1, because some costs do not act at step 0. Controls have no
+    limits here.
 
     Args:
-      problem: with an initial cost, the paper's soft start.
-      tolerance: of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol` counts as
-        that.
-      gap_tolerance: of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
-      max_iterations: when to give up.
+      problem: a problem with an initial cost, the paper's soft start.
+      tolerance: tolerance of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol`
+        counts as that.
+      gap_tolerance: tolerance of the gap (see `Iteration`), checked every dt. The dynamics residual is not evaluated.
+      max_iterations: number of iterations after which to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
         InitialPrior, which adds to that. It has a say in which local optimum is found.
       rtol: relative tolerance of all integrations.
@@ -168,7 +168,7 @@ def smooth_continuous(
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
     if problem.noise is not None:
-        raise InputError("noise: got some, which is per control period, want none in continuous time; smooth has it")
+        raise InputError("noise: got some, want none in continuous time: noise is per control period; smooth takes it")
     if problem.dynamics.discrete:
         raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
     limits = _Limits(
@@ -207,7 +207,7 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
     """The control (m,) of the first pass, and the prior. Raises InputError."""
     prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
     if prior is not None and prior.obstacles:
-        raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
+        raise InputError(f"start: got a prior with obstacles={prior.obstacles}, want one without in continuous time")
     wanted = start.controls if isinstance(start, InitialPrior) else start
     if wanted is None:
         return problem.nominal_control, prior
@@ -248,7 +248,7 @@ class _Smoother:
     """Runs the iterations, and keeps the state between them.
 
     Attributes:
-      forward, backward: the passes of the last iteration of which both were completed; None before.
+      forward, backward: the passes of the last iteration that completed both; None before.
       where: the pass that is under way.
       cost, gap: of the last rollout; see `Iteration`.
     """

@@ -1,11 +1,13 @@
 """What a solve in continuous time returns: policy and value functions as functions of time."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_number, excerpt, real
+from lqrsim.errors import Array, InputError, check_kind, excerpt, real
+from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.riccati_ode import Pass
@@ -26,17 +28,13 @@ class ContinuousSolution:
 
     status: Status
     detail: str
-    horizon: float
+    horizon: Annotated[float, Bounds(above=0.0)]
     iterations: tuple[Iteration, ...] = ()
-    _backward: Pass | None = field(repr=False)
-    _forward: Pass | None = field(repr=False)
+    _backward: Pass | None = field(repr=False, compare=False)
+    _forward: Pass | None = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        check_kind("ContinuousSolution: status", self.status, Status, "a Status")
-        check_kind("ContinuousSolution: detail", self.detail, str, "text")
-        check_number("ContinuousSolution: horizon", self.horizon, above=0.0)
-        log = check_items("ContinuousSolution: iterations", self.iterations, Iteration, "a tuple of Iteration")
-        object.__setattr__(self, "iterations", log)
+        check_fields(self)
         for name in ("_backward", "_forward"):
             check_kind(f"ContinuousSolution: {name}", getattr(self, name), (Pass, type(None)), "a Pass or None")
 

@@ -76,9 +76,9 @@ class Ending:
     """How iterations ended: the kernel's outcome, and what users read of it.
 
     Attributes:
-      outcome: of `kernels/declarations.py`. done: how many iterations there are, those before included.
+      outcome: outcome of `kernels/declarations.py`. done: how many iterations there are, those before included.
       failed: the step of the pass that failed, or -1. backward: whether that was a backward pass.
-      raised: what a user's function raised, if one did.
+      raised: the exception of a user's function, if there was one.
     """
 
     outcome: int
@@ -103,7 +103,7 @@ class Ending:
         )  # fmt: skip
 
     def detail(self, steps: int) -> str:
-        """Where it ended, of so many steps, and what a user's function raised there."""
+        """The step at which it ended, of this number of steps, and the exception of a user's function there."""
         raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
         return ": ".join(part for part in (self._place(steps), raised) if part)
 
@@ -142,7 +142,7 @@ def iterate(
       budget: whose log the iterations join. Compiled code returns after each iteration where there is a callback, a
         deadline or a constraint to look at, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
         an iteration are the average of those between two returns.
-      violation: by how much the constraints are missed by what `run` found last.
+      violation: violation of the constraints by the last result of `run`.
     """
     functions, stop = functions_of(problem), budget.stop
     single = (
@@ -184,7 +184,7 @@ def iterate(
 
 
 def raised_by(functions: Iterable[UserFunction]) -> str:
-    """What the functions have raised, in words."""
+    """The exceptions of the functions, as text."""
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return "; ".join(raised)
 
@@ -215,7 +215,7 @@ class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 
     Attributes:
-      cost: of the plan, as the log has it; infinite where there is no plan.
+      cost: cost of the plan, as the log has it; infinite where there is no plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
       final: whether another start cannot do better.
     """
@@ -245,13 +245,13 @@ class RunResult:
 
 
 class SolveRun:
-    """Iterated LQR smoothing from one start, in whatever state it is.
+    """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
-      ending: how smoothing stands; the outcome is RUNNING until it has ended.
-      second_order: whether Newton's method has the last iterations. final, rough: the tolerances of the answer, and of
-        what smoothing comes to; see `SmootherSettings`.
+      initial_guess: its start. work: its memory. budget: its iterations and its time.
+      ending: the state of smoothing; the outcome is RUNNING until it has ended.
+      second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
+        the smoothing before it; see `SmootherSettings`.
     """
 
     def __init__(
@@ -271,7 +271,7 @@ class SolveRun:
     ) -> "SolveRun":
         """A run in memory that an earlier solve gave back, if there is some: allocating takes time.
 
-        It overwrites what the earlier solve returned, which therefore has to be copied before.
+        It overwrites the result of the earlier solve, which therefore has to be copied before.
         """
         core, steps = compiled.core(problem, settings.form), problem.steps
         if settings.first_pass == "forward":
@@ -316,7 +316,7 @@ class SolveRun:
         return np.inf if self.ending.pass_failed else _cost_of(self._last)
 
     def smooth(self, last: int) -> None:
-        """Go on until smoothing has done `last` iterations, or ends."""
+        """Continue until smoothing has done `last` iterations, or ends."""
         if self.ending.outcome != declarations.RUNNING:
             return
         if not self._row and not self.run_opening_pass():
@@ -342,7 +342,7 @@ class SolveRun:
         return ending
 
     def _count(self, begin: int) -> int:
-        """How many iterations of smoothing have joined the log, which had `begin`."""
+        """Number of smoothing iterations that were added to a log of `begin` entries."""
         added = len(self.budget.log) - begin
         if added:
             self._last = self.budget.log[-1]
@@ -380,7 +380,7 @@ class SolveRun:
         """How smoothing ended; NOT_FINITE if a function is not finite at the start.
 
         Raises:
-          InputError: a function is not finite at the start, and the budget is attentive.
+          InputError: a function is not finite at the start, and `budget.attentive` is set.
         """
         start, control = self.work.start, self.initial_guess.offset[0]
         return check_finite_at_start(
@@ -388,7 +388,7 @@ class SolveRun:
         )
 
     def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
-        """Newton's method from the best plan so far; `added` is what constraints add to its cost."""
+        """Newton's method from the best plan so far; `added` is the constraints' share of its cost."""
         work, last = self.work, self.budget.left
         rows, trial = np.zeros(max(last, 1), LOG), Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
@@ -405,9 +405,9 @@ class SolveRun:
         return [array.copy() for array in self._going_on]
 
     def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
-        """Have smoothing go on from a checkpoint, and not stop in the valley.
+        """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
 
-        Iterations of other methods that came to nothing count as smoothing's: it is to make progress from there.
+        Iterations of other methods that failed count as smoothing's: it has to make progress from there.
         """
         for array, copy in zip(self._going_on, checkpoint, strict=True):
             array[...] = copy
@@ -654,9 +654,9 @@ class Workspace:
     """The memory of a run: what its iterations read and write.
 
     Attributes:
-      arrays: what is in `records.SmootherArrays`. model: the problem's numbers.
-      memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
-      multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
+      arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
+      memory: the safeguard's state between two iterations, a row of `MEMORY`; memory_rows: (1,) that row.
+      multipliers: multipliers of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
       core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
     """
 
@@ -668,7 +668,7 @@ class Workspace:
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
-        kept = steps if self.dual else 1  # the primal form finds its way back without
+        kept = steps if self.dual else 1  # the primal form recovers without it
 
         def plan() -> Motion:
             return Motion(zeros((steps + 1, n)), zeros((steps, m)))
@@ -688,7 +688,7 @@ class Workspace:
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        """Begin a solve, also after another one of the same size with as many steps."""
+        """Begin a solve, also after another one of the same size and number of steps."""
         self._problem, self._tolerance, steps = problem, settings.violation_tolerance(problem), problem.steps
         self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
@@ -755,7 +755,7 @@ class Workspace:
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
     def homotopy_scaled(self, share: float) -> CostModel:
-        """The stage cost with that share of what the homotopy scales; see `CostTerm.factor`."""
+        """The stage cost with its homotopy-scaled terms at that fraction; see `CostTerm.factor`."""
         if share == 1:
             return self.model.stage
         data = list(self.model.stage.data)

@@ -55,13 +55,13 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
-      problem: with a start that is given exactly, or by the initial cost.
+      problem: a problem whose start is given exactly, or by the initial cost.
       stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      tolerance: of the relative change of cost, and of the optimality, as in `smooth`.
+      tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
       max_iterations: the most iterations.
       time_limit: as in `smooth`.
-      start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
-        controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
+      start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the controls of
+        a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
       callback: as in `smooth`.
       noise: as in `smooth`; with noise this is iLQG.
       risk: as in `smooth`.
@@ -95,7 +95,7 @@ def ilqr_many(
     """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
 
     Args:
-      problems: of one structure or of many; each structure is compiled once.
+      problems: problems of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
       progress: called with the numbers of solved and of all problems, as each solve ends.
       noise: as in `ilqr`, for all problems.

@@ -14,7 +14,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers.engine import Workspace
 
-STATIONARY = 5e-3  # largest remaining gradient, relative to what cancels
+STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
 AT_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
 NAMED = 3  # most constraints that a message names beside the one that is violated most
 
@@ -24,8 +24,8 @@ class Evidence:
     """A plan whose violation is stationary.
 
     Attributes:
-      states: (T+1, n). controls: (T, m). left: the remaining gradient, relative to what
-        cancels. missed: the total violation.
+      states: (T+1, n). controls: (T, m). left: the remaining gradient, relative to the gradients that cancel. missed:
+        the total violation.
       against: the other constraints that conflict, in words, the strongest first.
     """
 

@@ -86,7 +86,7 @@ class InitialPrior:
         """Check that the prior fits a problem.
 
         Args:
-          problem: to be solved with it.
+          problem: the problem to be solved with it.
 
         Returns:
           The prior itself, with one entry per state.
@@ -117,7 +117,7 @@ class InitialGuess:
       trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
       summary: its entry in the options of a solution.
       prior: added to the cost in the first iterations.
-      multipliers: of the constraints, if known.
+      multipliers: multipliers of the constraints, if known.
       found: a result that the interior point already has, after the iterations in `log`; it is only finished.
     """
 

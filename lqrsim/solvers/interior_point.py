@@ -3,8 +3,8 @@
 Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
 the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
 falls by Mehrotra's rule where the last step was long and the measures come down, and otherwise when its own problem is
-nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); what a long step leaves open
-is then closed by corrections with the same models. Where a model has no minimum, the Hessian is mixed with that of the
+nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); corrections with the same
+models then reduce the residuals of a long step. Where a model has no minimum, the Hessian is mixed with that of the
 projected cost until it has.
 
 A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
@@ -38,8 +38,9 @@ REGULARISATION = 1e-8  # of equalities, relative
 # must exceed 1e-9 of its weight, below which the kernel takes it for rounding.
 CROSSING = 1e-6
 LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
-LATELY = 4  # iterations with that rule, than the worst of which the measures must be better for it to go on
-CLOSINGS, CLOSER = 3, 0.3  # corrections after a long step at most, and what each must leave of what was missed
+LATELY = 4  # iterations with that rule; to continue, the measures must be better than in the worst of them
+# Most corrections after a long step, and the largest share of the violation that each may leave.
+CLOSINGS, CLOSER = 3, 0.3
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
 NOTHING, FAR = 1e-4, 1e-2  # scale of the first plan, relative to the typical cost of a change: the least; if infinite
 SHORTEST = 1e-7  # part of a step before the line search gives up
@@ -61,10 +62,9 @@ class Measures(NamedTuple):
     """Residuals of a plan.
 
     Attributes:
-      cost: of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative to
-        the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
-        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to
-        the cost.
+      cost: cost of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative
+        to the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
+        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to the cost.
     """
 
     cost: float
@@ -87,9 +87,9 @@ class Found:
     """Result of a run.
 
     Attributes:
-      plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
-      multipliers: of each constraint (T+1, rows); of the limits (T, m), positive where a control presses against the
-        upper one. solved: whether all measures are within tolerance. iterations: how many there were.
+      plan: states and controls, a motion except for gaps. gain: (T, m, n) about it. measures: its measures.
+      multipliers: multipliers of each constraint (T+1, rows); of the limits (T, m), positive where a control presses
+        against the upper one. solved: whether all measures are within tolerance. iterations: how many there were.
       control_size, row_size: typical sizes of controls (m,) and rows (R,). scale: the cost that measures are relative
         to.
     """
@@ -382,11 +382,11 @@ class InteriorPoint:
     """Runs the interior point from one plan.
 
     Args:
-      problem: with constraints, limits, or neither.
+      problem: a problem with constraints, limits, or neither.
       plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
       barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
-      room: what slacks are at first, at least: relative to a row's size, or to a control's range.
-      price: of missing a constraint, in cost a unit: then it is elastic. Infinite: it is not to be missed.
+      room: the least initial slack: relative to a row's size, or to a control's range.
+      price: price of missing a constraint, in cost a unit: then it is elastic. Infinite: it must not be missed.
       multipliers: known ones of the constraints, (T+1, rows) each, or none.
       stages: to use again, of the same problem.
     """
@@ -488,7 +488,7 @@ class InteriorPoint:
         """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
-          tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
+          tolerance: tolerance of stationarity, gaps and complementarity. violation: of the constraints, in their units.
           most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after
             each; True ends it.
         """
@@ -555,7 +555,7 @@ class InteriorPoint:
     def _cross(self, tolerance: float, violation: float) -> bool:
         """Cross over from the barrier to the active set: active rows become equalities; return whether they were right.
 
-        So controls end at their limits, and multipliers lose what the barrier added. Constraints keep a margin for
+        So controls end at their limits, and multipliers lose the barrier's contribution. Constraints keep a margin for
         rounding.
         """
         stages, size, highest = self.stages, self._size, self._highest
@@ -609,7 +609,7 @@ class InteriorPoint:
     def _within(self, tolerance: float, violation: float) -> bool:
         found = self.measures
         others = found.stationarity < tolerance and found.gap < tolerance and found.complementarity < tolerance
-        if self._elastic:  # what is missed is in the slacks
+        if self._elastic:  # the violation is in the slacks
             return others and float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0)) < tolerance
         return others and found.violation <= violation
 
@@ -856,8 +856,8 @@ class InteriorPoint:
     ) -> tuple[Point, float, Step] | None:
         """Backtrack along a step until the filter accepts; the first trial also with a second-order correction.
 
-        The correction reduces what the whole step leaves open, since rows and dynamics are not linear. Without a
-        Hessian there is none.
+        The correction reduces the residuals after the whole step, which remain because rows and dynamics are not
+        linear. Without a Hessian there is none.
         """
         part, first = self._longest(self.point.slack, step.slack), True
         while part > SHORTEST:

@@ -43,10 +43,10 @@ def smooth_lq(
       dt: seconds a step, for the times of the trajectory and the policy.
 
     Returns:
-      A Solution with one iteration. The trajectory is the rollout of the policy. CONVERGED says that it costs what the
-      cost-to-go promised, to ACCURACY, relatively (that is its optimality); NOT_POSITIVE_DEFINITE that there is no
-      unique minimum, or none to working precision, and the detail says where. Where the states of least total cost are
-      further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
+      A Solution with one iteration. The trajectory is the rollout of the policy. CONVERGED says that its cost equals
+      the predicted cost-to-go to a relative accuracy of ACCURACY (that is its optimality); NOT_POSITIVE_DEFINITE that
+      there is no unique minimum, or none to working precision, and the detail says where. Where the states of least
+      total cost are further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
 
     Raises:
       InputError: arrays that do not fit together, or that the form does not take.
@@ -117,7 +117,7 @@ class _Passes(NamedTuple):
       law, inverse_law: gain (T, m, n) and offset (T, m).
       cost_to_go, cost_to_come: the fields of a `Quadratic`; of `Moments` for the latter in the dual form.
       x_hat: (T+1, n), the states of least total cost.
-      failure: which pass failed, and where; empty if none did.
+      failure: the pass that failed, and where; empty if none did.
     """
 
     law: tuple[Array, Array]

@@ -1,4 +1,4 @@
-"""Where `smooth` starts unless the caller says, and which of several starts it goes on with.
+"""The starts of `smooth` without one from the caller, and the choice among several starts.
 
 A homotopy draws the first iteration along a smooth path from start to goal, without obstacles, and then raises the
 obstacles' cost to its full weight. It ends in a good optimum far more often than a start from the nominal control does.
@@ -19,7 +19,7 @@ from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.parallel import workers
 
-# `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
+# `python experiments/benchmark_quality.py --sections ingredients` shows the gain from each of these choices.
 STARTS = 7
 ASIDE = 3  # the same where a constraint is to be passed
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
@@ -85,7 +85,8 @@ def passable(problem: Problem) -> list[bool]:
 
 
 def reweighted(problem: Problem, times: float) -> Problem:
-    """The problem with heavier obstacles and goal, whose plans go round and arrive whatever the controls cost.
+    """The problem with larger weights of obstacles and goal, whose plans go round obstacles and arrive even if controls
+    are expensive.
 
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """

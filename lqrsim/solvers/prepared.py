@@ -53,9 +53,6 @@ def prepare(
       max_iterations: as in `smooth`.
       finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
-    Returns:
-      A PreparedSolver.
-
     Raises:
       InputError: an argument is not as described.
     """
@@ -79,7 +76,7 @@ class PreparedSolver:
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
         check_problem(problem)
         if problem.duration is not None:
-            raise InputError("problem: got one with a duration that is free, want None where it is solved in real time")
+            raise InputError("problem: got one with a free duration, want a fixed one for solves in real time")
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates
@@ -124,9 +121,6 @@ class PreparedSolver:
         Args:
           problem: to be solved.
 
-        Returns:
-          The problem.
-
         Raises:
           InputError: it would have to be compiled.
         """
@@ -147,7 +141,8 @@ class PreparedSolver:
         after: int = 0,
         time_limit: float | None = None,
     ) -> Replan:
-        """Solve from a state, starting from a plan. The answer is no worse than going on with that plan; see `Replan`.
+        """Solve from a state, starting from a plan. The answer is no worse than continuing with that plan; see
+        `Replan`.
 
         Args:
           state: (n,) the state to plan from.
@@ -155,9 +150,6 @@ class PreparedSolver:
           problem: the problem to solve from that state; by default the prepared one.
           after: the number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
-
-        Returns:
-          A Replan.
 
         Raises:
           InputError: an argument is not as described.
@@ -359,7 +351,7 @@ class _Best:
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
       multipliers: that it was found with. cost, violation: of it. before: the cost of the first.
-      improved: whether it is another than the first. rolling_out: how long it took to see where that leads, in s.
+      improved: whether it is another than the first. rolling_out: time that its rollout took, in s.
     """
 
     def __init__(self, run: SolveRun) -> None:

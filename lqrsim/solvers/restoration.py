@@ -30,7 +30,8 @@ WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to co
 DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same for a damping of 1; bounds of the damping
 LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step above or below which the damping falls or grows, and the factor
 WIDE = 1e3  # factor by which a multiplier may differ from the one that the barrier implies
-# A violation, relative to the rows' sizes, and a change of cost that end the descent, so many times in a row.
+# The descent ends after a violation (relative to the rows' sizes) and a change of cost this small, this many times in a
+# row.
 CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
 LEVEL, FINER = 1e-4, 0.1  # negligible promised decrease, relative to the merit; factor by which it falls
 
@@ -51,7 +52,7 @@ def restore(
     """Descend from a motion (states (T+1, n), controls (T, m)).
 
     Args:
-      price: of violating a constraint by its typical size, in units of the typical cost. most: iterations.
+      price: price of violating a constraint by its typical size, in units of the typical cost. most: iterations.
       watch: called after each iteration with cost, violation and relative promised decrease; True ends the descent.
       stationary: asked, once the promised decrease is negligible, whether the violation of a motion is stationary. It
         gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.
@@ -158,7 +159,7 @@ def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -
 
 
 def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, price: float) -> bool:
-    """Find a descent direction, with as much of the exact Hessian as leaves the model a minimum."""
+    """Find a descent direction, with the largest share of the exact Hessian for which the model has a minimum."""
     models, none = stages.models, np.zeros((stages.steps, stages.n))
     for mix in MIXES:
         if stages.direction((1 - mix) * models.hessian + mix * models.convex + barrier, gradient, none):

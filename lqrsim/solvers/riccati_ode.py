@@ -71,7 +71,7 @@ class Model(NamedTuple):
 def homogeneous(
     fx: Array, fu: Array, f: Array, hessian: Array, gradient: Array, value: float, x: Array, u: Array
 ) -> Model:
-    """The model of dynamics and cost with these derivatives at (x, u), about the origin. Paper: Eqs. (24)-(27)."""
+    """The model about the origin of dynamics and cost with these derivatives at (x, u). Paper: Eqs. (24)-(27)."""
     n, m = fu.shape
     z = np.concatenate([x, u])
     slope = gradient - hessian @ z

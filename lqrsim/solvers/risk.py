@@ -55,7 +55,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
 
 
 def named(fails: Fails, risk: float, steps: int) -> str:
-    """Say at which step a risk is too high, and which one is not; empty if that cannot be told."""
+    """Say at which step a risk is too high, and which risk is not; empty if that cannot be determined."""
     failed = fails(risk)
     if failed < 0 or fails(0.0) >= 0:
         return ""

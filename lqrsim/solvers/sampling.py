@@ -17,13 +17,14 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     """Costs of simulated runs of a solution's policy from the first state of its plan, with noise drawn at random.
 
     The robot moves by the formulas of the problem, x' = g(x, u) + M(x, u) w, not in MuJoCo, and obstacles do not stop
-    it. The same seed draws the same noise whatever the solution: costs of two are compared trial by trial.
+    it. The same seed draws the same noise for any solution, so that costs of two solutions can be compared trial by
+    trial.
 
     Args:
       problem: with noise.
-      solution: of that problem, or of another one with as many states, controls and steps.
+      solution: solution of that problem, or of another one with as many states, controls and steps.
       trials: number of runs K.
-      seed: of the noise.
+      seed: seed of the noise.
 
     Returns:
       (K,) the costs.

@@ -150,7 +150,7 @@ def check_callback(callback: Callback | None) -> None:
 
 
 def check_runs(problem: Problem, starts: int) -> None:
-    """Raises InputError if the arrays of so many starts do not fit into memory."""
+    """Raises InputError if the arrays of this number of starts do not fit into memory."""
     check_memory("starts", starts, problem.steps * problem.bytes_per_step)
 
 

@@ -44,8 +44,8 @@ def smooth(
     Once these states are near the rollout, Newton's method takes over; problems with constraints are finished by an
     interior point.
 
-    Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
-    tried for a few iterations each, and the most promising goes on; see `solvers/strategy.py`.
+    Which local optimum it ends in depends on the start. With an ObstacleCost and no start, several starts are tried for
+    a few iterations each, and the most promising one is continued; see `solvers/strategy.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
@@ -53,18 +53,18 @@ def smooth(
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
         From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
         which cannot, it runs forwards.
-      safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
+      safeguard: where the method fails, continue from the best plan so far with steps that lower its cost; see
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
         the paper's test, which looks at the change of cost alone and can pass early.
-      tolerance: of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and 1e-4
-        without Newton's method.
-      gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: the most iterations that lead to the answer, by whatever method. Of a search, each start has as
-        many.
+      tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and
+        1e-4 without Newton's method.
+      gap_tolerance: tolerance of the gap (see `Iteration`).
+      max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
+        has as many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
-        comes first, does not count. It is looked at between iterations.
-      start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
+        comes first, does not count. It is checked between iterations.
+      start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
         multipliers it takes up. Or a function of the problem that returns one. Controls are cut off at their limits.
@@ -73,8 +73,8 @@ def smooth(
         inequality of the states, other than StateBounds, in a problem with a position; else 1, the straight way to the
         goal or the nominal control. The candidates are in the solution.
       constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
-        equalities no more than that. Where the augmented Lagrangian keeps them (see `finish`), inequalities are solved
-        for with so much to spare, by default 1e-3.
+        equalities no more than that. Where the augmented Lagrangian handles them (see `finish`), inequalities are
+        solved with this margin, by default 1e-3.
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
         they then act from the first iteration. It needs a start.
       finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;
@@ -118,12 +118,12 @@ def smooth_many(
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
-    The solutions are those of `smooth`, to the last bit, whatever the number of threads; only the seconds of an
-    iteration are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are
-    plain Python take turns, and gain nothing from threads.
+    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an iteration
+    are an average. Constraints are checked after each iteration. Dynamics and costs that are plain Python take turns,
+    and gain nothing from threads.
 
     Args:
-      problems: of one structure or of many; each structure is compiled once.
+      problems: problems of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
       progress: called with the numbers of solved and of all problems, as each solve ends.
       noise: as in `smooth`, for all problems.

@@ -1,7 +1,8 @@
 """What `smooth` tries, top to bottom, until something converges.
 
 `solve`
-  1. Which way round: a few iterations from each start, and the most promising goes on to its end (`Search.run`). With
+  1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
+  With
      constraints, the others follow as long as they may cost less.
   2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
      ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
@@ -51,7 +52,7 @@ from lqrsim.solvers.settings import SmootherSettings
 IDLE = 1e-6
 # Factors on the weights of obstacles and goal that find another way round.
 HEAVIER = (10.0, 100.0)
-# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
+# For a free duration: how often a shorter one is tried, by which factor, and with how many iterations.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
@@ -101,7 +102,7 @@ def solve(
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
-    """Run from one start to the end; certified. `known` is what other runs of the same problem found."""
+    """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
     if run.initial_guess.found is not None:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
@@ -138,7 +139,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs, of which the most promising are finished.
+    """Several runs; the most promising ones are finished.
 
     Attributes:
       best: the run with the best result so far, and that result.
@@ -278,7 +279,7 @@ class Search:
         self._finished.insert(0 if other else len(self._finished), (run, found))
 
     def retry_without_risk(self) -> None:
-        """If the risk was too high on the way: solve without risk, and go on from that plan."""
+        """If the risk was too high on the way: solve without risk, and continue from that plan."""
         if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)

@@ -69,7 +69,7 @@ def run_campaign(
     """Run the trials of a campaign that are not in its folder yet. Call it again to resume after an interruption.
 
     Args:
-      campaign: what to run.
+      campaign: the campaign to run.
       folder: where everything is stored.
       workers: processes on this machine; by default one per processor. 0 runs everything in this process.
       batch: trials that a worker simulates together; affects only time and memory.
@@ -155,7 +155,7 @@ def _check_versions(results: Results) -> None:
 
 
 def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:
-    """Raise InputError for what would fail in every trial, before anything is solved or written."""
+    """Raise InputError for errors that would occur in every trial, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
     impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:

@@ -14,7 +14,7 @@ multilevel_splitting.py measures the probability. The search uses no derivatives
    angle. Rounds are added up while the failure stays where it is. The search ends when the noise leaves less to gain
    than the tolerance.
 
-The result fails. It is not proven that nothing nearer does; a search from other failures is a check.
+The result fails. There may be a nearer failure; a search from other failures is a check.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,8 @@ class DesignPoint:
       first_order_probability: Phi(-|z|), FORM's estimate of the probability of failure.
       history: |z| after each round, the start first. simulations: number of computed scores.
       remaining: share of |z| that may be left to gain, by the noise of the gradient, if the failures lie beyond a
-        plane; NaN without a gradient. converged: this is less than the tolerance, and the last rounds came no nearer.
+        plane; NaN without a gradient. converged: this is less than the tolerance, and the last rounds did not come
+        closer.
     """
 
     numbers: Array
@@ -80,14 +81,14 @@ def smallest_failure(
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
       failures: (k, size) to begin with; by default those of a small splitting.
-      rounds: largest number of rounds. The search ends earlier if the noise leaves less than `tolerance` of the
-        distance to gain, and five rounds together gain less than a tenth of that.
+      rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than `tolerance` of
+        the distance, and five rounds together gain less than a tenth of that.
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer the gradient is
         mostly noise.
       spread: the length s of the steps of the pairs; each number of e is standard normal, divided by the root of
         `size`.
       tolerance: share of the distance that may be left to gain.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       progress: called with the number of finished rounds, that of all, and the distance so far as text.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Worker processes on this machine for a campaign. They may die or hang; the campaign goes on.
+"""Worker processes on this machine for a campaign. They may die or hang; the campaign continues.
 
 Weighed against libraries:
 
@@ -96,8 +96,8 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
 def end_if_started_by_import() -> None:
     """End this process if it is a worker, and its import of the caller's script has started the campaign again.
 
-    Python would only refuse to start processes there, with a page of text from each worker, and after all that the
-    script does before. The driver recognises the exit code.
+    Python would refuse to start processes there only after everything that the script does before, and with a page of
+    text from each worker. The driver recognises the exit code.
     """
     if multiprocessing.current_process().name == _NAME and not _serving:
         sys.exit(_RUNS_THE_SCRIPT)
@@ -153,7 +153,7 @@ class _Worker:
         return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
 
     def end(self) -> None:
-        """Stop the process, whatever it is doing."""
+        """Stop the process, also in the middle of a task."""
         self.connection.close()
         self.process.kill()
         self.process.join()
@@ -195,7 +195,7 @@ def _worker_environment() -> Iterator[None]:
     """Processes started in this block use one thread each, and the GLFW library that this process has loaded.
 
     Without the latter, importing MuJoCo starts a process that looks for GLFW. It would outlive a worker that is stopped
-    meanwhile, and complain that nobody reads what it has found.
+    meanwhile, and complain that nobody reads its result.
     """
     ours = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)

@@ -132,7 +132,7 @@ class ReliabilityProblem:
         return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
 
     def summary(self) -> str:
-        """Lines that say what is run, what counts as failure, and where the plan ends. Raises InputError as `score`."""
+        """Lines that describe the run, the failure, and the plan's end. Raises InputError as `score`."""
         score = self.score
         words = "; ".join(one.describe(score.plant) for one in self.disturbances)
         lines = [
@@ -156,7 +156,7 @@ class ReliabilityProblem:
         Args:
           particles: number of trials at each level.
           repetitions: number of independent estimates, from which the interval follows.
-          seed: of all random numbers.
+          seed: seed of all random numbers.
           report: called with the summary, and with a line for each level that the pilot run finds.
           progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
 
@@ -188,7 +188,7 @@ class ReliabilityProblem:
 
         Args:
           rounds: largest number of rounds.
-          seed: of all random numbers.
+          seed: seed of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the number of finished rounds, that of all, and the distance so far as text.
 
@@ -196,7 +196,8 @@ class ReliabilityProblem:
           The failure, its distance, and the contribution of each disturbance.
 
         Raises:
-          InputError: an option is out of range, the policy fails without any disturbance, or as `score` does.
+          InputError: an option is out of range, the policy fails without any disturbance, or for the reasons of
+            `score`.
           NoFailure: none was found.
         """
         seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)

@@ -85,7 +85,7 @@ def funnel(
         a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
       largest: largest level that is tried; by default that at which an angle is off by half a turn.
       failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       threads: as in `simulate`.
@@ -172,7 +172,7 @@ class FunnelCheck(NamedTuple):
 
     Attributes:
       knot: at which the trials began.
-      level: of the funnel at the knot.
+      level: level of the funnel at the knot.
       reached: the success rate with its exact interval.
       successes: whether each trial reached the goal, (K,).
     """
@@ -207,7 +207,7 @@ def check_funnel(
       controller: as for `funnel`.
       trials: number of trials at each knot.
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
-      seed: of all random numbers; it must differ from the funnel's, or the trials would not be new.
+      seed: seed of all random numbers; it must differ from the funnel's, or the trials would not be new.
       goal_radius: as for `funnel`.
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.

@@ -63,7 +63,7 @@ def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
                 f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
                 f" {MOST_TRIALS:,} trials, want one of them smaller"
             )
-    low = failures  # trials, all of which fail
+    low = failures  # trials that all fail
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if proves(middle) else (middle, high)
@@ -129,7 +129,7 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
 def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
     """Run the test's own trials, which the pilot has not used. Returns how many fail, and how many were run.
 
-    It stops once more have failed than are allowed.
+    It stops once more trials have failed than are allowed.
     """
     failed, done = 0, 0
     while done < test.trials and failed <= test.failures:

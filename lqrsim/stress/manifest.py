@@ -1,7 +1,7 @@
 """The manifest of a campaign's folder, `manifest.json`: specification, versions and hashes, checked when it is read.
 
-It has two hashes. `sha256` covers the whole file, so that an edited one is refused. `digest` covers what the rows
-depend on; each shard has it, too, so that a manifest with new settings and a renewed hash does not fit the shards.
+It has two hashes. `sha256` covers the whole file, so that an edited one is refused. `digest` covers everything that the
+rows depend on. Each shard has it, too, so that a manifest with new settings and a renewed hash does not fit the shards.
 """
 
 import json
@@ -122,7 +122,7 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_solution(solution: Solution) -> str:
-    """Hash of what a run of the solution depends on; not of the log of its solve."""
+    """Hash of everything in a solution that its runs depend on; not of the log of its solve."""
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]

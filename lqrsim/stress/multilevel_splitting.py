@@ -27,7 +27,7 @@ from lqrsim.errors import Array, InputError, check_count, check_function, check_
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 Score = Callable[[Array], Array]
-Progress = Callable[[int, int, str], object]  # how much is done, of how much, and what has been found so far
+Progress = Callable[[int, int, str], object]  # how much is done, of how much, and the result so far
 MOST = 10_000  # repetitions, moves, levels and rounds
 ACCEPTANCE = 0.4  # share of accepted moves at which the pilot run aims
 
@@ -43,8 +43,8 @@ class SplittingResult:
     Attributes:
       probability: the mean of the repetitions, with its interval: see the top of this file. If there is only one level,
         the repetitions are plain trials, and the interval is the exact one of Clopper and Pearson.
-      standard_error: of that mean. repetitions: (R,), independent unbiased estimates.
-      levels: of the score, the last one 0. step_sizes: b of the moves at each level but the last.
+      standard_error: standard error of that mean. repetitions: (R,), independent unbiased estimates.
+      levels: levels of the score, the last one 0. step_sizes: b of the moves at each level but the last.
       simulations: number of computed scores, those of the pilot run included.
       failures: (k, d) vectors that fail, from all repetitions, in their own distribution. scores: (k,) of these.
     """
@@ -89,8 +89,8 @@ def failure_probability(
       keep: share of the vectors that exceeds the next level.
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
-      seed: of all random numbers.
-      confidence: of the interval.
+      seed: seed of all random numbers.
+      confidence: confidence of the interval.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds.
       progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
@@ -164,7 +164,8 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
 
 
 class CountedScore:
-    """Counts the evaluations of a score and checks what it returns. Raises InputError unless it is a number each."""
+    """Counts the evaluations of a score and checks its results. Raises InputError unless it is one number for each
+    vector."""
 
     def __init__(self, score: Score) -> None:
         self.score, self.evaluations = score, 0

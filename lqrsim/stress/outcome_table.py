@@ -28,7 +28,7 @@ class Outcomes:
       clearance: the least, in metres; at most 0 after a collision.
       effort: integral of the squared applied controls over time, in their unit squared times s.
       saturated: share of the control periods with a command at a limit.
-      cost: of the problem, for the true states and the applied controls; NaN if the trial ended before.
+      cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before.
     """
 
     trial: npt.NDArray[np.int64]

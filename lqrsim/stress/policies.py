@@ -87,7 +87,7 @@ def solve(
 
     Args:
       policies: some of POLICIES.
-      scenario: what is solved.
+      scenario: the scenario that is solved.
       design: for "track" and "offset_free".
       given: from `solutions.given`; replaces what its solver would compute.
 
@@ -159,7 +159,7 @@ def make_controller(
     Args:
       name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
         `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
-      scenario: what was solved.
+      scenario: the scenario that was solved.
       solution: with the plan.
       design: for "track" and "offset_free".
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.

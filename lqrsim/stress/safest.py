@@ -91,10 +91,10 @@ def smooth_safest(
       disturbances: as in `simulate`.
       trials: number of trials of each plan, and of fresh trials of the chosen plan.
       starts: as for `smooth`.
-      seed: of the disturbances.
+      seed: seed of the disturbances.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
-      threads: of the search and of the simulations.
+      threads: number of threads of the search and of the simulations.
 
     Returns:
       A SafestPlan.

@@ -108,10 +108,10 @@ class Campaign:
       policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
         of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
         smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
-      design_disturbances: the disturbances for which "track" and "offset_free" are designed, whatever a trial then
-        meets. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of those in a
+        trial. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
       trials: number of trials of each cell.
-      seed: of all random numbers.
+      seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
       goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
@@ -214,10 +214,10 @@ class Campaign:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """Make a campaign from what `as_json` returned. Resolve its scenario first: that may define disturbances.
+        """Make a campaign from the result of `as_json`. Resolve its scenario first: that may define disturbances.
 
         Args:
-          fields: what `as_json` returned.
+          fields: the result of `as_json`.
 
         Returns:
           A Campaign equal to the one described.
@@ -238,7 +238,7 @@ class Campaign:
         except InputError:
             raise
         except Exception as error:  # a disturbance may raise anything for settings that are not its own
-            raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
+            raise InputError(f"campaign: got {excerpt(fields)}, want one that lqrsim wrote ({error})") from None
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:

@@ -175,9 +175,9 @@ def bootstrap(
       statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example
         `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
       samples: numbers (K,); row i of each belongs to the same trial.
-      confidence: of the interval.
+      confidence: confidence of the interval.
       resamples: number of bootstrap samples.
-      seed: of the resampling.
+      seed: seed of the resampling.
 
     Raises:
       InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such

@@ -1,7 +1,7 @@
 """Trials as a function of their random numbers: a vector of standard normal numbers determines a trial.
 
-Rare failures can then be searched for in the space of these vectors, whatever the disturbances are. It is the standard
-normal space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
+Rare failures can then be searched for in the space of these vectors, for any disturbances. It is the standard normal
+space of reliability analysis. The score is its limit-state function with the opposite sign: positive is failure.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -98,7 +98,7 @@ class PrescribedDraws:
 
 
 def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
-    """The shape of what NumPy's generators draw with these arguments."""
+    """The shape of the numbers that NumPy's generators draw with these arguments."""
     return size if size is not None else (np.broadcast_shapes(*(np.shape(one) for one in arguments)) or None)
 
 
@@ -158,7 +158,7 @@ class TrialScore:
     A trial fails if its score is positive. Standard normal numbers give trials distributed as those of `simulate`.
 
     Args:
-      plant: what is run.
+      plant: the simulated robot.
       solution: the plan, and the policy unless there is a controller.
       disturbances: as in `simulate`.
       controller: as in `simulate`.

@@ -1,1 +1,1 @@
-"""What `lqrsim new` writes, as it is for a robot of the name my_robot: programs that run where they are."""
+"""The files that `lqrsim new` writes, for a robot named my_robot: programs that run as they are."""

@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-FEW_FRAMES = 4  # up to so many wrong frames are named one by one
+FEW_FRAMES = 4  # up to this number of wrong frames, each is named
 
 
 def diagnose(

@@ -40,13 +40,10 @@ def verify_run(
     ball is read.
 
     Args:
-      rollout: of `simulate`, with frames.
+      rollout: rollout of `simulate`, with frames.
       trial: row of the rollout.
-      solution: that was run, to check the plan in the rollout.
+      solution: the solution that was run, to check the plan in the rollout.
       progress: called after each frame with the numbers of frames that are done and of all frames.
-
-    Returns:
-      The Verification.
 
     Raises:
       InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.

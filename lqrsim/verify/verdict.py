@@ -19,9 +19,9 @@ class Criterion:
     """One test of a verification.
 
     Attributes:
-      name: of the test.
+      name: name of the test.
       passed: None if it could not be checked.
-      detail: what was measured, and what was wanted.
+      detail: the measured value, and the wanted one.
     """
 
     __test__ = False  # pytest would collect it
@@ -39,7 +39,7 @@ class Verification:
     """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
 
     Attributes:
-      subject: what was verified.
+      subject: the file or run that was verified.
       method: how positions were read from pixels.
       times: (N,) seconds after the start of the run that the frames should show.
       seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
@@ -47,8 +47,8 @@ class Verification:
       planned: (N, d) positions in the plan.
       rms: root mean square of the distance between seen and actual, in metres.
       worst: largest distance between seen and actual, in metres.
-      shift: of the pictures ahead of the run, in seconds.
-      scale: of the seen motion relative to the actual one.
+      shift: shift of the pictures ahead of the run, in seconds.
+      scale: scale of the seen motion relative to the actual one.
       tests: each with a verdict.
       likely: the likely cause if a test failed; otherwise empty.
     """

@@ -53,9 +53,6 @@ def verify_video(
       solution: as for `verify_run`.
       progress: as for `verify_run`.
 
-    Returns:
-      The Verification.
-
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
@@ -110,7 +107,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
     Args:
       frames: number of frames that were decoded.
       off: largest error of the time of a frame, in seconds.
-      area: of the smallest mark, in pixels.
+      area: area of the smallest mark, in pixels.
     """
     return (
         Criterion(

@@ -35,8 +35,8 @@ from lqrsim.view.viewer_base import PUSHES, Viewer
 
 TESTED_VERSION = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
-HOST_NAMES = LOOPBACK, "localhost"  # by which requests may address it
-# No other page may read, embed or frame what it sends.
+HOST_NAMES = LOOPBACK, "localhost"  # names by which requests may address it
+# No other page may read, embed or frame its responses.
 PRIVATE_HEADERS = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
 SHARING_HEADER = "Access-Control-Allow-Origin"
 START_TIMEOUT = 10.0  # s, for the server to start
@@ -152,7 +152,7 @@ class Browser(Viewer):
 
     Args:
       port: 0 takes the first free port from 8080 on.
-      title: of the page. The other arguments are those of a Viewer.
+      title: title of the page. The other arguments are those of a Viewer.
 
     Attributes:
       port: on which the server listens.

@@ -30,7 +30,7 @@ class Camera:
     Attributes:
       position: in metres; the line from here along `forward` meets the middle of the picture.
       forward, up: orthogonal unit vectors.
-      height: of the picture, in metres of the world.
+      height: height of the picture, in metres of the world.
     """
 
     name: str

@@ -44,7 +44,7 @@ class Caption:
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
     def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
-        """The title, as many disturbances as leave most of the picture free, and the number of the others."""
+        """The title, the disturbances as far as they leave most of the picture free, and the number of the others."""
         tile = np.empty((0, 0, 4), dtype=np.uint8)
         for count in range(len(what), -1, -1):
             left = len(what) - count
@@ -73,7 +73,7 @@ class Caption:
         return text_tiles.text_tile(lines, self.letter_height, width=width, bold=False)
 
     def _readings_width(self, lines: int) -> int:
-        """The width in pixels of the readings in so many lines, with room for longer numbers."""
+        """The width in pixels of the readings in this number of lines, with room for longer numbers."""
         run, times = self.recorded.rollout, [0.0, self.recorded.end]
         if (funnel := self.overlays.funnel) is not None:
             times.append(float(run.times[funnel.said.index(max(funnel.said, key=len))]))
@@ -82,7 +82,7 @@ class Caption:
         return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
 
     def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
-        """The readings in at most so many lines."""
+        """The readings in at most this number of lines."""
         readings = self._readings(time)
         count = min(most, len(readings))
         cuts = [len(readings) * number // count for number in range(count + 1)]
@@ -113,7 +113,7 @@ class Legend:
 
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
         named = dict(entry for one in overlays for entry in one.legend_entries())
-        # Of two labels where one begins with the other, as tubes drawn in part and in full have, the longer one stays.
+        # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
         entries: dict[str, text_tiles.Colour | None] = {
             text: colour
             for text, colour in named.items()

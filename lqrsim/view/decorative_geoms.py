@@ -12,7 +12,8 @@ from lqrsim.view.cameras import Camera
 # one. Nothing else is pure green. All of its light is its own, so that it looks the same in the sun and in the shade.
 MARK_RGB = (0.0, 1.0, 0.0)
 RIM = (
-    1.8  # radius of the black ball, in radii of the green one: what a video blurs into the mark is the same all around
+    # Radius of the black ball, in radii of the green one: a video then blurs the same colour into the mark all around.
+    1.8
 )
 PLAN_RGB = (0.78, 0.08, 0.42)  # of the plan; neither the error map nor a robot has it
 

@@ -29,7 +29,7 @@ class DrawnTube:
       knots: (k,) of the plan.
       in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
       label: in the legend.
-      opacity: of each ellipsoid.
+      opacity: opacity of each ellipsoid.
     """
 
     knots: npt.NDArray[np.int64]

@@ -66,8 +66,8 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
     axes.set(xlabel=f"{plane[0]} (m)", ylabel=f"{plane[1]} (m)")
     if not flat.obstacles:
         return
-    # Contours of the planner's own distance, whatever the obstacles are made of. Grid lines through the obstacles'
-    # positions keep the corners of walls sharp.
+    # Contours of the planner's own distance, for any obstacles. Grid lines through the obstacles' positions keep the
+    # corners of walls sharp.
     spacing, places = float((high - low).max()) / 130, [obstacle.position for obstacle in flat.obstacles]
     x, y = (
         np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))

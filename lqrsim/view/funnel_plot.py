@@ -28,7 +28,7 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
       funnel: with the position among its states.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
-      radius: of the robot, in metres.
+      radius: radius of the robot, in metres.
 
     Returns:
       The path.

@@ -36,7 +36,7 @@ class Scale:
 
     Attributes:
       error: at the end of the trace's colours, in metres.
-      force: of the longest arrow, in N.
+      force: force of the longest arrow, in N.
     """
 
     error: float
@@ -54,7 +54,7 @@ class Overlays:
     """The overlays of one trial.
 
     Args:
-      solution: that was run, for the tube of its cost.
+      solution: the solution that was run, for the tube of its cost.
       show: names of overlays; those with nothing to show are left out, as a tube that was not predicted.
       funnel: about the plan of the run.
 

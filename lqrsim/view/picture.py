@@ -141,7 +141,7 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
     strip = max(0 if one is None or over else one.height for one in captions)
     if min(box.height for box in boxes) - strip < LEAST_HEIGHT:
         raise InputError(
-            f"size: got {size[0]} x {size[1]}, which captions fill, want a larger one, or overlays without caption"
+            f"size: got {size[0]} x {size[1]}, which captions would fill, want it larger, or overlays without caption"
         )
     with contextlib.ExitStack() as stack:
         parts: list[RunPart] = []
@@ -165,9 +165,9 @@ class Picture:
 
     Attributes:
       runs: the rollouts, each once.
-      panes: what is where.
+      panes: the panes and their places.
       size: width and height in pixels.
-      end: of the last run, in seconds.
+      end: end of the last run, in seconds.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class Picture:
 
 
 class LivePicture:
-    """Draws one trial that goes on, with its plan: opened at the first frame, and drawn anew for each.
+    """Draws one running trial, with its plan: opened at the first frame, and redrawn for each.
 
     Args:
       camera: as in `render`, except "chase", which needs the whole run.

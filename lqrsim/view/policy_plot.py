@@ -37,8 +37,8 @@ def plot_policy(
       solution: with a policy.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
-      radius: of the robot, in metres.
-      tube: of the solution, from `predict_tube`.
+      radius: radius of the robot, in metres.
+      tube: tube of the solution, from `predict_tube`.
 
     Returns:
       The path.

@@ -18,7 +18,7 @@ class RecordedTrial:
       robot: number of the robot's body in the model.
       planar: whether the robot is seen from above, with its overlays on the floor.
       floor: height of the ground below the robot in the first frame, in metres.
-      end: of the plan, in seconds.
+      end: end of the plan, in seconds.
       times: (k,) of the finite states.
       states, measured: (k, n).
       error, clearance: (k,) in metres.

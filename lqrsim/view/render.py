@@ -73,18 +73,18 @@ def render(
       trial: row of the rollout; several are shown side by side. With several rollouts, one for all or one for each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another of the model's.
       insets: more cameras, in panes beside the first. In panes of `top` and `side` robots have a green mark.
-      titles: of the runs, in the place of robot and scene.
+      titles: titles of the runs, in the place of robot and scene.
       overlays: what is drawn over the scene. plan. ghost: the planned path, and a disc or ball where it should be
         now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
         fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
         predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
         too wide. cost_tube: ellipsoids of low total cost. funnel: its shadow on the position, pale between
         its knots. caption: time, tracking error, clearance, disturbances, whether the run is in the funnel.
-      solution: of which the run is, for cost_tube; one for all, or one each.
-      funnel: about the plan of the run, for funnel; one for all, or one each.
+      solution: the solution that was run, for `cost_tube`; one for all runs, or one each.
+      funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
-      fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
+      fps: frames a second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.
 

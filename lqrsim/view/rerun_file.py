@@ -34,8 +34,8 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
     """Write a trial as FILE.rrd.
 
     Args:
-      rollout: what `simulate` returned, with frames.
-      path: of the file.
+      rollout: the result of `simulate`, with frames.
+      path: path of the file.
       trial: row of the rollout.
       funnel: about the plan of the run.
 

@@ -72,7 +72,7 @@ def wrap(words: str, height: int, width: int) -> list[str]:
 
 
 def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
-    """Blend a tile into the image, in place, so many pixels from the left and from the top or the bottom."""
+    """Blend a tile into the image, in place, at these distances in pixels from the left and the top or bottom."""
     room = image.shape[0] - tile.shape[0]
     start = max(top if top is not None else room - (bottom or 0), 0)
     area = image[start : start + tile.shape[0], left : left + tile.shape[1]]

@@ -21,7 +21,7 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.view.viewer_base import Viewer
 
 LONGEST_RUN = 600.0  # s, after which a run restarts, for all of it is recorded
-RECENT = 100  # solves of which the caption shows the median
+RECENT = 100  # number of solves whose median the caption shows
 GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the colour of the plan nor that of the trace
 GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
 
@@ -30,7 +30,7 @@ class MovableGoal:
     """The goal position of a problem's final cost, which can be moved.
 
     Attributes:
-      place: in the problem, (2 or 3,).
+      place: the goal in the problem, (2 or 3,).
 
     Raises:
       InputError: the final cost has no goal position, or several.

@@ -166,7 +166,7 @@ def live(
     Args:
       planner: makes a live re-planner for each run, in place of a controller: `replanner.live`. A run then continues
         after the plan's horizon, for at most ten minutes.
-      goal: to be moved by the person, with a planner and a viewer that shows it.
+      goal: a goal that the person moves, with a planner and a viewer that shows it.
       ended: called with a line on each run that has ended.
     """
 

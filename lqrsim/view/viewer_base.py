@@ -47,15 +47,15 @@ class Viewer(abc.ABC):
     """A viewer. Subclasses draw, and call `push`, `drag` and so on when the person interferes.
 
     Args:
-      model: to be shown.
-      plan: of the run.
+      model: the model to be shown.
+      plan: plan of the run.
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.
-      radius: of the robot, in metres.
+      radius: radius of the robot, in metres.
       balls: with the planned places, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.
-      speed: of the time shown; 1 is real time.
+      speed: speed of the time shown; 1 is real time.
       seconds: after which the viewer closes; never by default.
 
     Attributes:
@@ -162,7 +162,7 @@ class Viewer(abc.ABC):
         return selected or (self.goal_body if self.holds_goal else self.robot)
 
     def other(self) -> int:
-        """The body that Enter selects: of robot and goal the one that is not held."""
+        """The body that Enter selects: the one of robot and goal that is not held."""
         return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
     def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:

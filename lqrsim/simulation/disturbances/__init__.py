@@ -24,6 +24,7 @@ from lqrsim.simulation.disturbances.mismatch import (
 )
 from lqrsim.simulation.disturbances.noise import (
     ControlNoise,
+    ControlOffset,
     DisplacedObstacles,
     ForceNoise,
     InitialStateError,
@@ -31,9 +32,10 @@ from lqrsim.simulation.disturbances.noise import (
     MeasurementNoise,
     Push,
     TorqueNoise,
-    as_disturbances,
 )
-from lqrsim.simulation.disturbances.presets import PRESETS, preset
+from lqrsim.simulation.disturbances.noise import as_disturbances as as_disturbances
+from lqrsim.simulation.disturbances.presets import PRESETS as PRESETS
+from lqrsim.simulation.disturbances.presets import preset
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
 
 KINDS: dict[str, type[Disturbance]] = {
@@ -43,13 +45,12 @@ KINDS: dict[str, type[Disturbance]] = {
 }
 
 __all__ = [
-    "KINDS",
-    "PRESETS",
     "ActuatorLoss",
     "AxleMismatch",
     "CommandDropouts",
     "ControlDelay",
     "ControlNoise",
+    "ControlOffset",
     "DisplacedObstacles",
     "Disturbance",
     "Dryden",
@@ -72,6 +73,5 @@ __all__ = [
     "ThrustMismatch",
     "TorqueNoise",
     "WheelRadiusMismatch",
-    "as_disturbances",
     "preset",
 ]

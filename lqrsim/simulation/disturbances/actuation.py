@@ -116,7 +116,7 @@ class Saturation(Disturbance):
         """The narrowed limits.
 
         Args:
-          plant: with the robot's own limits.
+          plant: the plant, with the robot's own limits.
 
         Returns:
           Two arrays (m,).

@@ -30,8 +30,7 @@ Numbers = float | Sequence[float]
 class Effect:
     """The effect of a disturbance on one run of K trials; None has no effect. A step is the number of a control period.
 
-    Each function must give a trial the same numbers, to the last bit, whatever trials run beside it: no sums over
-    trials.
+    Each function must give a trial the same bits, independent of the trials beside it: no sums over trials.
 
     Attributes:
       initial_states: (first states of the plan (K, n)) -> first states of the trials, (K, n).
@@ -219,7 +218,7 @@ def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
 
 
 def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], field: str = "std") -> Array:
-    """A field as one number for each of `names`. Raises InputError unless it has one or as many numbers."""
+    """A field as one number for each of `names`. Raises InputError unless it has one number, or one for each name."""
     values = np.asarray(numbers, dtype=np.float64)
     if values.ndim and len(values) != len(names):
         raise InputError(

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from lqrsim.control.uncertainty import Uncertainty, Unknown
+from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_array, check_items, check_number
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
@@ -33,7 +33,7 @@ class StateError(GaussianDisturbance):
     what: ClassVar[str]
 
     def _coordinates(self, plant: Plant) -> Coordinates:
-        """What the error is added to."""
+        """The quantity to which the error is added."""
         return plant.robot.dynamics.state_coordinates
 
     def describe(self, plant: Plant) -> str:
@@ -68,6 +68,28 @@ class ControlNoise(StateError):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return Uncertainty(control=self._std_for_filters(plant))
+
+
+class ControlOffset(StateError):
+    """A constant error of each control, drawn for each trial from a normal distribution.
+
+    Args:
+      std: standard deviation in the control's unit; one number, or one per control.
+    """
+
+    what = "control offset"
+
+    def _coordinates(self, plant: Plant) -> Coordinates:
+        return plant.robot.dynamics.control_coordinates
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        std = self._deviations(plant)
+        offset = std * normal(generators, 1, len(std))[:, 0]
+        return Effect(actuate=lambda step, controls: controls + offset)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        controls = zip(self._coordinates(plant).names, self._deviations(plant).tolist(), strict=True)
+        return unknowns_of(self, plant, [Unknown(OFFSET + name, std) for name, std in controls])
 
 
 class MeasurementNoise(StateError):
@@ -213,10 +235,10 @@ class DisplacedObstacles(GaussianDisturbance):
 class StateNoise(Disturbance):
     """The noise of a problem, `lqrsim.Noise`: the state jumps by M(x, u) w at the end of each control period.
 
-    w is drawn anew each time; x is the state at the beginning of the period, u what the actuators got.
+    w is drawn anew each time; x is the state at the beginning of the period, u the control that reached the actuators.
 
     Args:
-      noise: with the matrix M.
+      noise: the noise, with its matrix M.
     """
 
     noise: Noise

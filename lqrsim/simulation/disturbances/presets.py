@@ -42,7 +42,7 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
 
     Args:
       name: calm, light, moderate, strong or severe.
-      plant: that the disturbances act on.
+      plant: the plant that the disturbances act on.
 
     Returns:
       The disturbances, in the order in which they act.

@@ -84,7 +84,7 @@ class Gusts(Wind):
     """Gusts that rise and fade: an Ornstein-Uhlenbeck process on each axis, in its stationary state from the start.
 
     Args:
-      std: of the wind in m/s; one number, or three along the world's axes.
+      std: standard deviation of the wind in m/s; one number, or three along the world's axes.
       time_constant: seconds in which the correlation falls to 1/e.
     """
 
@@ -122,7 +122,7 @@ class Dryden(Wind):
     Args:
       wind: mean wind at 20 ft in m/s, or "light", "moderate" or "severe": 15, 30 or 45 knots.
       altitude: above the ground in m; below 10 ft it counts as 10 ft.
-      direction: in which the mean wind blows, rad from the world's x axis towards its y axis.
+      direction: direction towards which the mean wind blows, in rad from the world's x axis towards its y axis.
     """
 
     wind: float | str = "light"

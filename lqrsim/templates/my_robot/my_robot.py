@@ -1,4 +1,4 @@
-"""The robot my_robot: a disc that two motors push over a table, and what it is to do.
+"""The robot my_robot: a disc that two motors push over a table, and its task.
 
 Change the MJCF, the dynamics and the scenario to those of your robot; `test_my_robot.py` tells whether they agree.
 """

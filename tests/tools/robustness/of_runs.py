@@ -20,7 +20,8 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
     **{
         kind: {"std": 0.1}
         for kind in (
-            "AxleMismatch", "ControlNoise", "DisplacedObstacles", "ForceNoise", "FrictionMismatch", "InertiaMismatch",
+            "AxleMismatch", "ControlNoise", "ControlOffset", "DisplacedObstacles", "ForceNoise",
+            "FrictionMismatch", "InertiaMismatch",
             "MassMismatch", "MeasurementBias", "MeasurementNoise", "ThrustMismatch", "TorqueNoise",
             "WheelRadiusMismatch",
         )

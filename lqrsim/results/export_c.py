@@ -1,0 +1,380 @@
+"""Policies as C99, for a microcontroller. The texts are in `templates/c/`; here they get their numbers.
+
+The laws are written about their nominal states, `planned + gain (state - nominal)`, which is the same as `gain state +
+offset`: rounding, to float or to 16 bits, then acts on deviations only.
+"""
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_flag, check_name, check_path, check_text, excerpt
+from lqrsim.results.archive import replacing
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.save_load import hash_of
+from lqrsim.results.solution import Solution
+
+TEMPLATES = Path(__file__).parent.parent / "templates" / "c"
+PREFIX = "my_policy"  # in the templates
+STATIC = ("CMakeLists.txt", "main.c", "stm32f405.c", "stm32f405.ld")
+LARGEST = 32767  # of 16 bits
+# What main.c allows, relative to the largest sum of magnitudes in a command: well above rounding, which is about 1e-15
+# in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
+SHARES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
+NUMBERS, GAINS = ("float", "double"), ("full", "int16")
+DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportedC:
+    """What `export_c` wrote.
+
+    Attributes:
+      files: their paths.
+      sha256: of the policy's content, as in its file; the header has it, too.
+      table_bytes: of the constant tables.
+      rounding: how far rounding the gains changes each control at most, where every state, with those of the filter, is
+        off its nominal by one of its unit; (m,), in the controls' units.
+      controls: their names and units.
+    """
+
+    files: tuple[Path, ...]
+    sha256: str
+    table_bytes: int
+    rounding: tuple[float, ...]
+    controls: tuple[str, ...]
+
+    def summary(self) -> str:
+        """What was written, and how far the commands are off, in lines."""
+        lines = [f"SHA-256 {self.sha256}, tables of {self.table_bytes:,} bytes", f"{OFF}:"]
+        return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
+
+
+def export_c(
+    policy: Solution | AffinePolicy | OutputFeedbackPolicy,
+    folder: str | os.PathLike[str],
+    *,
+    number: str = "float",
+    gains: str = "full",
+    interpolate: bool = False,
+    name: str = "policy",
+) -> ExportedC:
+    """Write a policy as C99 with constant tables, and an example with a CMake file.
+
+        ls.export_c(solution, "firmware/policy")
+        ls.export_c(ls.OffsetFree(problem, solution, uncertainty).policy, "firmware/policy", gains="int16")
+
+    `NAME.h` declares `NAME_init()` and `NAME_step(measured, t, command)`, `NAME.c` needs `math.h` alone and allocates
+    nothing. The commands are those that the policy computes in Python, angles, limits and the time after the horizon
+    included. `main.c` compares some with Python's.
+
+    Args:
+      policy: of a solution; of `track`; or with a filter, as `OffsetFree(...).policy`. A controller that solves while
+        it runs, or a function, cannot be exported.
+      folder: for the files. Files of these names are replaced.
+      number: "float" or "double", of all but the time.
+      gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
+      interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
+      name: of the files and the functions: small letters, digits and underscores, a letter first.
+
+    Returns:
+      An ExportedC.
+
+    Raises:
+      InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
+    """
+    wanted = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
+    kinds = Solution, AffinePolicy, OutputFeedbackPolicy
+    if not isinstance(policy, kinds):
+        raise InputError(f"policy: got {_kind_of(policy)}, want {wanted}")
+    folder, number = check_path("folder", folder, "the path of a folder"), check_name("number", number, NUMBERS)
+    gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
+    if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
+        raise InputError(f"name: got {excerpt(name)}, want small letters, digits and underscores, such as policy")
+    law = policy.policy if isinstance(policy, Solution) else policy
+    if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
+        raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")
+    tables = _Tables(number, gains)
+    values = _filter_values(law) if isinstance(law, OutputFeedbackPolicy) else _values(law)
+    for field, array in values.items():
+        tables.add(field, array)
+    low, high = _limits(law.control_coordinates, DTYPES[number])
+    tables.plain("lowest", low)
+    tables.plain("highest", high)
+    sha = hash_of(policy)
+    header = "my_policy.h", {
+        "title": _title(law), "version": version("lqrsim"), "rounding": _rounding_text(law, tables, number, gains),
+        "period": repr(law.dt), "entries": _entries(law), "sha256": sha, "T": law.steps,
+        "n": len(law.state_coordinates), "Y": len(_measured(law)), "m": len(law.control_coordinates),
+        "bytes": tables.bytes, "real": number,
+        "or": "" if isinstance(law, OutputFeedbackPolicy) else ", or measured is NULL",
+        "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period."
+        if isinstance(law, OutputFeedbackPolicy) else "",
+    }  # fmt: skip
+    source = "filter.c" if isinstance(law, OutputFeedbackPolicy) else "feedback.c", {
+        "tables": tables.text(), "nearest": _nearest(law, number), "Z": law.nominal.shape[1],
+        **(BLENDED if interpolate else HELD),
+    }  # fmt: skip
+    share = SHARES["int16" if gains == "int16" else number]
+    rows, tolerance = _rows(law, values, DTYPES[number], share, interpolate)
+    example = {"share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())), "rows": rows}
+    texts = {f"{name}.h": header, f"{name}.c": source} | {one: (one, example) for one in STATIC}
+    files = []
+    for file, (template, parts) in texts.items():
+        text = (TEMPLATES / template).read_text(encoding="utf-8")
+        text = re.sub("@([A-Za-z0-9]+)@", lambda match, parts=parts: str(parts[match[1]]), text)
+        text = text.replace(PREFIX, name).replace(PREFIX.upper(), name.upper())
+        with replacing(folder / file) as unfinished:
+            unfinished.write_text(text, encoding="utf-8", newline="\n")
+        files.append(folder / file)
+    return ExportedC(
+        files=tuple(files), sha256=sha, table_bytes=tables.bytes, rounding=tuple(tables.rounding["gain"].tolist()),
+        controls=law.control_coordinates.labels,
+    )  # fmt: skip
+
+
+# What feedback.c does between two knots.
+HELD = {"blend": "", "near": "NOMINAL(k, j)", "wanted": "law(k, i, state)"}
+BLENDED = {
+    "blend": """    const int next = k + 1 < MY_POLICY_STEPS ? k + 1 : k;
+    const double after = knot - 1e-9 - k;
+    const real weight = next > k && after > 0 ? (real)after : 0;
+""",
+    "near": "(1 - weight) * NOMINAL(k, j) + weight * NOMINAL(next, j)",
+    "wanted": "(1 - weight) * law(k, i, state) + weight * law(next, i, state)",
+}
+
+
+class _Tables:
+    """The constant tables of a policy, as C text.
+
+    Attributes:
+      bytes: of all.
+      rounding: by the name of a table of matrices (T, rows, columns), the sum over the columns of the largest rounding
+        error of each entry, (rows,).
+      share: the largest rounding error of an entry, relative to the entry's largest magnitude over the steps.
+    """
+
+    def __init__(self, number: str, gains: str) -> None:
+        self._number, self._short = number, gains == "int16"
+        self._lines: list[str] = []
+        self.bytes, self.rounding, self.share = 0, dict[str, Array](), 0.0
+
+    def add(self, name: str, array: Array) -> None:
+        """Add a table (T, rows) or (T, rows, columns), read by a macro: NAME(k, i, j).
+
+        The last rows that are the same in all steps, such as those of a filter's unknowns, are stored once.
+        """
+        if not np.isfinite(array).all():
+            raise InputError(f"policy: {name}: got NaN or infinity in it, want finite numbers")
+        changes = np.flatnonzero((array != array[0]).reshape(*array.shape[:2], -1).any(axis=(0, 2)))
+        first = int(changes[-1]) + 1 if len(changes) else 0  # of these rows
+        column, rows = "[j]" if array.ndim == 3 else "", array.shape[1]
+        read, parts = f"{name}[k][i]{column}", {name: array[:, :first], f"{name}_rest": array[0, first:]}
+        if first == 0:
+            read = f"{name}_rest[i]{column}"
+        elif first < rows:
+            read = f"(i < {first} ? {read} : {name}_rest[i - {first}]{column})"
+        if array.ndim == 3 and self._short:
+            unit = self._rounded(name, np.abs(array).max(axis=0) / LARGEST)
+            short = np.divide(array, unit, out=np.zeros_like(array), where=unit > 0).round().clip(-LARGEST, LARGEST)
+            self.plain(f"{name}_unit", unit)
+            read, stored = f"((real){read} * {name}_unit[i][j])", short * unit
+            parts, kind = {name: short[:, :first], f"{name}_rest": short[0, first:]}, "short"
+        else:
+            stored, kind = self._rounded(name, array), "real"
+        for part, numbers in parts.items():
+            if numbers.size:
+                self._write(part, numbers, kind)
+        self._lines.append(f"#define {name.upper()}({'k, i, j' if column else 'k, i'}) {read}\n")
+        if array.ndim == 3:
+            off, largest = np.abs(stored - array).max(axis=0), np.abs(array).max(axis=0)
+            self.rounding[name] = off.sum(axis=-1)
+            shares = np.divide(off, largest, out=np.zeros_like(off), where=largest > 0)
+            self.share = max(self.share, float(shares.max()))
+
+    def plain(self, name: str, array: Array) -> None:
+        """Add an array of numbers that the type holds."""
+        self._write(name, array, "real")
+
+    def text(self) -> str:
+        real = self._number == "float"
+        constants = [
+            f"#define TURN {_number(2 * np.pi, self._number)}", f"#define RINT {'rintf' if real else 'rint'}",
+            f"#define SQRT {'sqrtf' if real else 'sqrt'}", f"#define SMALL {_number(1e-12, self._number)}\n",
+        ]  # fmt: skip
+        return "\n".join([*constants, *self._lines])
+
+    def _rounded(self, name: str, array: Array) -> Array:
+        with np.errstate(over="ignore"):
+            found = array.astype(DTYPES[self._number]).astype(np.float64)
+        if not np.isfinite(found).all():
+            raise InputError(f"policy: {name}: got {np.abs(array).max():g} in it, want numbers that a float holds")
+        return found
+
+    def _write(self, name: str, array: Array, kind: str) -> None:
+        self.bytes += array.size * (2 if kind == "short" else np.dtype(DTYPES[self._number]).itemsize)
+        sizes = "".join(f"[{length}]" for length in array.shape)
+
+        def as_text(one: float) -> str:
+            return f"{int(one)}" if kind == "short" else _number(one, self._number)
+
+        def inner(part: Array) -> str:
+            if part.ndim == 1:
+                return _list(as_text(one) for one in part)
+            return "{" + (",\n" if part.ndim < 3 else ",\n\n").join(inner(one) for one in part) + "}"
+
+        self._lines.append(f"static const {kind} {name}{sizes} = {inner(array)};")
+
+
+def _number(value: float, number: str) -> str:
+    """A number in C, which reads as the same bits."""
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return f"{np.float32(value)!s}f" if number == "float" else repr(float(value))
+
+
+def _list(parts: Iterable[str]) -> str:
+    return "{" + ", ".join(parts) + "}"
+
+
+def _values(law: AffinePolicy) -> dict[str, Array]:
+    planned = law.offset + np.einsum("tij,tj->ti", law.gain, law.nominal)
+    return {"planned": planned, "gain": law.gain, "nominal": law.nominal}
+
+
+def _filter_values(law: OutputFeedbackPolicy) -> dict[str, Array]:
+    nominal, n = law.nominal, len(law.state_coordinates)
+    planned = law.offset + np.einsum("tij,tj->ti", law.gain, nominal)
+    moved = np.einsum("tij,tj->ti", law.transition, nominal) + np.einsum("tij,tj->ti", law.input, planned)
+    return {
+        "planned": planned, "gain": law.gain, "nominal": nominal, "correction": law.correction, "sensor": law.sensor,
+        "expected": law.sensor_offset + np.einsum("tij,tj->ti", law.sensor, nominal[:, :n]),
+        "transition": law.transition, "input": law.input, "next": moved + law.drift,
+    }  # fmt: skip
+
+
+def _limits(controls: Coordinates, dtype: npt.DTypeLike) -> tuple[Array, Array]:
+    """The limits in the number type, rounded inwards, (m,) each."""
+    low, high = np.array(controls.low), np.array(controls.high)
+    with np.errstate(over="ignore"):
+        lowest, highest = low.astype(dtype), high.astype(dtype)
+    lowest = np.where(lowest < low, np.nextafter(lowest, np.array(np.inf, dtype)), lowest)
+    highest = np.where(highest > high, np.nextafter(highest, np.array(-np.inf, dtype)), highest)
+    return lowest.astype(np.float64), highest.astype(np.float64)
+
+
+def _measured(law: AffinePolicy | OutputFeedbackPolicy) -> Coordinates:
+    return law.measured_coordinates if isinstance(law, OutputFeedbackPolicy) else law.state_coordinates
+
+
+def _nearest(law: AffinePolicy | OutputFeedbackPolicy, number: str) -> str:
+    """The functions that take angles and rotation vectors nearest to others."""
+    spaces = {"nearest_state": law.state_coordinates}
+    if isinstance(law, OutputFeedbackPolicy):
+        spaces["nearest_measured"] = law.measured_coordinates
+    text = ""
+    if any(space.rotation_vectors for space in spaces.values()):
+        text = f"{(TEMPLATES / 'rotation.c').read_text(encoding='utf-8')}\n"
+    for name, space in spaces.items():
+        lines = ["(void)x;", "(void)near;"] if not (space.angles or space.rotation_vectors) else []
+        lines += [f"x[{i}] -= TURN * RINT((x[{i}] - near[{i}]) / TURN);" for i in space.angles]
+        lines += [f"nearest_rotation(x + {i}, near + {i});" for i in space.rotation_vectors]
+        inside = "".join(f"    {line}\n" for line in lines)
+        text += "/* Replace angles and rotation vectors by their representatives nearest to others. */\n"
+        text += f"static void {name}(real *x, const real *near)\n{{\n{inside}}}\n\n"
+    return text
+
+
+def _comment(text: str) -> str:
+    """Text of anyone for a comment in C: plain ASCII that neither ends the comment nor looks like a trigraph."""
+    return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)", " ", re.sub(r"[^ -~]|[?\\]", "_", text))
+
+
+def _title(law: AffinePolicy | OutputFeedbackPolicy) -> str:
+    what = "A filter and the law of its estimates" if isinstance(law, OutputFeedbackPolicy) else "A feedback law"
+    return f"{what} in C99: {len(law.control_coordinates)} controls from {len(_measured(law))} measured numbers."
+
+
+def _entries(law: AffinePolicy | OutputFeedbackPolicy) -> str:
+    """The lines of a comment that name measured numbers and commands, with units and limits."""
+    lines, controls = ["measured:"], law.control_coordinates
+    measured = _measured(law)
+    turning = dict.fromkeys(measured.angles, ", an angle")
+    turning |= {i + j: ", of a rotation vector" for i in measured.rotation_vectors for j in range(3)}
+    lines += [f"  {i}: {label}{turning.get(i, '')}" for i, label in enumerate(measured.labels)]
+    lines.append("command:")
+    limits = zip(controls.low, controls.high, strict=True)
+    pairs = zip(controls.labels, limits, strict=True)
+    lines += [f"  {i}: {label}, {low:g} to {high:g}" for i, (label, (low, high)) in enumerate(pairs)]
+    return "\n".join(f" * {_comment(line)}" for line in lines)
+
+
+def _rounding_text(law: AffinePolicy | OutputFeedbackPolicy, tables: _Tables, number: str, gains: str) -> str:
+    lines = [f"Numbers are stored as {number}."]
+    if gains == "int16":
+        lines = [f"Matrices are stored in 16 bits, each entry with an error of at most {_up(tables.share)} of its"]
+        lines += [f"largest magnitude over the steps; other numbers as {number}."]
+    lines += [*f"{OFF}:".split("\n"), *_bounds(law.control_coordinates.labels, tables.rounding["gain"])]
+    return "\n * ".join(map(_comment, lines))
+
+
+# What `rounding` bounds.
+OFF = """Where all states, with those of a filter, are off their nominal ones by one of their unit, rounding the gains
+changes the commands by at most"""
+
+
+def _bounds(labels: Iterable[str], rounding: Iterable[float]) -> list[str]:
+    return [f"  {label}: {_up(most)}" for label, most in zip(labels, rounding, strict=True)]
+
+
+def _up(value: float) -> str:
+    """A bound with three digits, rounded up."""
+    return f"{value * 1.005:.2e}"
+
+
+def _kind_of(value: object) -> str:
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
+def _rows(
+    law: AffinePolicy | OutputFeedbackPolicy, values: dict[str, Array], dtype: npt.DTypeLike, share: float,
+    interpolate: bool,
+) -> tuple[str, Array]:  # fmt: skip
+    """The rows of main.c, with Python's commands for random measurements, and the tolerance of each control (m,)."""
+    rng, rows = np.random.default_rng(0), []
+    largest = np.zeros(len(law.control_coordinates))
+    periods = [0, 1, 1.5, law.steps // 2, law.steps - 1.25, law.steps - 1, law.steps, 2 * law.steps]
+    times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
+    z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
+    space, expected = _measured(law), values.get("expected", law.nominal)
+    # A filter takes what is measured for a motion, whose rates are larger by far.
+    spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
+    for place, period in enumerate(times):
+        t, k = float(period) * law.dt, min(int(period), law.steps - 1)
+        shown = expected[k] + spread * rng.standard_normal(len(space))
+        for i in space.angles:
+            shown[i] += 2 * np.pi * rng.integers(-1, 2)
+        shown = shown.astype(dtype).astype(np.float64)
+        lost = isinstance(law, OutputFeedbackPolicy) and place % 5 == 3
+        state = z
+        if isinstance(law, OutputFeedbackPolicy):
+            command, z = law.step(z, None if lost else shown, t)
+        else:
+            command, state = law(shown, t, interpolate=interpolate), shown
+        rows.append(
+            f"    {{{t!r}, {int(lost)}, {_list(map(repr, shown.tolist()))}, {_list(map(repr, command.tolist()))}}},"
+        )
+        sums = np.abs(values["gain"][k]) @ (np.abs(state) + np.abs(law.nominal[k])) + np.abs(values["planned"][k])
+        largest = np.maximum(largest, sums)
+    return "\n".join(rows), share * largest

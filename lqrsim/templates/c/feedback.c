@@ -1,0 +1,47 @@
+/* See my_policy.h. In control period k: command = planned_k + gain_k (state - nominal_k), within the limits. */
+#include <math.h>
+
+#include "my_policy.h"
+
+typedef my_policy_real real;
+
+@tables@
+@nearest@
+void my_policy_init(void)
+{
+}
+
+/* Command i by the law of control period k, not limited. */
+static real law(int k, int i, const real *state)
+{
+    (void)k; /* one law may serve all periods */
+    real sum = PLANNED(k, i);
+    for (int j = 0; j < MY_POLICY_STATES; j++)
+        sum += GAIN(k, i, j) * (state[j] - NOMINAL(k, j));
+    return sum;
+}
+
+int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command)
+{
+    real state[MY_POLICY_STATES], near[MY_POLICY_STATES];
+
+    if (!measured || !(t >= 0.0) || !isfinite(t))
+        return 1;
+    for (int j = 0; j < MY_POLICY_STATES; j++) {
+        if (!isfinite(measured[j]))
+            return 1;
+        state[j] = measured[j];
+    }
+    /* Rounding must not put a time at a knot before it. */
+    const double knot = t / MY_POLICY_PERIOD + 1e-9;
+    const int k = knot < MY_POLICY_STEPS - 1 ? (int)knot : MY_POLICY_STEPS - 1;
+@blend@
+    for (int j = 0; j < MY_POLICY_STATES; j++)
+        near[j] = @near@;
+    nearest_state(state, near);
+    for (int i = 0; i < MY_POLICY_CONTROLS; i++) {
+        const real wanted = @wanted@;
+        command[i] = wanted < lowest[i] ? lowest[i] : wanted > highest[i] ? highest[i] : wanted;
+    }
+    return 0;
+}

@@ -1,0 +1,46 @@
+/* @title@
+ *
+ * Written by lqrsim @version@ from a file whose content has the SHA-256 that is below as MY_POLICY_SHA256.
+ * @rounding@
+ *
+ * Call my_policy_init() once, then my_policy_step() in each control period, @period@ s. Nothing is allocated. The state of
+ * the law is static: one robot runs it. Do not compile it with -ffast-math, for it looks for NaN.
+ *
+@entries@
+ */
+#ifndef MY_POLICY_H
+#define MY_POLICY_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define MY_POLICY_SHA256 "@sha256@"
+#define MY_POLICY_STEPS @T@ /* laws, one for each control period */
+#define MY_POLICY_PERIOD @period@ /* s */
+#define MY_POLICY_STATES @n@
+#define MY_POLICY_MEASURED @Y@
+#define MY_POLICY_CONTROLS @m@
+#define MY_POLICY_TABLES @bytes@ /* bytes of the constant tables */
+
+typedef @real@ my_policy_real;
+
+/* Begin a run. */
+void my_policy_init(void);
+
+/* The commands at one time.
+ *
+ * measured: MY_POLICY_MEASURED numbers; angles and rotation vectors in any representative.@lost@
+ * t: seconds since the start, 0 or more; a double, so that rounding never puts it into another control period.
+ * command: MY_POLICY_CONTROLS numbers, within their limits.
+ *
+ * After the horizon the last law stays in force. Returns 0; or 1, and does nothing, if t is negative or a number is not
+ * finite@or@.
+ */
+int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
