@@ -8,26 +8,27 @@ Problems: the nine of Altro.jl as `altro_problems.py` has them, with RK4 for the
 original has RK3; `concar`, a car among four random circles, of InteriorPointDDP.jl; a planar quadrotor with a wall to
 get over and a clearance; the paper's quadrotor, whose obstacles are a cost; an arm of three links among posts; a planar
 quadrotor through a gap that it passes tilted, and a rocket that lands, each with a given duration and with a free one.
-All solvers but the second begin with the same: controls and the states that they lead to, or for `escape` and the gap states that do
-not belong together. A free duration begins as the one that is stated, its price is in the cost, and of lqrsim the end
-alone is compared: all of its iterations, with shorter durations that it tries.
+All solvers but the second begin with the same: controls and the states that they lead to, or for `escape` and the gap
+states that do not belong together. A free duration begins as the one that is stated, its price is in the cost, and of
+lqrsim the end alone is compared: all of its iterations, with shorter durations that it tries.
 
 lqrsim            ls.smooth with the start that is given, and otherwise its default settings.
 lqrsim, search    ls.smooth with starts of its own; the iterations of all of them are counted.
-lqrsim, no finish the first with finish=None and tolerance=1e-8: no Newton steps, and the augmented Lagrangian, with 1e-6
-                  to spare, in place of the interior point.
+lqrsim, no finish the first with finish=None and tolerance=1e-8: no Newton steps, and the augmented Lagrangian, with
+                  1e-6 to spare, in place of the interior point.
 ilqr              ls.ilqr with tolerance=1e-8; it keeps no constraints but the limits of the controls.
 box-FDDP          Crocoddyl's, which keeps as much.
 FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
 
 The target is Altro.jl's published cost where a verified plan of the league costs no more, and otherwise 1.001 times the
-least cost of the verified plans of all that begin with the same, whether or not they are said to be optimal. It is reached at the first iteration with
-no higher cost and every constraint kept to 1e-6; of the interior point, FATROP and IPOPT the dynamics, too. A solver
-whose final plan costs more is not asked when it was there. "To 1e-8" is by each solver's own measure of optimality,
-which are not the same: the decrease of the cost that is still promised, relative to the cost, or the residuals of the
-optimality conditions. "Within 1 %" counts the instances where a verified plan costs at most 1.01 times the least cost
-of all solvers. "Against IPOPT" is how much dearer the plan is than IPOPT's from the same start, where both are solved
-and in the same optimum, their costs within 0.1 %: of several instances the largest difference.
+least cost of the verified plans of all that begin with the same, whether or not they are said to be optimal. It is
+reached at the first iteration with no higher cost and every constraint kept to 1e-6; of the interior point, FATROP and
+IPOPT the dynamics, too. A solver whose final plan costs more is not asked when it was there. "To 1e-8" is by each
+solver's own measure of optimality, which are not the same: the decrease of the cost that is still promised, relative to
+the cost, or the residuals of the optimality conditions. "Within 1 %" counts the instances where a verified plan costs
+at most 1.01 times the least cost of all solvers. "Against IPOPT" is how much dearer the plan is than IPOPT's from the
+same start, where both are solved and in the same optimum, their costs within 0.1 %: of several instances the largest
+difference.
 
 Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
 1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of

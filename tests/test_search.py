@@ -214,7 +214,8 @@ def among_discs(seed: int) -> ls.Problem:
 
     return ls.Problem(
         dynamics=dynamics, dt=0.1, steps=30, initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),
-        stage_cost=ls.ControlCost((0.1, 0.1)), final_cost=ls.QuadraticCost(np.full(4, 100.0), about=(1.0, 0.0, 0.0, 0.0)),
+        stage_cost=ls.ControlCost((0.1, 0.1)),
+        final_cost=ls.QuadraticCost(np.full(4, 100.0), about=(1.0, 0.0, 0.0, 0.0)),
         constraints=[ls.SymbolicConstraint(outside, parameters=numbers)],
     )  # fmt: skip
 

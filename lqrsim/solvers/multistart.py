@@ -116,8 +116,8 @@ def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is asked for where there is nothing to go round."""
     if count is not None and count > 1 and pull(problem) == 0 and not (any(passable(problem)) and detours(problem)):
         raise InputError(
-            f"starts: got {count}, want 1 without a start and a goal some way apart, and an ObstacleCost or a constraint"
-            " of states between them: there is nothing to go round; or give a start"
+            f"starts: got {count}, want 1 without a start and a goal some way apart, and an ObstacleCost or a"
+            " constraint of states between them: there is nothing to go round; or give a start"
         )
 
 
