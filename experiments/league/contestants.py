@@ -93,6 +93,10 @@ def _search(problem: ls.Problem, *, compile: bool) -> Solve:
     """`ls.smooth` with starts of its own, all of whose iterations count."""
     if problem.duration is not None:
         raise NotImplementedError("a free duration")
+    try:
+        ls.smooth(problem, max_iterations=1)
+    except ls.InputError as error:  # dynamics without derivatives at the nominal control
+        raise NotImplementedError("a problem without a start") from error
 
     def solve(problem: ls.Problem, start: Start) -> Run:
         log: list[ls.types.Iteration] = []

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_flag, check_name, check_path, check_text, excerpt
 from lqrsim.results.archive import replacing
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Line, check_fields
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.save_load import hash_of
@@ -48,10 +49,13 @@ class ExportedC:
     """
 
     files: tuple[Path, ...]
-    sha256: str
+    sha256: Line
     table_bytes: int
-    rounding: tuple[float, ...]
-    controls: tuple[str, ...]
+    rounding: Annotated[tuple[float, ...], "m"]
+    controls: Annotated[tuple[Line, ...], "m"]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def summary(self) -> str:
         """What was written, and how far the commands are off, in lines."""

@@ -31,6 +31,18 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         "predict_tube": (common | {"controller": law}, 0.5),
         "Tube": (fields(tube),),
         "OutputFeedbackPolicy": (fields(policy),),
+        "export_c": (
+            {
+                "policy": policy,
+                "folder": place.folder / "c",
+                "number": "float",
+                "gains": "full",
+                "interpolate": False,
+                "name": "policy",
+            },
+            0.1,
+        ),
+        "ExportedC": (fields(ls.export_c(place.solution, place.folder / "c")),),
         "OutputFeedbackPolicy.step": ({"self": policy, "z": policy.start(), "measurement": np.zeros(3), "t": 0.3},),
         "smooth_chance_constrained": (
             {
