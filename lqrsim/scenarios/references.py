@@ -21,8 +21,9 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import TYPE_CHECKING
 
 from lqrsim.errors import InputError, check_name
@@ -117,11 +118,18 @@ def _own_function(target: str) -> Callable[..., object]:
     return functions[check_name(f"function in {place}", name, functions)]
 
 
+class _Uncached(SourceFileLoader):
+    """Reads the source each time: Python takes bytecode on disk for current if a file was changed within a second."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def _load_file(path: Path) -> ModuleType:
     if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise InputError(f"scenario: got {path}, want a Python file that exists")
     name = str(path.resolve())  # the stem may be the name of another module
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, path, loader=_Uncached(name, str(path)))
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
