@@ -1,6 +1,6 @@
 """A league of solvers at equal accuracy: iterations and time until the same cost, and until 1e-8, on the same problems.
 
-    python experiments/solver_league.py    # everything, ten minutes, and once as many for compiling
+    python experiments/solver_league.py    # everything, 15 minutes, half of it compiling
     python experiments/solver_league.py --problems acrobot concar --solvers lqrsim FATROP --seeds 10    # some of it
     python experiments/solver_league.py --quick    # the first two problems, and too little to trust
 

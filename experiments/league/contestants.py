@@ -95,8 +95,8 @@ def _search(problem: ls.Problem, *, compile: bool) -> Solve:
         raise NotImplementedError("a free duration")
     try:
         ls.smooth(problem, max_iterations=1)
-    except ls.InputError as error:  # dynamics without derivatives at the nominal control
-        raise NotImplementedError("a problem without a start") from error
+    except ls.InputError as error:
+        raise NotImplementedError("dynamics without derivatives at the nominal control") from error
 
     def solve(problem: ls.Problem, start: Start) -> Run:
         log: list[ls.types.Iteration] = []

@@ -2,8 +2,7 @@
 
 `solve`
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
-  With
-     constraints, the others follow as long as they may cost less.
+     With constraints, the others follow as long as they may cost less.
   2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
      ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
   3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
