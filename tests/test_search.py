@@ -198,11 +198,15 @@ def arcs(x: Array, u: Array, p: Any) -> list[float]:
     return [speed * np.cos(x[2]), speed * np.sin(x[2]), (u[1] - u[0]) / p.axle_length]
 
 
+def discs_of(seed: int) -> Array:
+    """Middles and radii of two discs, (2, 3)."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform([-0.5, -0.3], [0.5, 0.3], (2, 2)), rng.uniform(0.15, 0.3, 2)])
+
+
 def among_discs(seed: int) -> ls.Problem:
     """A point mass that is to get past two discs, which are constraints and no costs."""
-    rng = np.random.default_rng(seed)
-    discs = np.column_stack([rng.uniform([-0.5, -0.3], [0.5, 0.3], (2, 2)), rng.uniform(0.15, 0.3, 2)])
-    numbers = {f"{name}{i}": float(one[k]) for i, one in enumerate(discs) for k, name in enumerate("abr")}
+    numbers = {f"{name}{i}": float(one[k]) for i, one in enumerate(discs_of(seed)) for k, name in enumerate("abr")}
     dynamics = ls.Dynamics(
         lambda x, u, p: [x[2], x[3], u[0], u[1]],
         states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s^2", "ay": "m/s^2"},
@@ -242,6 +246,15 @@ class TestConstraintsInTheWay:
             side = ls.smooth(problem, start=ls.Trajectory(states, np.zeros((problem.steps, 2)), problem.dt))
             costs.append(side.cost if side.success else np.inf)
         assert found.cost == pytest.approx(min(costs), rel=1e-9)  # the same runs
+        # Recomputed by the closed form of a point mass with constant acceleration; constraints are kept to 1e-6.
+        x, u = found.trajectory.states, found.trajectory.controls
+        moved = x[:-1, :2] + 0.1 * x[:-1, 2:] + 0.005 * u
+        np.testing.assert_allclose(x[1:], np.hstack([moved, x[:-1, 2:] + 0.1 * u]), atol=1e-12)
+        end = x[-1] - [1.0, 0.0, 0.0, 0.0]
+        assert found.cost == pytest.approx(0.05 * (u**2).sum() + 50 * (end**2).sum(), rel=1e-9)
+        middles, radii = np.split(discs_of(seed), [2], axis=1)
+        squares = ((x[:, None, :2] - middles) ** 2).sum(axis=2) - radii[:, 0] ** 2
+        assert squares.min() > -1e-6
 
     def test_a_bound_of_a_speed_has_no_other_side(self) -> None:
         """A plan at its bound is not searched for a way round; it is asked for in a line."""

@@ -171,7 +171,7 @@ class MjcfDynamics(Dynamics):
         """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
 
         More threads than processors would wait for each other, and are not begun. After a signal that raises
-        KeyboardInterrupt all steps are NaN, so that it need not wait for an iteration, which may take half a minute.
+        KeyboardInterrupt all steps are NaN, so that it need not wait for the end of an iteration.
         """
         threads = min(check_count("threads", threads), processors())
         team, helpers = self.physics.team, list[threading.Thread]()
