@@ -112,8 +112,9 @@ class Ladder:
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
-            near = LITTLE if start.violation <= self._allowed else MUCH
-            rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
+            begin = guess.trajectory or start  # a sketch of a path is not near the answer, though standing still is kept
+            kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
+            rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
         if not stay:
             rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
         if stay or not self._known.from_start:  # the runs of a search have the same start
