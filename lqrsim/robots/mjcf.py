@@ -307,10 +307,7 @@ class MjcfRobot(Robot):
           InputError: no joint has any.
         """
         names = self.dynamics.state_coordinates.names
-        limited = {names[one.dof]: one.limits for one in self._joints if one.limits is not None}
-        return StateBounds(
-            {name: low for name, (low, _) in limited.items()}, {name: high for name, (_, high) in limited.items()}
-        )
+        return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
