@@ -345,7 +345,7 @@ def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path)
 
 def test_derivatives_are_right() -> None:
     kept = [
-        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}), ls.StateBounds(x=(-1, np.inf))
+        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}), ls.StateBounds(x=(-1, 2))
     ]  # fmt: skip
     checks = [check for check in ls.check_derivatives(problem(*kept)) if "slope of" in check.what]
     assert len(checks) == 4
@@ -382,7 +382,7 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
          "constraints: got goals of 1 and 2 for x, want one"),
         (lambda: ls.StateBounds(), "StateBounds: got nothing, want (low, high) by name of a state"),
         (lambda: ls.StateBounds(x=(1, -1)), "StateBounds: 'x': got 1 to -1, want low below high"),
-        (lambda: ls.StateBounds(x=(-np.inf, np.inf)), "StateBounds: 'x': got -inf to inf, want low below high, and one"),
+        (lambda: ls.StateBounds(x=(-np.inf, np.inf)), "StateBounds: 'x': got -inf to inf, want low below high, and"),
         (lambda: anything.StateBounds([0, 0]), "StateBounds: got [0, 0], want (low, high) by name of a state"),
         (lambda: anything.StateBounds(x=1.0), "StateBounds: 'x': got shape (), want (2,)"),
         (lambda: ls.StateBounds(x=(np.nan, 1)), "StateBounds: 'x': got nan"),
