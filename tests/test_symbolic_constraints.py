@@ -345,7 +345,8 @@ def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path)
 
 def test_derivatives_are_right() -> None:
     kept = [
-        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}), ls.StateBounds(x=(-1, 2))
+        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}),
+        ls.StateBounds(x=(-1, np.inf)),
     ]  # fmt: skip
     checks = [check for check in ls.check_derivatives(problem(*kept)) if "slope of" in check.what]
     assert len(checks) == 4
