@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ DYNAMICS = ls.Dynamics(
     lambda x, u, p: [x[2], 0 * x[2], u[0]], states=STATES, controls={"force": "N"}, position=("x", "y")
 )
 PILLAR = ls.World([ls.Obstacle("pillar", "cylinder", np.zeros(3), np.eye(3), np.array([0.5, 1.0, 0.0]))])
-FIELDS = {
+FIELDS: dict[str, Any] = {
     "dynamics": DYNAMICS,
     "dt": 0.1,
     "steps": 10,
@@ -136,7 +137,9 @@ def test_a_goal_inside_an_obstacle_is_said_before_the_solve(
 
 def test_where_a_goal_is_inside_is_known_of_constraints_and_of_what_moves() -> None:
     """A ball that is 1 m away at the start, and at the goal when the plan ends."""
-    ball = ls.Obstacle("ball", "sphere", np.array([3.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]), velocity=(1.0, 0, 0))
+    ball = ls.Obstacle(
+        "ball", "sphere", np.array([3.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]), velocity=np.array([1.0, 0, 0])
+    )
     stage, kept = ls.ControlCost([1.0], about=[0.0]), [ls.Clearance(ls.World([ball]), radius=0.1), ls.GoalState(x=4.0)]
     problem = ls.Problem(**FIELDS | {"stage_cost": stage, "constraints": kept})
     assert problem.goal_inside == "at (4, 0) m, 0.3 m inside obstacle 'ball'"
