@@ -118,7 +118,7 @@ def test_a_goal_inside_an_obstacle_is_said_before_the_solve(
     depth = 0.6 - np.hypot(x, y)
     assume(abs(depth) > 1e-6)
     weight = [1.0, 1.0, 0.0] if weighed else [1.0, 0.0, 1.0]
-    problem = ls.Problem(**FIELDS | {"final_cost": ls.QuadraticCost(weight, about=(x, y, speed))})
+    problem = ls.Problem(**{**FIELDS, "final_cost": ls.QuadraticCost(weight, about=(x, y, speed))})
     said, begun = list[str](), list[int]()
     handler = logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage() * (not begun))
@@ -141,7 +141,7 @@ def test_where_a_goal_is_inside_is_known_of_constraints_and_of_what_moves() -> N
         "ball", "sphere", np.array([3.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]), velocity=np.array([1.0, 0, 0])
     )
     stage, kept = ls.ControlCost([1.0], about=[0.0]), [ls.Clearance(ls.World([ball]), radius=0.1), ls.GoalState(x=4.0)]
-    problem = ls.Problem(**FIELDS | {"stage_cost": stage, "constraints": kept})
+    problem = ls.Problem(**{**FIELDS, "stage_cost": stage, "constraints": kept})
     assert problem.goal_inside == "at (4, 0) m, 0.3 m inside obstacle 'ball'"
     assert not dataclasses.replace(problem, begin=1.0).goal_inside
 
