@@ -80,6 +80,7 @@ class Solution(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check_finite("inverse_policy", "cost_to_come", "clearance")
         come = self.cost_to_come
         if come is not None:
             mean = come.gradient if isinstance(come, Quadratic) else come.mean
