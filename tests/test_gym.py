@@ -52,7 +52,11 @@ def test_gymnasiums_own_check_finds_nothing(case: tuple[str, ls.Scenario, ls.Sol
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [*((name, "") for name in NAMES), ("lqrsim/Scenario-v0", "scenario='quadrotor'"), ("lqrsim/Quadrotor-v0", "num_envs=2")],
+    [
+        *((name, "") for name in NAMES),
+        ("lqrsim/Scenario-v0", "scenario='quadrotor'"),
+        ("lqrsim/Quadrotor-v0", "num_envs=2"),
+    ],
 )
 def test_a_name_alone_is_enough_where_nothing_has_imported_lqrsim(name: str, options: str) -> None:
     make = "make_vec" if "num_envs" in options else "make"
