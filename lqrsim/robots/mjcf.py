@@ -23,7 +23,7 @@ from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_geoms import MjcfGeoms
@@ -342,7 +342,7 @@ class MjcfRobot(Robot):
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
-        qpos, qvel = vectors_of("qpos", qpos, model.nq), vectors_of("qvel", qvel, model.nv)
+        qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
         parts = []
         for one in self._joints:
             own = qpos[..., one.qpos : one.qpos + _WIDTH[one.kind][0]]
