@@ -49,7 +49,7 @@ def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     # The pole stands at the end, and the plan is what MuJoCo did.
     assert np.abs(solution.trajectory.states[-1]).max() < 0.05
     assert names["rollout"].tracking_error.max() < 1e-6
-    assert kept.constraints[0].high == {"slider": 3.0}
+    assert kept.constraints[0].bounds == {"slider": (-3.0, 3.0)}
 
 
 def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_flag,
+    check_items,
     check_name,
     check_number,
     check_weights,
@@ -170,7 +171,8 @@ class MjcfRobot(Robot):
             if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
                 return (), ""
         else:
-            found = [names.index(check_name(f"{who}: position", name, names)) for name in asked]
+            listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
+            found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
