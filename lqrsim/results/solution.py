@@ -146,7 +146,7 @@ class Solution(Plan):
             lines.append(f"  remedy:    {self.remedy}")
         gap = f"{self.gap:.1e}" if np.isfinite(self.gap) else "none (no cost-to-come)"
         lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
-        if self.violation > 0:
+        if self.violation > 1e-6:  # the tolerance by default
             lines[-1] += f"   violation: {self.violation:.1e}"
         if "noise" in self.options:
             meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
