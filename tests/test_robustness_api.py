@@ -376,6 +376,15 @@ def enormous(x: Any, u: Any, p: Any) -> list[int]:
     return [10**400]
 
 
+RECORD: Any = {
+    "step": 0, "trial": 0, "status": "converged", "iterations": 3, "seconds": 0.1, "cost": 1.0, "before": 2.0,
+    "used": True, "reason": "",
+}  # fmt: skip
+DEEP: Any = []
+for _ in range(3000):
+    DEEP = [DEEP]
+
+
 class Biting:
     """What cannot be looked into."""
 
@@ -394,6 +403,13 @@ class Biting:
             lambda: ls.check_derivatives(lq.Dynamics(enormous, states={"x": "m"}, controls={"u": "N"}, level="plain")),
             "enormous(x, u, p): got ",
         ),
+        (lambda: ls.Uncertainty(model_error=DEEP), "Uncertainty: model_error: got "),
+        (lambda: ls.Uncertainty(start={"m": -1.0}), "Uncertainty: start: 'm': got -1.0, want a finite number >= 0"),
+        (lambda: ls.rotations.vector_rate((1e300, 1e300, 1e300), (0.0, 0.0, 1.0)), "r: got a rotation vector whose"),
+        (lambda: lq.Capsule(0.4, 0.1, 0.02).between((0, 0, 0), itertools.count()), "between: got "),
+        (lambda: ls.stress.FunnelCheck(0, DEEP, rate(1, 2), np.ones(2, dtype=bool)), "FunnelCheck: level: got "),
+        (lambda: ls.stress.ComparedPlan("", DEEP, np.ones(2, dtype=bool)), "ComparedPlan: solution: got "),
+        (lambda: ls.types.ReplanRecord(**RECORD | {"reason": DEEP}), "ReplanRecord: reason: got "),
     ],
 )
 def test_what_hostile_calls_once_found(call: Callable[[], object], says: str) -> None:
