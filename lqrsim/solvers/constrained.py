@@ -424,8 +424,8 @@ class Ladder:
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                beside = least.beside(detail)
-                detail += f"; against it stand {beside}" if beside else ""
+                best = replace(best, against=least.beside(detail))
+                detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 

@@ -1,8 +1,8 @@
 """Funnels: the region around a plan from which a policy reaches the goal. `levels.py` says how a level is found."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -167,7 +167,8 @@ def _search(
     return found
 
 
-class FunnelCheck(NamedTuple):
+@dataclass(frozen=True)
+class FunnelCheck:
     """New trials at a knot of a funnel.
 
     Attributes:
@@ -181,6 +182,13 @@ class FunnelCheck(NamedTuple):
     level: float
     reached: Estimate
     successes: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        check_count("FunnelCheck: knot", self.knot, at_least=0)
+        check_number("FunnelCheck: level", self.level, at_least=0.0)
+        check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
+        successes = check_array("FunnelCheck: successes", self.successes, (None,)) != 0
+        object.__setattr__(self, "successes", successes)
 
 
 def check_funnel(
