@@ -113,11 +113,13 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
     held = np.tile(robot.hold(problem.start), (problem.steps, 1)) if isinstance(task, FamilyTask) else None
     most, seconds = limits["iterations"], limits["time_limit"]
     solution = ls.smooth(problem, max_iterations=most, time_limit=seconds)
-    other = ls.ilqr(problem, max_iterations=most, time_limit=seconds, start=held)
+    other = None  # iLQR keeps no constraints
+    if not problem.constraints:
+        other = ls.ilqr(problem, max_iterations=most, time_limit=seconds, start=held)
     row |= {
         "states": len(robot.dynamics.state_coordinates), "controls": len(robot.dynamics.control_coordinates),
         "status": solution.status.name, "success": solution.success, "cost": solution.cost,
-        "ilqr_cost": other.cost, "ilqr_status": other.status.name, "iterations": len(solution.iterations),
+        "ilqr_cost": None if other is None else other.cost, "iterations": len(solution.iterations),
         "ms": float(np.median([1000 * one.seconds for one in solution.iterations])),
     }  # fmt: skip
     if not np.isfinite(solution.trajectory.states).all():
@@ -137,7 +139,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
     if config.pictures:
         (config.out / FIGURES).mkdir(parents=True, exist_ok=True)
         name = task.name.replace(" ", "_")
-        camera = camera_of(robot)
+        camera = "overview" if isinstance(task, FamilyTask) else camera_of(robot)
         render_still(
             config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
         )
@@ -201,7 +203,10 @@ def cells(row: dict[str, Any]) -> list[Any]:
         return [row["name"], "", "", f"refused: {row['refused']}", *[""] * (len(HEAD) - 4)]
     known = [
         *(row[name] for name in ("name", "states", "controls", "status")),
-        *(f"{row['cost']:.4g}", f"{row['ilqr_cost']:.4g}", row["iterations"], f"{row['ms']:.1f}"),
+        f"{row['cost']:.4g}",
+        "" if row["ilqr_cost"] is None else f"{row['ilqr_cost']:.4g}",
+        row["iterations"],
+        f"{row['ms']:.1f}",
     ]
     if "off" not in row:
         return [*known, *[""] * (len(HEAD) - len(known))]
@@ -227,7 +232,7 @@ def report(result: Result) -> str:
     solved = [row for row in result["rows"] if "cost" in row]
     there = sum(row["success"] and "off" in row and abs(farthest(row)[1]) <= CLOSE for row in solved)
     lines.append(f"Solved, and within {CLOSE} rad or m of their goals: {there} of {len(result['rows'])}.")
-    ratios = [row["cost"] / row["ilqr_cost"] for row in solved]
+    ratios = [row["cost"] / row["ilqr_cost"] for row in solved if row["ilqr_cost"] is not None]
     lines.append(
         f"Cost not more than 1 % above iLQR's from the same start: {sum(one <= WORSE for one in ratios)} of"
         f" {len(ratios)}; at least 1 % below: {sum(one < BETTER for one in ratios)}."
