@@ -295,15 +295,15 @@ def elbow(gear: float, least: float, *, size: float = 0.03, collides: int = 0) -
     return ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true" angle="radian"/>
       <option timestep="0.005"/><worldbody><body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}
       <body name="fore" pos="0.4 0 0"><joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}
-      <body name="hand" pos="0.01 0 0"><geom size="0.05" contype="{collides}" conaffinity="1"/></body>
+      <body name="hand" pos="0.01 0 0"><geom size="0.05" mass="1e-3" contype="{collides}" conaffinity="1"/></body>
       </body></body></worldbody><actuator><motor joint="a" gear="10" ctrlrange="-1 1"/>
       <motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>""", "arm"))  # fmt: skip
 
 
-@pytest.mark.parametrize("turn", [1.0, 2.0, 2.5])
-@pytest.mark.parametrize("gear", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("turn", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("gear", [2.0, 4.0])
 def test_plans_keep_off_joint_limits(gear: float, turn: float) -> None:
-    """The swing folds the elbow: plans without that cost all touch the limit at -0.3, and some of them stall there."""
+    """The swing folds the elbow: plans without that cost all touch the limit at -0.3."""
     robot = elbow(gear, -0.3)
     problem = robot.problem(robot.at(), robot.at(a=turn), steps=40, dt=0.02, weights=[1000, 1000, 100, 100])
     solution = ls.smooth(problem)
