@@ -143,9 +143,11 @@ FAMILY: tuple[FamilyTask, ...] = (
     ),
     FamilyTask(
         name="Shadow hand", package="gymnasium_robotics", file=ENVS + "assets/hand/reach.xml", moves={3: 0.5, 7: 0.5},
+        steps=40,
     ),
     FamilyTask(
         name="pusher", package="gymnasium_robotics", file=ENVS + "mujoco/assets/pusher.xml", moves={0: 0.5, 1: -0.3},
+        steps=100,
     ),
     FamilyTask(
         name="point", package="gymnasium_robotics", file=ENVS + "assets/point/point.xml", moves={0: 1.0, 1: 0.5},

@@ -28,7 +28,7 @@ from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_geoms import MjcfGeoms
 from lqrsim.scenes import mjcf_joints
-from lqrsim.scenes.mjcf_holding import Holding, efforts, holding
+from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
 from lqrsim.scenes.mjcf_obstacles import in_the_way
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
@@ -37,6 +37,7 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS
 _AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touches one: 2 % of it at 8 cm
 _ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off its limits, the smaller one
+_REST = 1e-6  # m/s^2, by which something at rest may accelerate
 _PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
@@ -220,6 +221,32 @@ class MjcfRobot(Robot):
           InputError: the state is not (n,) finite numbers.
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
+
+    def settled(self, state: npt.ArrayLike) -> Array:
+        """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
+
+        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They have to touch.
+
+        Args:
+          state: (n,), whose velocities do not count.
+
+        Returns:
+          (n,), with velocities of zero; `hold` has the controls for it.
+
+        Raises:
+          InputError: nothing nearby is at rest.
+        """
+        state = check_array("state", state, (len(self.dynamics.state_coordinates),))
+        model = self.dynamics.physics.model
+        place, left = settled(model, self.configuration(state)[0])
+        if left > _REST * float(model.body_mass.sum()):
+            raise InputError(
+                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches what"
+                " is to carry it"
+            )
+        found = state.copy()
+        found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        return found
 
     def _held(self, state: Array) -> Holding:
         model = self.dynamics.physics.model
