@@ -76,6 +76,7 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.costs import LimitCost
 from lqrsim.problem.noise import numbers_of
 from lqrsim.results.hashing import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
@@ -832,6 +833,10 @@ class TestParts:
     def test_quadratic_costs(self) -> None:
         of_term(ls.QuadraticCost([1.0, 2.0, 3.0], about=[0.1, 0.2, 0.3]).bind(CART))
         of_term(ls.ControlCost([1.0, 2.0], about=[0.1, 0.2]).bind(CART))
+
+    def test_costs_of_limits(self) -> None:
+        low, high = {"x": X[0] + 0.3, "y": X[1] - 0.3}, {"x": X[0] + 0.4, "y": X[1] - 0.4}
+        of_term(LimitCost(low, high, weight=3.0).bind(CART))
 
     @pytest.mark.parametrize("given", [False, True])
     def test_costs_that_are_functions(self, given: bool) -> None:

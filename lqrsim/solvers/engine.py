@@ -500,7 +500,7 @@ class SolveRun:
         """
         work, last = self.work, self.budget.left
         rows, memory = np.zeros(max(last, 1), LOG), work.memory
-        memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
+        memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
         trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         return iterate(
