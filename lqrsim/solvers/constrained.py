@@ -112,7 +112,8 @@ class Ladder:
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
-            begin = guess.trajectory or start  # a sketch of a path is not near the answer, though standing still is kept
+            # A sketch of a path is not near the answer, even where standing still keeps the constraints.
+            begin = guess.trajectory or start
             kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
             rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
         if not stay:
