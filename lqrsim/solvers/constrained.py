@@ -385,7 +385,8 @@ class Ladder:
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):
             size = found.row_size[self._stages.owners == k]
-            idle = (one.values * size / found.scale < values[k] / size) & ~self._problem.constraint_terms[k].equality
+            idle = one.values * size / found.scale < values[k] / size
+            idle &= not self._problem.constraint_terms[k].equality
             multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
         return tuple(multipliers)
 
