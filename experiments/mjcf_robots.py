@@ -7,11 +7,12 @@
     python experiments/mjcf_robots.py --family --models models    # arms, hands, legs and vehicles, as they come
 
 `experiments/mjcf/tasks.py` says what each is to do, `experiments/mjcf/family.py` what the family is, and how to get its
-files. What is not installed is left out, and named.
+files. What is not installed is left out, and named. Each row is kept as soon as it is done: the same command goes on
+where it was stopped, and a row is measured again when its file in the folder of the output is deleted.
 """
 
-import time
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,15 @@ from mjcf.tasks import TASKS, Task
 from paper.common import render_still
 from PIL import Image
 from runner import FIGURES, FolderSettings, Result, opening, progress, run, table
+from tqdm import tqdm
 
 import lqrsim as ls
+from lqrsim.results.save_load import replacing
 
 OUT = Path("runs/mjcf_robots")
 TILE = 400, 225  # pixels of a picture on the sheet of all
 WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and below what it is better
+CLOSE = 0.01  # rad or m; a robot is at its goal if no joint is farther from it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +39,11 @@ class Config(FolderSettings):
     out: Path = OUT
     """Folder for the pictures, in a folder of that name."""
     only: tuple[str, ...] = ()
-    """Names of robots, or words of them; by default all."""
+    """Names of robots; or, of those that are no name, words of them. By default all."""
     iterations: int = 300
     """At most, of each solver."""
+    time_limit: float = 120.0
+    """Seconds of each solve at most, without compiling."""
     family: bool = False
     """The family of arms, hands, legs and vehicles, and not the eleven."""
     models: Path | None = None
@@ -49,14 +55,37 @@ class Config(FolderSettings):
 def main(config: Config) -> Result:
     most = min(config.iterations, 2) if config.quick else config.iterations
     tasks = [task.found_in(config.models) for task in FAMILY] if config.family else TASKS
-    wanted = [task for task in tasks if not config.only or any(word in task.name for word in config.only)]
+    names = {task.name for task in tasks}
+    words = [word for word in config.only if word not in names]
+    wanted = [
+        one for one in tasks if not config.only or one.name in config.only or any(word in one.name for word in words)
+    ]
     here = [task for task in wanted if task.path is not None]
     result = opening(config) | {"rows": [], "missing": [task.name for task in wanted if task not in here]}
     for task in progress(here, "robots"):
-        result["rows"].append(of_task(config, task, most, result))
+        row = row_of(config, task, {"iterations": most, "time_limit": config.time_limit})
+        result["rows"].append(row)
+        result["figures"] += row["figures"]
+        if not config.json:
+            tqdm.write(line(row))
     if result["figures"]:
         sheet(config, result)
     return result
+
+
+def row_of(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> dict[str, Any]:
+    """The row that was kept, if it is of the same settings; or a new one, which is kept."""
+    if config.quick:
+        return of_task(config, task, limits)
+    kept = config.out / "rows" / f"{task.name.replace(' ', '_')}.json"
+    settings = limits | {"task": repr(replace(task, folder=None) if isinstance(task, FamilyTask) else task)}
+    row = json.loads(kept.read_text("utf-8")) if kept.is_file() else None
+    if row is None or row["settings"] != settings:
+        row = of_task(config, task, limits) | {"settings": settings}
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(kept) as unfinished:
+            unfinished.write_text(json.dumps(row) + "\n", encoding="utf-8")
+    return row
 
 
 def sheet(config: Config, result: Result) -> None:
@@ -71,31 +100,36 @@ def sheet(config: Config, result: Result) -> None:
     result["figures"].append("mjcf_robots.png")
 
 
-def of_task(config: Config, task: Task | FamilyTask, most: int, result: Result) -> dict[str, Any]:
+def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> dict[str, Any]:
     """Solve by both methods from the same start, and run the plan."""
-    robot = task.robot()
-    problem, plant = task.problem(robot), ls.Plant(robot, robot.scene)
-    found, seconds = {}, {}
+    row = {"name": task.name, "file": f"{task.package}/{task.file}", "figures": []}
+    try:
+        robot = task.robot()
+        problem, plant = task.problem(robot), ls.Plant(robot, robot.scene)
+    except ls.InputError as error:
+        return row | {"refused": str(error)}
     assert problem.start is not None
     # iLQR begins at rest, where what holds the robot between start and goal would let it fall.
     held = np.tile(robot.hold(problem.start), (problem.steps, 1)) if isinstance(task, FamilyTask) else None
-    for name, solve in (("smooth", ls.smooth), ("ilqr", ls.ilqr)):
-        start = held if name == "ilqr" else None
-        solve(problem, max_iterations=1, start=start)  # compiles
-        clock = time.perf_counter()
-        found[name] = solve(problem, max_iterations=most, start=start)
-        seconds[name] = time.perf_counter() - clock
-    solution, other = found["smooth"], found["ilqr"]
+    most, seconds = limits["iterations"], limits["time_limit"]
+    solution = ls.smooth(problem, max_iterations=most, time_limit=seconds)
+    other = None  # iLQR keeps no constraints
+    if not problem.constraints:
+        other = ls.ilqr(problem, max_iterations=most, time_limit=seconds, start=held)
+    row |= {
+        "states": len(robot.dynamics.state_coordinates), "controls": len(robot.dynamics.control_coordinates),
+        "status": solution.status.name, "success": solution.success, "cost": solution.cost,
+        "ilqr_cost": None if other is None else other.cost, "iterations": len(solution.iterations),
+        "ms": float(np.median([1000 * one.seconds for one in solution.iterations])),
+    }  # fmt: skip
+    if not np.isfinite(solution.trajectory.states).all():
+        return row
     rollout = ls.simulate(plant, solution)
     outcome = ls.stress.outcomes(rollout)
-    row = {
-        "name": task.name, "states": len(robot.dynamics.state_coordinates), "file": f"{task.package}/{task.file}",
-        "controls": len(robot.dynamics.control_coordinates), "status": solution.status.name, "cost": solution.cost,
-        "ilqr_cost": other.cost, "ilqr_status": other.status.name, "iterations": len(solution.iterations),
-        "ms": float(np.median([1000 * one.seconds for one in solution.iterations])), "seconds": seconds["smooth"],
-        "ilqr_seconds": seconds["ilqr"], "off": float(outcome.worst[0]), "replayed": replayed(robot, solution),
+    row |= {
+        "off": float(outcome.worst[0]), "replayed": replayed(robot, solution), "unit": rollout.tracking_unit,
         "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
-        "bindings": clearance_by_bindings(robot, solution), "unit": rollout.tracking_unit,
+        "bindings": clearance_by_bindings(robot, solution),
         "missed": {
             name: float(solution.trajectory.states[-1, i] - problem.goal[i])
             for i, name in enumerate(robot.dynamics.state_coordinates.names)
@@ -105,9 +139,9 @@ def of_task(config: Config, task: Task | FamilyTask, most: int, result: Result) 
     if config.pictures:
         (config.out / FIGURES).mkdir(parents=True, exist_ok=True)
         name = task.name.replace(" ", "_")
-        camera = camera_of(robot)
+        camera = "overview" if isinstance(task, FamilyTask) else camera_of(robot)
         render_still(
-            config, result, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
+            config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
         )
     return row
 
@@ -157,22 +191,48 @@ def camera_of(robot: ls.MjcfRobot) -> str:
     return next((name for name in ("overview", "fixed", *names) if name in names), "overview")
 
 
+HEAD = (
+    "robot", "states", "controls", "status", "cost", "iLQR's cost", "iterations", "ms an iteration",
+    "tracking error in MuJoCo", "by plain mj_step", "clearance (m)", "less the bindings'", "farthest from the goal",
+)  # fmt: skip
+
+
+def cells(row: dict[str, Any]) -> list[Any]:
+    """What the table has of a robot."""
+    if "refused" in row:
+        return [row["name"], "", "", f"refused: {row['refused']}", *[""] * (len(HEAD) - 4)]
+    known = [
+        *(row[name] for name in ("name", "states", "controls", "status")),
+        f"{row['cost']:.4g}",
+        "" if row["ilqr_cost"] is None else f"{row['ilqr_cost']:.4g}",
+        row["iterations"],
+        f"{row['ms']:.1f}",
+    ]
+    if "off" not in row:
+        return [*known, *[""] * (len(HEAD) - len(known))]
+    name, missed = farthest(row)
+    apart = ["", ""]
+    if row["clearance"] is not None:
+        apart = [f"{row['clearance']:.4f}", f"{row['clearance'] - row['bindings']:+.0e}"]
+    return [*known, f"{row['off']:.1e} {row['unit']}", f"{row['replayed']:.1e}", *apart, f"{name} {missed:+.2g}"]
+
+
+def farthest(row: dict[str, Any]) -> tuple[str, float]:
+    """The joint that is farthest from the goal, and how far."""
+    return max(row["missed"].items(), key=lambda pair: abs(pair[1]), default=("", 0.0))
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table on its own."""
+    return table(HEAD, [cells(row)]).splitlines()[-1]
+
+
 def report(result: Result) -> str:
-    rows, head = [], (
-        "robot", "states", "controls", "status", "cost", "iLQR's cost", "iterations", "ms an iteration",
-        "tracking error in MuJoCo", "by plain mj_step", "clearance (m)", "less the bindings'", "farthest from the goal",
-    )  # fmt: skip
-    for row in result["rows"]:
-        missed = max(row["missed"].items(), key=lambda pair: abs(pair[1]), default=("", 0.0))
-        rows.append([
-            row["name"], row["states"], row["controls"], row["status"], f"{row['cost']:.4g}",
-            f"{row['ilqr_cost']:.4g}", row["iterations"], f"{row['ms']:.1f}", f"{row['off']:.1e} {row['unit']}",
-            f"{row['replayed']:.1e}", "" if row["clearance"] is None else f"{row['clearance']:.4f}",
-            "" if row["clearance"] is None else f"{row['clearance'] - row['bindings']:+.0e}",
-            f"{missed[0]} {missed[1]:+.2g}",
-        ])  # fmt: skip
-    ratios = [row["cost"] / row["ilqr_cost"] for row in result["rows"]]
-    lines = [table(head, rows), ""]
+    lines = [table(HEAD, [cells(row) for row in result["rows"]]), ""]
+    solved = [row for row in result["rows"] if "cost" in row]
+    there = sum(row["success"] and "off" in row and abs(farthest(row)[1]) <= CLOSE for row in solved)
+    lines.append(f"Solved, and within {CLOSE} rad or m of their goals: {there} of {len(result['rows'])}.")
+    ratios = [row["cost"] / row["ilqr_cost"] for row in solved if row["ilqr_cost"] is not None]
     lines.append(
         f"Cost not more than 1 % above iLQR's from the same start: {sum(one <= WORSE for one in ratios)} of"
         f" {len(ratios)}; at least 1 % below: {sum(one < BETTER for one in ratios)}."

@@ -76,6 +76,7 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.costs import LimitCost
 from lqrsim.problem.noise import numbers_of
 from lqrsim.results.hashing import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
@@ -355,8 +356,8 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
 class TestSolvers:
     def test_dual_form_with_limits_and_constraints(self) -> None:
         kept = [
-            ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState([1.4], states=("x",)),
-            ls.StateBounds(low={"heading": -0.2}, high={"y": 0.6}),
+            ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState(x=1.4),
+            ls.StateBounds(heading=(-0.2, np.inf), y=(-np.inf, 0.6)),
         ]  # fmt: skip
         smoothed(problem(constraints=kept), task="damped", penalty=30.0)
 
@@ -833,6 +834,10 @@ class TestParts:
         of_term(ls.QuadraticCost([1.0, 2.0, 3.0], about=[0.1, 0.2, 0.3]).bind(CART))
         of_term(ls.ControlCost([1.0, 2.0], about=[0.1, 0.2]).bind(CART))
 
+    def test_costs_of_limits(self) -> None:
+        low, high = {"x": X[0] + 0.3, "y": X[1] - 0.3}, {"x": X[0] + 0.4, "y": X[1] - 0.4}
+        of_term(LimitCost(low, high, weight=3.0).bind(CART))
+
     @pytest.mark.parametrize("given", [False, True])
     def test_costs_that_are_functions(self, given: bool) -> None:
         def cost(x, u, p):
@@ -862,7 +867,7 @@ class TestParts:
 
     def test_constraints(self) -> None:
         of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))
-        of_constraint(ls.StateBounds(low={"x": 0.5}, high={"y": 0.2}).bind(CART))
+        of_constraint(ls.StateBounds(x=(0.5, np.inf), y=(-np.inf, 0.2)).bind(CART))
         of_constraint(ls.GoalState([1.0, 0.0, 0.0]).bind(CART), equality=1)
 
     @pytest.mark.parametrize("seed", range(4))
@@ -1073,7 +1078,7 @@ class TestInteriorPoint:
     def test_models_steps_and_where_they_lead(self) -> None:
         """From a soft start, with constraints that bend; the plan is no motion."""
         rng = np.random.default_rng(0)
-        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
         one = problem(steps=3, constraints=kept)
         stages, source = Stages(one), source_of(interior_point)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
@@ -1118,7 +1123,7 @@ class TestActiveSet:
     def test_models_and_pivots(self) -> None:
         """From a soft start, with constraints that bend, an equality and limits, some of them held."""
         rng = np.random.default_rng(0)
-        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
         stages, source = Stages(problem(steps=3, constraints=kept)), source_of(active_set)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         rows = len(stages.owners)

@@ -21,6 +21,7 @@ import lqrsim as ls
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
+from lqrsim.problem.costs import LimitCost, terms_of
 from lqrsim.scenes.scene import scene_from_xml
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -283,9 +284,56 @@ def test_a_camera_and_a_light_where_there_are_none() -> None:
 def test_joint_limits_are_bounds() -> None:
     robot, _ = robot_of("cart", 0)
     bounds = robot.joint_limits
-    assert (bounds.low, bounds.high) == ({"slider": -0.3}, {"slider": 0.3})
-    with pytest.raises(InputError, match="got no bounds"):
+    assert bounds.bounds == {"slider": (-0.3, 0.3)}
+    with pytest.raises(InputError, match="StateBounds: got nothing"):
         _ = robot_of("wheel", 0)[0].joint_limits
+
+
+def elbow(gear: float, least: float, *, size: float = 0.03, collides: int = 0) -> ls.MjcfRobot:
+    """Two links in a level plane, whose second joint has limits."""
+    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="{size}" mass="1" contype="{collides}" conaffinity="1"/>'
+    return ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true" angle="radian"/>
+      <option timestep="0.005"/><worldbody><body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}
+      <body name="fore" pos="0.4 0 0"><joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}
+      <body name="hand" pos="0.01 0 0"><geom size="0.05" mass="1e-3" contype="{collides}" conaffinity="1"/></body>
+      </body></body></worldbody><actuator><motor joint="a" gear="10" ctrlrange="-1 1"/>
+      <motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>""", "arm"))  # fmt: skip
+
+
+@pytest.mark.parametrize("turn", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("gear", [2.0, 4.0])
+def test_plans_keep_off_joint_limits(gear: float, turn: float) -> None:
+    """The swing folds the elbow: plans without that cost all touch the limit at -0.3."""
+    robot = elbow(gear, -0.3)
+    problem = robot.problem(robot.at(), robot.at(a=turn), steps=40, dt=0.02, weights=[1000, 1000, 100, 100])
+    solution = ls.smooth(problem)
+    assert solution.success
+    assert solution.trajectory.states[:, 1].min() > -0.3
+    (*states, last), controls = solution.trajectory.states, solution.trajectory.controls
+    low, high = np.maximum(0, -0.2 - np.array(states)[:, 1]), np.maximum(0, np.array(states)[:, 1] - 1.9)
+    squares = np.sum(controls**2) + 1e-3 * np.sum(np.array(states)[:, 2:] ** 2) + 100 * np.sum(low**2 + high**2)
+    squares += (last - robot.at(a=turn)) ** 2 @ [1000, 1000, 100, 100]
+    assert solution.cost == pytest.approx(squares / 2, rel=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_limits_cost_nothing_where_start_and_goal_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot, (start, goal) = elbow(1.0, -0.3), rng.uniform(-0.3, 2.0, size=2)
+    problem = robot.problem(robot.at(b=start), robot.at(b=goal))
+    (term,) = [one for one in terms_of(problem.stage_cost) if isinstance(one, LimitCost)]
+    (_, _, low), (_, _, high) = term.bounds
+    assert low == pytest.approx(min(-0.2, start, goal))
+    assert high == pytest.approx(max(1.9, start, goal))
+
+
+def test_what_is_amiss_at_rest_is_said() -> None:
+    """Joints past their limits, and bodies that touch, but not those that MuJoCo lets through."""
+    assert "past their limits at rest: 'b 0 (want 0.2 to 2)'" in str(elbow(1.0, 0.2))
+    assert "at rest: 'b" not in str(elbow(1.0, -0.2))
+    assert "touching" not in str(elbow(1.0, 0.2))
+    assert "touching at rest: 'upper and hand'" in str(elbow(1.0, 0.2, collides=1))
 
 
 def test_a_wrench_on_the_body_is_a_disturbance() -> None:

@@ -21,6 +21,7 @@ from lqrsim.errors import Array
 
 
 @hypothesis.given(st.floats(-5, 5), st.floats(-5, 5), st.floats(-1, 1))
+@hypothesis.example(0.0, 5e-324, 1.0)
 @hypothesis.settings(max_examples=150)
 def test_both_below_is_the_bivariate_normal(a: float, b: float, correlation: float) -> None:
     """To 1e-9 of quadrature; beyond a correlation of 0.9999 that has no more digits: the limit is at most 1e-2 off."""

@@ -21,7 +21,6 @@ from lqrsim.scenes.scene import read_mjcf, scene_from_xml
 
 ARMS, HANDS = "models/assets/robots/", "models/assets/grippers/"
 LEGS, ENVS = "robot_model/", "envs/"
-MARGIN = 0.02  # m, from posts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +31,7 @@ class FamilyTask:
       name: of it. package, file: the MJCF in that package, installed or unpacked in `folder`.
       moves: by how much joints are to move, by number, from the start. start: positions of the joints, one each; none
         for where they are in the MJCF. keyframe: to start from. post: a cylinder in the way, its place and size.
+      excluded: two bodies that do not collide, against the MJCF: they touch by construction, as `print(robot)` says.
       steps: of dt seconds. weights: at the end, of positions and velocities.
     """
 
@@ -42,6 +42,7 @@ class FamilyTask:
     start: tuple[float, ...] = ()
     keyframe: str | None = None
     post: tuple[float, ...] = ()
+    excluded: tuple[str, ...] = ()
     steps: int = 60
     dt: float = 0.02
     weights: tuple[float, float] = (1000.0, 100.0)
@@ -61,15 +62,21 @@ class FamilyTask:
         return next((place / self.file for place in places if (place / self.file).is_file()), None)
 
     def robot(self) -> ls.MjcfRobot:
-        """The robot, with the post if there is one."""
+        """The robot, with the post if there is one, and without the contacts of what is excluded."""
         assert self.path is not None
-        if not self.post:
+        if not self.post and not self.excluded:
             return ls.MjcfRobot(self.path)
         name, xml = read_mjcf(self.path)
-        x, y, z, radius, half = self.post
-        post = f'<geom name="post" type="cylinder" pos="{x} {y} {z}" size="{radius} {half}" rgba=".2 .4 .6 1"/>'
-        xml = xml.replace("</mujoco>", f"<worldbody>{post}</worldbody></mujoco>")
-        return ls.MjcfRobot(scene_from_xml(xml, name, obstacles=("post",)))
+        added = ""
+        if self.post:
+            x, y, z, radius, half = self.post
+            size = f'pos="{x} {y} {z}" size="{radius} {half}"'
+            added += f'<worldbody><geom name="post" type="cylinder" {size} rgba=".2 .4 .6 1"/></worldbody>'
+        if self.excluded:
+            one, other = self.excluded
+            added += f'<contact><exclude body1="{one}" body2="{other}"/></contact>'
+        xml = xml.replace("</mujoco>", f"{added}</mujoco>")
+        return ls.MjcfRobot(scene_from_xml(xml, name, obstacles=("post",) if self.post else ()))
 
     def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
         """From rest at the start to the goal."""
@@ -80,10 +87,7 @@ class FamilyTask:
             goal[joint] += move
         weights = np.zeros(len(start))
         weights[:nv], weights[nv : 2 * nv] = self.weights
-        problem = robot.problem(start, goal, steps=self.steps, dt=self.dt, weights=weights)
-        if not self.post:
-            return problem
-        return replace(problem, constraints=[ls.Clearance(robot.scene.world, geoms=robot.geoms, margin=MARGIN)])
+        return robot.problem(start, goal, steps=self.steps, dt=self.dt, weights=weights)
 
 
 FAMILY: tuple[FamilyTask, ...] = (
@@ -118,11 +122,12 @@ FAMILY: tuple[FamilyTask, ...] = (
     FamilyTask(
         name="Sawyer", package="robosuite", file=ARMS + "sawyer/robot.xml",
         start=(0, -1.18, 0, 2.18, 0, 0.57, 3.3161), moves={0: 0.8, 1: 0.3},
+        excluded=("right_arm_base_link", "right_l0"),
     ),
     FamilyTask(
         name="Baxter", package="robosuite", file=ARMS + "baxter/robot.xml",
         start=(0.403, -0.636, 0.114, 1.432, 0.735, 1.205, -0.269, -0.403, -0.636, -0.114, 1.432, -0.735, 1.205, 0.269),
-        moves={0: 0.4, 7: -0.4},
+        moves={0: -0.4, 7: 0.4},
     ),
     FamilyTask(
         name="Spot arm", package="robosuite", file=ARMS + "spot_arm/robot.xml",
@@ -133,13 +138,16 @@ FAMILY: tuple[FamilyTask, ...] = (
         weights=(1e5, 1e3),
     ),
     FamilyTask(
-        name="Inspire hand", package="robosuite", file=HANDS + "inspire_right_hand.xml", moves={4: 0.5, 6: 0.5},
+        name="Inspire hand", package="robosuite", file=HANDS + "inspire_right_hand.xml",
+        start=(0.3,) * 12, moves={4: 0.5, 6: 0.5, 8: 0.5, 10: 0.5}, steps=75,
     ),
     FamilyTask(
         name="Shadow hand", package="gymnasium_robotics", file=ENVS + "assets/hand/reach.xml", moves={3: 0.5, 7: 0.5},
+        steps=40,
     ),
     FamilyTask(
         name="pusher", package="gymnasium_robotics", file=ENVS + "mujoco/assets/pusher.xml", moves={0: 0.5, 1: -0.3},
+        steps=100,
     ),
     FamilyTask(
         name="point", package="gymnasium_robotics", file=ENVS + "assets/point/point.xml", moves={0: 1.0, 1: 0.5},

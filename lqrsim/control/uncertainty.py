@@ -139,6 +139,12 @@ class Uncertainty:
     def __post_init__(self) -> None:
         unknowns = check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown")
         object.__setattr__(self, "unknowns", unknowns)
+        for name in SUMMED:
+            numbers = getattr(self, name)
+            for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
+                check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
+            if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
+                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want a number, or one for each")
         object.__setattr__(self, "lag", check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
             count = check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)

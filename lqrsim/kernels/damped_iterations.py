@@ -9,11 +9,13 @@ from math import inf, isnan, nan
 
 from lqrsim.kernels.declarations import (
     DAMPED,
+    IDLE,
     ILQR,
     MAX_ITERATIONS,
     NOISY,
     PATIENCE,
     REJECTED,
+    ROUNDING,
     RUNNING,
     STALLED,
     M,
@@ -49,7 +51,8 @@ def damped_iterations(first, last, settings, model, work, memory, log):
     long.
 
     A small change of cost can come from a short step, so two in a row are required. Then one more undamped pass about
-    the plan measures its optimality, and computes the policy and the value functions of the answer.
+    the plan measures its optimality, and computes the policy and the value functions of the answer. Where nothing but
+    rounding lowers the merit for IDLE iterations in a row, as at a kink of the dynamics, it has stalled.
 
     With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
     `smoother_iterations`.
@@ -70,12 +73,15 @@ def damped_iterations(first, last, settings, model, work, memory, log):
             memory.plan_cost, memory.merit = cost, merit
             small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
             memory.small_changes = memory.small_changes + 1 if small else 0.0
-            settled, stalled = memory.small_changes > 1, False
+            memory.idle = memory.idle + 1 if improvement < ROUNDING else 0.0
+            stalled = memory.idle >= IDLE
+            settled = stalled or memory.small_changes > 1
             relax_damping(memory, fraction)
             write_row(log[done], cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
         else:
             tighten_damping(memory)
-            stalled = memory.weight > 1e12
+            memory.idle += 1
+            stalled = memory.weight > 1e12 or memory.idle >= IDLE
             settled = stalled
             write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
         if settled or full:

@@ -38,6 +38,8 @@ SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
 
 # Damped iterations after which iLQR has its turn.
 PATIENCE = 50
+# Relative improvements that may be rounding, and iterations in a row with no others after which damped ones stall.
+ROUNDING, IDLE = 1e-11, 12
 
 
 # Words of the language; see `codegen/language.py`.

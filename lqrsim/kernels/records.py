@@ -388,15 +388,16 @@ def _row(*names: str) -> np.dtype[np.void]:
 # The state of the iterations between calls.
 # plan_cost, merit: of the plan; the merit includes the augmented Lagrangian. started: 1 once the start was rolled out.
 # watched: 1 where undamped iterations end without progress, because the safeguard can take over.
-# Of the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row; of
-# iterations at reach 0, iLQR's, how many are left, how many there will be the next time, and how many others there were
-# since; final_gap: between smoothed states and plan at the end.
+# Of the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row;
+# idle: of iterations in a row that were rejected or improved by rounding; of iterations at reach 0, iLQR's, how many
+# are left, how many there will be the next time, and how many others there were since; final_gap: between smoothed
+# states and plan at the end.
 # Of Newton's method: share of the second order of the next pass; the step at which the last pass failed; its predicted
 # slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible cost; and
 # the damping without which the pass has no minimum.
 MEMORY = _row(
-    "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
-    "started", "watched", "share", "failed", "decrease", "promised", "negligible", "damping",
+    "plan_cost", "merit", "reach", "weight", "small_changes", "idle", "ilqr_left", "ilqr_next", "since_ilqr",
+    "final_gap", "started", "watched", "share", "failed", "decrease", "promised", "negligible", "damping",
 )  # fmt: skip
 
 # A row of the log; NaN where something was not computed.

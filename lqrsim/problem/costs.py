@@ -28,7 +28,7 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import differences, distance_cost, obstacle_cost, quadratic_cost, user_functions
+from lqrsim.kernels import differences, distance_cost, limit_cost, obstacle_cost, quadratic_cost, user_functions
 from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
@@ -177,6 +177,38 @@ class ControlCost(Cost):
         _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
         numbers = np.concatenate([self.about, self.weight.ravel()])
         return CostTerm(source_of(quadratic_cost, CONTROL=1), numbers, uses_control=True)
+
+
+class LimitCost(Cost):
+    """`1/2 weight depth^2` for each state that is past a bound, by that depth: a soft end to where it may be.
+
+    Args:
+      low, high: name of a state -> its bound.
+      weight: of the square of each depth.
+    """
+
+    def __init__(
+        self,
+        low: Mapping[str, float] | None = None,
+        high: Mapping[str, float] | None = None,
+        *,
+        weight: float,
+    ) -> None:
+        self.weight = check_number("LimitCost: weight", weight, at_least=0.0)
+        self.bounds = [
+            (name, sign, check_number(f"LimitCost: bound of {name}", bound))
+            for sign, bounds in ((1.0, low), (-1.0, high))
+            for name, bound in (bounds or {}).items()
+        ]
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        names = dynamics.state_coordinates.names
+        rows = [
+            [names.index(check_name("LimitCost: state", name, names)), sign, bound, self.weight]
+            for name, sign, bound in self.bounds
+        ]
+        numbers = np.array([len(rows), *np.ravel(rows)], dtype=np.float64)
+        return CostTerm(source_of(limit_cost), numbers, exact_hessian=False)
 
 
 class ObstacleCost(Cost):

@@ -13,6 +13,7 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_flag,
+    check_items,
     check_name,
     check_number,
     check_weights,
@@ -20,15 +21,15 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.problem.constraints import StateBounds
-from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
+from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_geoms import MjcfGeoms
 from lqrsim.scenes import mjcf_joints
-from lqrsim.scenes.mjcf_holding import Holding, efforts, holding
+from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
 from lqrsim.scenes.mjcf_obstacles import in_the_way
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
@@ -36,6 +37,8 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touches one: 2 % of it at 8 cm
+_ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off its limits, the smaller one
+_REST = 1e-6  # m/s^2, by which something at rest may accelerate
 _PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
@@ -170,7 +173,8 @@ class MjcfRobot(Robot):
             if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
                 return (), ""
         else:
-            found = [names.index(check_name(f"{who}: position", name, names)) for name in asked]
+            listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
+            found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
@@ -220,6 +224,32 @@ class MjcfRobot(Robot):
         """
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
+    def settled(self, state: npt.ArrayLike) -> Array:
+        """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
+
+        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
+
+        Args:
+          state: (n,), whose velocities do not count.
+
+        Returns:
+          (n,), with velocities of zero; `hold` has the controls for it.
+
+        Raises:
+          InputError: nothing nearby is at rest.
+        """
+        state = check_array("state", state, (len(self.dynamics.state_coordinates),))
+        model = self.dynamics.physics.model
+        place, left = settled(model, self.configuration(state)[0])
+        if left > _REST * float(model.body_mass.sum()):
+            raise InputError(
+                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches"
+                " what is to carry it"
+            )
+        found = state.copy()
+        found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        return found
+
     def _held(self, state: Array) -> Holding:
         model = self.dynamics.physics.model
         numbers = np.array([model.actuator(name).id for name in self.actuators], dtype=np.intp)
@@ -235,8 +265,12 @@ class MjcfRobot(Robot):
         weights: npt.ArrayLike = 100.0,
         effort: npt.ArrayLike | None = None,
         damping: float = 1e-3,
+        limits: float = 100.0,
     ) -> Problem:
         """Make a problem: from one state to another, within the actuators' limits, clear of obstacles at a cost.
+
+        Joints keep off their limits at a cost, too: MuJoCo's step is discontinuous where a limit is just reached, and
+        plans along one do not converge.
 
         The cost of the controls is about those that hold the robot still at the start; if it can be held at the goal,
         too, about the mean of both. Solvers start from these controls.
@@ -249,6 +283,8 @@ class MjcfRobot(Robot):
           weights: weights of the final error, one number for all states, or (n,).
           effort: weights of the controls, (m,); by default such that a control at its limit costs 1/2.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
+          limits: weight of what a joint is closer to its limits, at each step, than 0.1 rad or m, 5 % of its range, or
+            start and goal are.
 
         Returns:
           The Problem.
@@ -273,6 +309,9 @@ class MjcfRobot(Robot):
                 )
         if moves.any():
             cost = cost + QuadraticCost(moves, about=np.zeros(n))
+        bounds = self._bounds(start, goal)
+        if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
+            cost = cost + LimitCost(*bounds, weight=limits)
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
@@ -281,6 +320,17 @@ class MjcfRobot(Robot):
             final_cost=QuadraticCost(check_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
         )  # fmt: skip
+
+    def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
+        """Least and largest positions of joints, by name: some way off their limits, if both states are."""
+        names, low, high = self.dynamics.state_coordinates.names, {}, {}
+        for one in self._joints:
+            if one.limits is not None:
+                least, most = one.limits
+                room, ends = min(_ROOM[0], _ROOM[1] * (most - least)), (start[one.dof], goal[one.dof])
+                low[names[one.dof]] = max(least, min(least + room, *ends))
+                high[names[one.dof]] = min(most, max(most - room, *ends))
+        return low, high
 
     def __str__(self) -> str:
         space, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
@@ -291,9 +341,23 @@ class MjcfRobot(Robot):
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self._timestep:g} s",
             f"  states: {excerpt(', '.join(space.names))}",
             f"  held at rest by: {told}{short}",
+            *(f"  {what} at rest: {excerpt(', '.join(found))}" for what, found in self._amiss().items() if found),
             f"  obstacles: {excerpt(', '.join(names)) if names else 'none'}",
         ]
         return "\n".join(lines)
+
+    def _amiss(self) -> dict[str, list[str]]:
+        """What a plan from the MJCF's rest has to do with from its first step: joints past limits, and contacts."""
+        model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
+        past = [
+            f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
+            for one in self._joints
+            if one.limits is not None and not one.limits[0] <= rest[one.dof] <= one.limits[1]
+        ]
+        touching = [
+            f"{first} and {second}" for first, second in mjcf_joints.contacts_of(model, self.configuration(rest)[0])
+        ]
+        return {"past their limits": past, "touching": touching}
 
     @property
     def _timestep(self) -> float:
@@ -307,10 +371,7 @@ class MjcfRobot(Robot):
           InputError: no joint has any.
         """
         names = self.dynamics.state_coordinates.names
-        limited = {names[one.dof]: one.limits for one in self._joints if one.limits is not None}
-        return StateBounds(
-            {name: low for name, (low, _) in limited.items()}, {name: high for name, (_, high) in limited.items()}
-        )
+        return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
@@ -345,7 +406,7 @@ class MjcfRobot(Robot):
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
-        qpos, qvel = vectors_of("qpos", qpos, model.nq), vectors_of("qvel", qvel, model.nv)
+        qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
         parts = []
         for one in self._joints:
             own = qpos[..., one.qpos : one.qpos + _WIDTH[one.kind][0]]

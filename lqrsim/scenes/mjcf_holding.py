@@ -11,6 +11,7 @@ from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import couplings_of
 
 _HELD = 1e-6  # of the largest force, what may be missed where a robot is said to be held
+_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # steps at most, their halves, and m or rad of difference quotients
 _LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
 
 
@@ -70,6 +71,46 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     found = np.clip(found, low, high)
     missed = float(np.abs(columns @ (found - middle) + rest - wanted).max(initial=0.0))
     return Holding(found[actuators], missed, missed <= _HELD * size)
+
+
+def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
+    """Positions (nq,) nearby at which what no actuator drives is at rest, and the largest force (N, N m) left on it.
+
+    Newton's method, with the least steps: contacts are springs, and of the free directions, such as along a floor, none
+    is moved in.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    driven = np.zeros(model.nv, dtype=bool)
+    for one in np.eye(model.nu):
+        forces = []
+        for data.ctrl[:] in (one, -one):
+            mujoco.mj_forward(model, data)
+            forces.append(data.qfrc_actuator.copy())
+        driven |= forces[0] != forces[1]
+    free = np.flatnonzero(~driven)
+
+    def missing(moved: Array) -> tuple[Array, Array]:
+        place, motion = qpos.copy(), np.zeros(model.nv)
+        motion[free] = moved
+        mujoco.mj_integratePos(model, place, motion, 1.0)
+        data.qpos[:], data.qvel[:], data.qacc[:] = place, 0, 0
+        mujoco.mj_inverse(model, data)
+        return place, data.qfrc_inverse[free].copy()
+
+    moved = np.zeros(len(free))
+    place, left = missing(moved)
+    for _ in range(_NEWTON):
+        slopes = [missing(moved + one)[1] - missing(moved - one)[1] for one in _NUDGE * np.eye(len(free))]
+        step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _NUDGE), left, rcond=1e-6)[0]
+        for share in 0.5 ** np.arange(_HALVES):
+            tried, then = missing(moved + share * step)
+            if np.linalg.norm(then) < np.linalg.norm(left):
+                moved, place, left = moved + share * step, tried, then
+                break
+        else:
+            break
+    return place, float(np.abs(left).max(initial=0.0))
 
 
 def _carried(model: mujoco.MjModel) -> Array:

@@ -152,6 +152,19 @@ def _unit(model: mujoco.MjModel, number: int) -> str:
     return f"{length}/s" if bias[1] == 0 and gain[0] == -bias[2] else ""
 
 
+def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
+    """The names of the bodies that touch, each pair once."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
+    return [
+        (model.body(first).name, model.body(second).name)
+        for first, second in dict.fromkeys(map(tuple, bodies.tolist()))
+    ]
+
+
 def couplings_of(model: mujoco.MjModel) -> tuple[Coupling, ...]:
     """The active equality constraints of joints, all of which must be linear: see `is_linear`."""
     found = []

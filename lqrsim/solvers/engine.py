@@ -218,6 +218,7 @@ class RunResult:
       cost: cost of the plan, as the log has it; infinite where there is no plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
       final: whether another start cannot do better.
+      against: what conflicts with the constraints that are missed, in words, the strongest first.
     """
 
     status: Status
@@ -232,6 +233,7 @@ class RunResult:
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
     final: bool = False
+    against: tuple[str, ...] = ()
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
@@ -498,7 +500,7 @@ class SolveRun:
         """
         work, last = self.work, self.budget.left
         rows, memory = np.zeros(max(last, 1), LOG), work.memory
-        memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
+        memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
         trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         return iterate(

@@ -1,7 +1,7 @@
 """Funnels: the region around a plan from which a policy reaches the goal. `levels.py` says how a level is found."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -205,7 +205,8 @@ def _search(
         progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}; {run:,} trials")
 
 
-class FunnelCheck(NamedTuple):
+@dataclass(frozen=True)
+class FunnelCheck:
     """New trials at a knot of a funnel.
 
     Attributes:
@@ -219,6 +220,13 @@ class FunnelCheck(NamedTuple):
     level: float
     reached: Estimate
     successes: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        check_count("FunnelCheck: knot", self.knot, at_least=0)
+        check_number("FunnelCheck: level", self.level, at_least=0.0)
+        check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
+        successes = check_array("FunnelCheck: successes", self.successes, (None,)) != 0
+        object.__setattr__(self, "successes", successes)
 
 
 def check_funnel(
