@@ -1,5 +1,6 @@
 """`lqrsim rare` and `lqrsim break`: what they print holds, the same seed gives the same files, nothing is left over."""
 
+import dataclasses
 import json
 import re
 import signal
@@ -105,12 +106,42 @@ def test_rare_measures_a_probability_that_is_known(
     assert (asked["scenario"], asked["policy"], asked["particles"]) == (reference, "open_loop", 60)
     assert rare["disturbances"] == [{"kind": "Shift", "settings": {"std": 0.1, "most": 9.0}}]
     # What is written fails, the worst first.
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rare.json", "rollout.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["certificate.npz", "rare.json", "rollout.npz"]
     rollout = ls.load(tmp_path / "rollout.npz", ls.Rollout)
     assert rollout.outcome == ("collided",) * 3
     assert rollout.frames.shape[1] > 1
     begun = rollout.states[:, 0, 1]
     assert begun[0] == begun.min()
+
+
+def test_a_certificate_is_measured_again_and_a_false_one_is_found_out(
+    own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same bits, in whole or in part. Other bits, or fresh numbers whose interval is elsewhere, exit with 1."""
+    reference, file = f"{own}:shifted", str(tmp_path / "certificate.npz")
+    few = ["--particles", "20", "--repetitions", "3", "--strength", "3"]
+    assert main(["rare", reference, *OPEN, *few, "--out", str(tmp_path)]) == 0
+    for more in ([], ["--repetitions", "2"]):
+        assert main(["certify", file, "--scenario", reference, *more]) == 0
+        assert "as certified, to the last bit" in capsys.readouterr().out
+    assert main(["certify", file, "--scenario", reference, "--seed", "7"]) == 0
+    assert "as certified: the intervals overlap" in capsys.readouterr().out
+    assert main(["certify", file]) == 2
+    assert "scenario: got none, want it" in capsys.readouterr().err
+    true = ls.load(file, ls.stress.Certificate)
+    less = {name: getattr(true, name) / 1000 for name in ("probability", "low", "high", "repetitions")}
+    for change, more, says in (
+        (less, [], "NOT as certified: repetition 0: got"),
+        (less, ["--seed", "7"], "NOT as certified: probability: got"),
+        ({"policy_digest": "0"}, [], "NOT as certified: policy_digest: got"),
+    ):
+        false = ls.save(dataclasses.replace(true, **change), tmp_path / "false.npz")
+        assert main(["certify", str(false), "--scenario", reference, "--repetitions", "2", *more]) == 1
+        assert says in capsys.readouterr().out
+    with pytest.raises(ls.InputError, match="want it inside"):
+        dataclasses.replace(true, probability=0.0)
+    with pytest.raises(ls.InputError, match="of which the probability is the mean"):
+        dataclasses.replace(true, repetitions=true.repetitions * 1.01)
 
 
 @pytest.mark.long

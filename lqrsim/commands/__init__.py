@@ -10,14 +10,14 @@ from tyro.conf import subcommand
 
 from lqrsim.commands.creating import Export, New
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
-from lqrsim.commands.reliability import Break, FunnelCommand, Rare
+from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Rare
 from lqrsim.commands.solving import List, Simulate, Solve
 from lqrsim.commands.stressing import Replay, Report, Stress
 from lqrsim.commands.verifying import Verify
 from lqrsim.commands.viewing import Render, View
 
 _ALL = (
-    List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Break, FunnelCommand,
+    List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Certify, Break, FunnelCommand,
     Export, Reproduce, Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}

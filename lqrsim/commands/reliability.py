@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, PolicyOptions, optional
+from lqrsim.commands.options import Folder, Json, OwnScenario, PolicyOptions, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
@@ -55,7 +55,8 @@ class Rare(FailureOptions):
     Multilevel splitting needs far fewer trials than plain sampling: it multiplies the probabilities of levels that come
     nearer and nearer to a failure. Prints the levels as a pilot run finds them, then the probability with its interval,
     from independent, unbiased repetitions. Writes rollout.npz, with the worst failure and typical ones, for `lqrsim
-    render`, and rare.json, with settings and results. Ctrl-C keeps the repetitions that are done, from the second on.
+    render`, rare.json, with settings and results, and certificate.npz, for `lqrsim certify`. Ctrl-C keeps the
+    repetitions that are done, from the second on.
 
     Exits with 1 if no failure was found.
     """
@@ -82,7 +83,9 @@ class Rare(FailureOptions):
             failures = len(rare.splitting.failures)
             written = min(failures, self.shown)
             console.say(f"the worst of {failures:,} failures, as trial 0, and {written - 1} others:")
-            return _write(rare, folder, "rare.json", shown=self.shown)
+            code = _write(rare, folder, "rare.json", shown=self.shown)
+            console.wrote(folder / "certificate.npz")
+            return code
 
         try:
             with console.keeping(write), console.progress("splitting", "repetition") as progress:
@@ -126,6 +129,55 @@ class Break(FailureOptions):
         except NoFailure as none:
             return _say_none(none)
         return write(smallest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certify:
+    """Check a certificate by measuring it again.
+
+    Repeats the splitting of `lqrsim rare` with the plan, policy, disturbances and seed of the certificate, in whole or
+    in part. With the same versions and processor it must give the same bits; with others the intervals must overlap.
+
+      lqrsim certify runs/rare/quadrotor/certificate.npz --repetitions 2
+
+    Exits with 1 if something is not as certified.
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="FILE.npz")]
+    """certificate.npz from `lqrsim rare`."""
+    repetitions: Annotated[int | None, optional("INT")] = None
+    """Number of its repetitions to run, at least 2. By default all."""
+    seed: Annotated[int | None, optional("INT")] = None
+    """Another seed, for fresh random numbers: then the intervals are compared. By default that of the certificate."""
+    scenario: OwnScenario = None
+    json: Json = False
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim.commands import console
+        from lqrsim.results import save_load
+        from lqrsim.results.certificate import Certificate
+        from lqrsim.stress.failure_search import certify
+        from lqrsim.stress.multilevel_splitting import NoFailure
+
+        certificate = save_load.load(self.file, Certificate)
+        console.say(certificate.summary())
+        try:
+            with console.progress("splitting", "repetition") as progress:
+                found = certify(
+                    certificate, repetitions=self.repetitions, seed=self.seed, scenario=self.scenario, progress=progress
+                )
+        except NoFailure as none:
+            return _say_none(none)
+        console.say(found.summary())
+        one = found.measured.probability
+        console.result(
+            probability=certificate.probability, low=certificate.low, high=certificate.high,
+            measured={"probability": one.value, "low": one.low, "high": one.high},
+            repetitions=len(found.measured.splitting.repetitions), differences=found.differences,
+            changed=found.changed or None,
+        )  # fmt: skip
+        return 1 if found.differences else 0
 
 
 def _say_none(none: Exception) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results.archive import Arrays, Header, digest, opened, write
 from lqrsim.results.archive import replacing as replacing
+from lqrsim.results.certificate import Certificate
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -25,8 +26,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.schema import anything, canonical, parse
 from lqrsim.results.solution import Solution
 
-Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel
-_Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel)
+Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | Certificate
+_Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, Certificate)
 
 # The name in the file, and the version.
 FORMATS: dict[type, tuple[str, int]] = {
@@ -35,17 +36,18 @@ FORMATS: dict[type, tuple[str, int]] = {
     AffinePolicy: ("policy", 2),
     OutputFeedbackPolicy: ("output feedback policy", 1),
     Funnel: ("funnel", 2),
+    Certificate: ("certificate", 1),
 }
 VERSIONS = dict(FORMATS.values())
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
-    """Write a solution, a rollout, a policy or a funnel; the file is whole or not there. Returns its path.
+    """Write a solution, a rollout, a policy, a funnel or a certificate, whole or not at all. Returns its path.
 
     A link is written through: the file that it points to changes. Nothing but a regular file is replaced.
 
     Args:
-      result: a Solution, a Rollout, a policy or a Funnel.
+      result: a Solution, a Rollout, a policy, a Funnel or a Certificate.
       path: FILE.npz.
 
     Returns:
@@ -92,8 +94,8 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
 
     Args:
       path: path of a file that `save` wrote.
-      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
-        By default, any.
+      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy`, `ls.Funnel`
+        or `ls.stress.Certificate`. By default, any.
 
     Returns:
       What was saved.
@@ -102,7 +104,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
       InputError: the file is missing, damaged, of another version or of another kind.
     """
     if kind is not None and kind not in FORMATS:
-        raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(f'ls.{one.__name__}' for one in FORMATS)}")
+        raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(map(_public, FORMATS))}")
     wanted = None if kind is None else FORMATS[kind][0]
     path = check_path(wanted or "path", path)
     if path.is_dir():
@@ -118,6 +120,10 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
         return record
+
+
+def _public(kind: type) -> str:
+    return f"ls.stress.{kind.__name__}" if kind is Certificate else f"ls.{kind.__name__}"
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind
+from lqrsim.results.certificate import Certificate
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
@@ -49,7 +50,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 
     Args:
       scenario: to solve.
-      path: path of a solution, of a policy, or of a rollout or funnel, for its plan.
+      path: path of a solution, of a policy, of a certificate, or of a rollout or funnel, for its plan.
 
     Returns:
       The solution, the policy or the plan.
@@ -58,6 +59,8 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
       InputError: the file has something else, or it is for another system or number of steps.
     """
     found = load(path)
+    if isinstance(found, Certificate):
+        found = found.solution
     if isinstance(found, OutputFeedbackPolicy):
         raise InputError(
             f"start: got {path}, a policy with an estimator, want a solution, a policy of the state, a rollout or a"

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.control.controllers import as_controller
 from lqrsim.errors import (
     Array,
     InputError,
@@ -30,6 +31,7 @@ from lqrsim.errors import (
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
+from lqrsim.results.certificate import Certificate
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -44,7 +46,7 @@ from lqrsim.stress.policies import POLICIES, check_designed, make_policy
 from lqrsim.stress.specification import disturbances_as_json
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
-from lqrsim.versions import versions
+from lqrsim.versions import changed, versions
 
 FAILURES = {"collision": collision_score, "miss": miss_score}
 Report = Callable[[str], object]
@@ -314,8 +316,22 @@ class RareFailures:
         chosen = np.linspace(0, len(others), count - 1, endpoint=False).astype(int)
         return self.splitting.failures[[worst, *others[np.unique(chosen)[: len(others)]]]]
 
+    def certificate(self) -> Certificate:
+        """The probability with all that it takes to measure it again; `save` writes it, and `certify` checks it."""
+        problem, one = self.problem, self.probability
+        asked = {name: getattr(problem, name) for name in _ASKED}
+        return Certificate(
+            **asked, **_facts(problem), solution=problem.score.solution, probability=one.value, low=one.low,
+            high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions,
+            particles=self.options["particles"], seed=self.options["seed"], versions=versions(),
+        )  # fmt: skip
+
     def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:
-        """Write rare.json, and `shown` typical failures as rollout.npz. Returns these; raises InputError."""
+        """Write rare.json, certificate.npz, and `shown` typical failures as rollout.npz. Returns these.
+
+        Raises:
+          InputError: they cannot be written.
+        """
         folder, result, one = check_path("folder", folder, "the path of a folder"), self.splitting, self.probability
         numbers = self.typical(check_count("shown", shown))
         found = {
@@ -325,7 +341,114 @@ class RareFailures:
             "plain_trials": self.plain_trials, "failures": len(result.scores),
         }  # fmt: skip
         asked = {**self.options, "shown": shown}
-        return _write(self.problem, folder, "rare", asked, found, numbers, self.stopped)
+        written = _write(self.problem, folder, "rare", asked, found, numbers, self.stopped)
+        save_load.save(self.certificate(), folder / "certificate.npz")
+        return written
+
+
+_ASKED = (
+    "scenario", "sweep", "strength", "policy", "design_disturbances", "failure", "goal_radius", "goal_tolerance",
+)  # fmt: skip
+
+
+def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
+    """What the names of a problem stand for now: disturbances, model and policy."""
+    score = problem.score
+    law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
+    described = tuple(one.describe(score.plant) for one in problem.disturbances)
+    return {"disturbances": described, "model": sha256(problem.resolved.scene.xml), "policy_digest": law.digest}
+
+
+@dataclass(frozen=True)
+class Recheck:
+    """A certificate, measured again.
+
+    Attributes:
+      certificate: the Certificate.
+      measured: the RareFailures of the same seed.
+      differences: how the two differ, a line each; empty if nothing does.
+      changed: why the bits may differ, so that only the intervals were compared: another seed, or versions that have
+        changed since; else empty.
+    """
+
+    certificate: Certificate
+    measured: RareFailures
+    differences: tuple[str, ...]
+    changed: str
+
+    def summary(self) -> str:
+        """Lines that say what was measured again, and how it compares."""
+        done, asked = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
+        lines = [f"measured again: {done} of {asked} repetitions, {self.measured.splitting.simulations:,} trials"]
+        if self.changed:
+            lines.append(
+                f"{self.measured.probability:.2g}; intervals are compared, for the bits may differ: got {self.changed}"
+            )
+        lines += [f"NOT as certified: {one}" for one in self.differences]
+        if not self.differences:
+            lines.append("as certified: the intervals overlap" if self.changed else "as certified, to the last bit")
+        return "\n".join(lines)
+
+    __str__ = summary
+
+
+def certify(
+    certificate: Certificate,
+    *,
+    repetitions: int | None = None,
+    seed: int | None = None,
+    scenario: str | None = None,
+    report: Report | None = None,
+    progress: Progress | None = None,
+) -> Recheck:
+    """Measure again what a certificate says, in whole or in part.
+
+    Args:
+      certificate: from `RareFailures.certificate`, or `ls.load`.
+      repetitions: how many of its repetitions to run, at least 2; by default all.
+      seed: another seed, for fresh random numbers; by default that of the certificate.
+      scenario: reference to the scenario if it is your own function: files never choose code to run.
+      report: as in `ReliabilityProblem.rare_failures`.
+      progress: likewise.
+
+    Returns:
+      A Recheck.
+
+    Raises:
+      InputError: an option is out of range; or the scenario is someone's own, and none is given.
+      NoFailure: none was found.
+    """
+    check_kind("certificate", certificate, Certificate, "a Certificate, such as rare.certificate()")
+    every = len(certificate.repetitions)
+    count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
+    if scenario is None and ":" in certificate.scenario:
+        raise InputError(f"scenario: got none, want it for a certificate of {certificate.scenario}, which is code")
+    asked: dict[str, Any] = {name: getattr(certificate, name) for name in _ASKED} | {"solution": certificate.solution}
+    if scenario is not None:
+        asked["scenario"] = scenario
+    problem = ReliabilityProblem(**asked)
+    now = _facts(problem)
+    differences = [
+        f"{name}: got {value}, want {was}"
+        for name, value in now.items()
+        if value != (was := getattr(certificate, name))
+    ]
+    options = {"particles": certificate.particles, "seed": certificate.seed if seed is None else seed}
+    measured = problem.rare_failures(repetitions=count, **options, report=report, progress=progress)
+    fresh = f"seed {seed} (was {certificate.seed})" if options["seed"] != certificate.seed else ""
+    others, one = fresh or changed(certificate.versions), measured.probability
+    if others:
+        if one.low > certificate.high or certificate.low > one.high:
+            differences.append(f"probability: got {one:.2g}, want an interval that overlaps")
+    else:
+        pairs = zip(measured.splitting.repetitions.tolist(), certificate.repetitions.tolist(), strict=False)
+        differences += [
+            f"repetition {i}: got {got!r}, want {want!r}" for i, (got, want) in enumerate(pairs) if got != want
+        ]
+        ends = (one.value, one.low, one.high), (certificate.probability, certificate.low, certificate.high)
+        if count == every and ends[0] != ends[1]:
+            differences.append(f"probability with its interval: got {ends[0]}, want {ends[1]}")
+    return Recheck(certificate, measured, tuple(differences), others)
 
 
 @dataclass(frozen=True)

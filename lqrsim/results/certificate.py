@@ -1,0 +1,86 @@
+"""A certificate: how often a policy fails, with all that it takes to measure it again. NumPy only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from lqrsim.errors import Array, InputError
+from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.solution import Solution
+
+_SHARE = Bounds(at_least=0.0, at_most=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certificate:
+    """The probability that a policy fails, as multilevel splitting has measured it, and what was measured.
+
+    Attributes:
+      solution: with the plan.
+      scenario: reference to the scenario, as in `ReliabilityProblem`.
+      sweep: name of the set of disturbances.
+      strength: factor by which they are scaled.
+      policy: name of the policy.
+      design_disturbances: name of the set for which it is designed, or None.
+      failure: what counts as one.
+      goal_radius: as in `ReliabilityProblem`.
+      goal_tolerance: likewise.
+      disturbances: a description of each.
+      model: hash of the simulated MJCF.
+      policy_digest: hash of all that the controls depend on.
+      probability: the estimate.
+      low: lower end of its interval.
+      high: upper end.
+      confidence: of the interval.
+      repetitions: the estimate of each repetition, (R,).
+      particles: number of trials at each level.
+      seed: seed of all random numbers.
+      versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
+
+    Raises:
+      InputError: the parts do not fit together.
+    """
+
+    solution: Solution
+    scenario: Line
+    sweep: Line
+    strength: Annotated[float, Bounds(above=0.0)]
+    policy: Line
+    design_disturbances: Line | None
+    failure: Line
+    goal_radius: Annotated[float, Bounds(above=0.0)] | None
+    goal_tolerance: Annotated[float, Bounds(above=0.0)] | None
+    disturbances: tuple[Line, ...]
+    model: Line
+    policy_digest: Line
+    probability: Annotated[float, _SHARE]
+    low: Annotated[float, _SHARE]
+    high: Annotated[float, _SHARE]
+    confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
+    repetitions: Annotated[Array, "R", _SHARE]
+    particles: int
+    seed: int
+    versions: Mapping[str, Line]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.low <= self.probability <= self.high:
+            got = f"{self.probability:g} in an interval from {self.low:g} to {self.high:g}"
+            raise InputError(f"Certificate: probability: got {got}, want it inside")
+        mean = float(self.repetitions.mean()) if len(self.repetitions) > 1 else -1.0
+        if abs(mean - self.probability) > 1e-9 * self.probability:
+            raise InputError(
+                f"Certificate: repetitions: got {len(self.repetitions)} whose mean is not {self.probability:g}, want at"
+                " least two, of which the probability is the mean"
+            )
+
+    def summary(self) -> str:
+        """Lines that say what was measured, and the probability."""
+        interval = f"{100 * self.confidence:g} % interval, {len(self.repetitions)} repetitions"
+        return (
+            f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}; failure: {self.failure}\n"
+            f"probability of failure: {self.probability:.2g} [{self.low:.2g}, {self.high:.2g}] ({interval})"
+        )
+
+    def __str__(self) -> str:
+        return self.summary()
