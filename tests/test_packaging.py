@@ -1,11 +1,11 @@
 """What people install works: the built wheel, in an environment that holds it and its dependencies alone."""
 
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
-import venv
 import zipfile
 from pathlib import Path
 
@@ -101,11 +101,21 @@ def test_solves_without_optional_packages(tmp_path: Path, monkeypatch: pytest.Mo
     run(sys.executable, "-c", WITHOUT, cwd=tmp_path)
 
 
+def pythons() -> dict[str, str]:
+    """This Python, and others on the path that lqrsim runs on, by their versions."""
+    found = {f"python3.{sys.version_info.minor}": sys.executable}
+    for name in (f"python3.{minor}" for minor in range(11, 20)):
+        works = shutil.which(name) and subprocess.run([name, "-c", "import venv"], capture_output=True).returncode == 0
+        found.setdefault(name, name) if works else None
+    return found
+
+
 @pytest.mark.long
-def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("python", pythons())
+def test_wheel_solves_from_an_empty_environment(python: str, built: Path, tmp_path: Path) -> None:
     """Installs for real, with the dependencies that the wheel names and no others: 15 s where pip has them cached."""
     (wheel,) = built.glob("*.whl")
-    venv.create(tmp_path / "empty", symlinks=sys.platform != "win32")
+    run(pythons()[python], "-m", "venv", "--without-pip", tmp_path / "empty", cwd=tmp_path)
     binaries = tmp_path / "empty" / ("Scripts" if sys.platform == "win32" else "bin")
     pip = [sys.executable, "-m", "pip", "--python", binaries / "python", "install", "--quiet", "--no-compile"]
     run(*pip, wheel, cwd=tmp_path)
