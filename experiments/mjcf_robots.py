@@ -19,7 +19,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mjcf.family import FAMILY, FamilyTask
+from mjcf.family import FAMILY, FamilyTask, ShelfTask
 from mjcf.tasks import TASKS, Task
 from paper.common import render_still
 from PIL import Image
@@ -27,6 +27,7 @@ from runner import FIGURES, FolderSettings, Result, opening, progress, run, tabl
 from tqdm import tqdm
 
 import lqrsim as ls
+from lqrsim.errors import Array
 from lqrsim.results.save_load import replacing
 
 OUT = Path("runs/mjcf_robots")
@@ -133,11 +134,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         "exact": replayed(robot, solution, EXACT), "unit": rollout.tracking_unit,
         "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
         "bindings": clearance_by_bindings(robot, solution),
-        "missed": {
-            name: float(solution.trajectory.states[-1, i] - problem.goal[i])
-            for i, name in enumerate(robot.dynamics.state_coordinates.names)
-            if (task.ends.get(name, 0) >= 10 if task.ends else i < robot.scene.model.nv) and problem.goal is not None
-        },
+        "missed": missed(task, robot, problem, solution.trajectory.states[-1]),
     }  # fmt: skip
     if config.pictures:
         (config.out / FIGURES).mkdir(parents=True, exist_ok=True)
@@ -147,6 +144,23 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
             config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
         )
     return row
+
+
+def missed(task: Task | FamilyTask, robot: ls.MjcfRobot, problem: ls.Problem, last: Array) -> dict[str, float]:
+    """How far each joint that is wanted somewhere ends from there; of a tool its place (m) and turn (rad)."""
+    if isinstance(task, ShelfTask):
+        data, turn = mujoco.MjData(robot.scene.model), np.zeros(4)
+        data.qpos[:] = robot.configuration(last)[0]
+        mujoco.mj_kinematics(robot.scene.model, data)
+        mujoco.mju_mat2Quat(turn, data.site("tool").xmat)
+        angle = 2 * np.arccos(min(1.0, abs(float(turn @ task.turn))))
+        return {"tool": float(np.linalg.norm(data.site("tool").xpos - task.place)), "tool's turn": angle}
+    assert problem.goal is not None
+    return {
+        name: float(last[i] - problem.goal[i])
+        for i, name in enumerate(robot.dynamics.state_coordinates.names)
+        if (task.ends.get(name, 0) >= 10 if task.ends else i < robot.scene.model.nv)
+    }
 
 
 def replayed(robot: ls.MjcfRobot, solution: ls.Solution, tolerance: float | None = None) -> float:
@@ -201,7 +215,8 @@ def camera_of(robot: ls.MjcfRobot) -> str:
 
 HEAD = (
     "robot", "states", "controls", "status", "cost", "iLQR's cost", "iterations", "ms an iteration",
-    "tracking error in MuJoCo", "by plain mj_step", "with a solver to 1e-14", "clearance (m)", "less the bindings'", "farthest from the goal",
+    "tracking error in MuJoCo", "by plain mj_step", "with a solver to 1e-14",
+    "clearance (m)", "less the bindings'", "farthest from the goal",
 )  # fmt: skip
 
 

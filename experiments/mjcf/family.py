@@ -10,6 +10,7 @@ All of them are stated in the same lines: from a posture to another one, by `Mjc
 """
 
 import importlib.util
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -95,6 +96,39 @@ class FamilyTask:
         return robot.problem(start, goal, steps=self.steps, dt=self.dt, weights=weights)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ShelfTask(FamilyTask):
+    """A tool on a hand goes from below a board to a pose above it, which only the site says.
+
+    Attributes:
+      hand: the body that has the tool, 0.1 m along its z axis. board: a box, its place and half its size.
+      place, turn: of the tool at the end, a quaternion.
+    """
+
+    hand: str
+    board: tuple[float, ...]
+    place: tuple[float, ...]
+    turn: tuple[float, ...]
+
+    def robot(self) -> ls.MjcfRobot:
+        assert self.path is not None
+        name, xml = read_mjcf(self.path)
+        root, size = ElementTree.fromstring(xml), [f"{number:g}" for number in self.board]
+        (hand,) = root.iterfind(f".//body[@name='{self.hand}']")
+        ElementTree.SubElement(hand, "site", {"name": "tool", "pos": "0 0 0.1"})
+        box = {"name": "board", "type": "box", "pos": " ".join(size[:3]), "size": " ".join(size[3:])}
+        ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "geom", box | {"rgba": ".2 .4 .6 1"})
+        return ls.MjcfRobot(scene_from_xml(ElementTree.tostring(root, "unicode"), name, obstacles=("board",)))
+
+    def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
+        start, nv, weights = robot.at(), robot.scene.model.nv, np.zeros(2 * robot.scene.model.nv)
+        start[:nv], weights[nv:] = self.start, self.weights[1]
+        problem = robot.problem(start, start, steps=self.steps, dt=self.dt, weights=weights)
+        pose = {"position": self.place, "orientation": self.turn}
+        drawn = problem.final_cost + ls.SiteCost("tool", **pose, weight=self.weights[0], turn_weight=self.weights[1])
+        return replace(problem, final_cost=drawn, constraints=[ls.SiteConstraint("tool", **pose)])
+
+
 FAMILY: tuple[FamilyTask, ...] = (
     FamilyTask(
         name="Panda", package="robosuite", file=ARMS + "panda/robot.xml",
@@ -103,6 +137,11 @@ FAMILY: tuple[FamilyTask, ...] = (
     FamilyTask(
         name="Panda round a post", package="robosuite", file=ARMS + "panda/robot.xml",
         start=(0, 0.196, 0, -2.618, 0, 2.942, 0.785), moves={0: 1.4}, post=(0.33, 0.3, 0.3, 0.05, 0.5),
+    ),
+    ShelfTask(
+        name="Panda reaches past a shelf", package="robosuite", file=ARMS + "panda/robot.xml", moves={},
+        start=(0, 0.196, 0, -2.618, 0, 2.942, 0.785), hand="right_hand", steps=75,
+        board=(0.5, 0.4, 0.28, 0.15, 0.2, 0.01), place=(0.45, 0.35, 0.36), turn=(0, 1, 0, 0),
     ),
     FamilyTask(
         name="UR5e", package="robosuite", file=ARMS + "ur5e/robot.xml",
