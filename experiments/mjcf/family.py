@@ -124,9 +124,10 @@ class ShelfTask(FamilyTask):
         start, nv, weights = robot.at(), robot.scene.model.nv, np.zeros(2 * robot.scene.model.nv)
         start[:nv], weights[nv:] = self.start, self.weights[1]
         problem = robot.problem(start, start, steps=self.steps, dt=self.dt, weights=weights)
-        pose = {"position": self.place, "orientation": self.turn}
-        drawn = problem.final_cost + ls.SiteCost("tool", **pose, weight=self.weights[0], turn_weight=self.weights[1])
-        return replace(problem, final_cost=drawn, constraints=[ls.SiteConstraint("tool", **pose)])
+        place, turn, (heavy, light) = self.place, self.turn, self.weights
+        drawn = ls.SiteCost("tool", position=place, orientation=turn, weight=heavy, turn_weight=light)
+        exact = ls.SiteConstraint("tool", position=place, orientation=turn)
+        return replace(problem, final_cost=problem.final_cost + drawn, constraints=[exact])
 
 
 FAMILY: tuple[FamilyTask, ...] = (
