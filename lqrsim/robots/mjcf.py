@@ -225,7 +225,7 @@ class MjcfRobot(Robot):
     def settled(self, state: npt.ArrayLike) -> Array:
         """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
 
-        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They have to touch.
+        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -241,8 +241,8 @@ class MjcfRobot(Robot):
         place, left = settled(model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
             raise InputError(
-                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches what"
-                " is to carry it"
+                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches"
+                " what is to carry it"
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
