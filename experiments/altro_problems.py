@@ -95,7 +95,7 @@ def same(problem: ls.Problem, *controls: float) -> NDArray[np.float64]:
 
 
 def double_integrator() -> tuple[ls.Problem, Start]:
-    bounds = ls.StateBounds(low={"v": -0.6}, high={"v": 0.6})
+    bounds = ls.StateBounds(v=(-0.6, 0.6))
     made = problem(
         models.double_integrator(), 2.0, 21, (0, 0), (1, 0), (1.0, 0.1, 1.0), control_limits=(-3, 3),
         constraints=[bounds],
@@ -123,7 +123,7 @@ def acrobot() -> tuple[ls.Problem, Start]:
 
 
 def parallel_park() -> tuple[ls.Problem, Start]:
-    bounds = ls.StateBounds(low={"x": -0.25, "y": -0.001}, high={"x": 0.25, "y": 1.501})
+    bounds = ls.StateBounds(x=(-0.25, 0.25), y=(-0.001, 1.501))
     made = problem(
         models.car(), 3.0, 101, (0, 0, 0), (0, 1.5, 0), (0.01, 0.01, 100.0), control_limits=(-2, 2),
         constraints=[bounds],
@@ -218,10 +218,11 @@ def barrel_roll() -> tuple[ls.Problem, Start]:
     end = (*[100.0] * 3, *[500.0] * 4, *[100.0] * 6)
     dynamics = airplane()
     # Of the quaternion its vector: the scalar follows, for it keeps its length.
-    rest = [name for name in dynamics.state_coordinates.names if name != "q0"]
+    rest = dict(zip(dynamics.state_coordinates.names, goal, strict=True))
+    del rest["q0"]
     made = problem(
         dynamics, 1.25, 101, begin, goal, (0.1, 1e-3, end), about=TRIM_CONTROLS,
-        end=[ls.GoalState(np.delete(goal, 3), states=rest)],
+        end=[ls.GoalState(rest)],
     )  # fmt: skip
     return made, same(made, *TRIM_CONTROLS)
 

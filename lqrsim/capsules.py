@@ -8,6 +8,7 @@ evenly spaced along the segment, are inside it. Between two balls, `spacing` apa
 and a distance to the balls overestimates that to the capsule by at most as much.
 """
 
+import itertools
 import math
 from collections import namedtuple
 from collections.abc import Sequence
@@ -91,7 +92,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
           InputError: they are not two points of the same size.
         """
         try:
-            first, last = list(start), list(end)
+            first, last = (list(itertools.islice(iter(one), 4)) for one in (start, end))
         except TypeError:
             first, last = [], [0]
         if len(first) != len(last) or len(first) not in (2, 3):

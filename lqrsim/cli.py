@@ -84,6 +84,12 @@ def _run(arguments: list[str]) -> int:
     with process.printing():
         command = _parse(arguments)
 
+    from lqrsim.versions import outdated
+
+    if line := outdated():  # before the import that fails because of it
+        process.print_error(f"lqrsim: error: {line}")
+        return 2
+
     from lqrsim.commands import NAMES, console
     from lqrsim.errors import InputError
 

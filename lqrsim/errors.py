@@ -18,6 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.machine import memory
+from lqrsim.versions import outdated
+
+if outdated():
+    raise ImportError(f"lqrsim: {outdated()}")
 
 Array = npt.NDArray[np.floating]
 

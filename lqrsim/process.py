@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 WAKE = getattr(signal, "SIGURG", signal.SIGINT)  # unused otherwise, and ignored by default
@@ -145,6 +145,20 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
         os.close(arrivals)
         watcher.join()
         os.close(arrived)
+
+
+@contextlib.contextmanager
+def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
+    """A block in which any exception, such as that of Ctrl-C, gets what there is until then as its `found`.
+
+    Args:
+      make: returns it, or None if there is nothing. It is given what the block within has kept, or None.
+    """
+    try:
+        yield
+    except BaseException as error:
+        error.found = make(getattr(error, "found", None))  # pyright: ignore[reportAttributeAccessIssue]
+        raise
 
 
 def run_script(arguments: list[str]) -> None:

@@ -142,6 +142,8 @@ def _cross(a: Vector, b: Vector) -> list[Any]:
 def _ratio(name: str, s: Any) -> Any:
     """A ratio at s: numeric for a number or an array, otherwise as a SymPy function."""
     if isinstance(s, float | int | np.number):
+        if np.isinf(float(s)):
+            raise InputError("r: got a rotation vector whose squared length is beyond all floats, want a shorter one")
         return _NUMERIC[name](float(s))
     if isinstance(s, np.ndarray) and s.dtype != object:
         return np.vectorize(_NUMERIC[name], otypes=[np.float64])(s)

@@ -1,9 +1,10 @@
 """The versions and the processor that the bits of a result depend on; every saved result has them."""
 
 import platform
+import re
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 
 from lqrsim.machine import processor
 
@@ -25,6 +26,31 @@ def changed(was: Mapping[str, str]) -> str:
     return ", ".join(
         f"{name} {now.get(name)} (was {was.get(name)})" for name in names if now.get(name) != was.get(name)
     )
+
+
+@cache
+def outdated() -> str:
+    """A line on the packages that are older than lqrsim needs, as another package may have asked for; else empty."""
+    try:
+        needs = requires("lqrsim") or []
+    except PackageNotFoundError:  # a copy of the source that is not installed
+        return ""
+    bounds = [re.fullmatch(r"([\w.-]+)>=([\d.]+)", need) for need in needs]  # not those of extras
+    least = {bound[1]: bound[2] for bound in bounds if bound}
+    older = {
+        name: found for name, found in versions_of(*least).items()
+        if found != "not installed" and _numbers(found) < _numbers(least[name])
+    }  # fmt: skip
+    if not older:
+        return ""
+    wanted = " ".join(f"'{name}>={least[name]}'" for name in older)
+    return f"got {', '.join(f'{name} {found}' for name, found in older.items())}, want newer: pip install {wanted}"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """The numbers with which a version begins."""
+    leading = re.match(r"\d+(\.\d+)*", version)
+    return tuple(int(part) for part in leading[0].split(".")) if leading else ()
 
 
 def versions_of(*names: str) -> dict[str, str]:

@@ -1,5 +1,8 @@
 """Plans that collide no more often than is asked, for a point mass that passes a pillar; and margins of each knot."""
 
+import os
+import signal
+import sys
 from typing import Any
 
 import numpy as np
@@ -74,6 +77,24 @@ def test_less_chance_costs_more_and_keeps_farther(problem: ls.Problem) -> None:
     assert plans[0].solution.cost < plans[1].solution.cost
     nearest = [float(clearances(plan.solution.trajectory.states).min()) for plan in plans]
     assert nearest[0] < nearest[1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to a process")
+def test_ctrl_c_keeps_the_best_plan_so_far(problem: ls.Problem) -> None:
+    told: list[tuple[int, int, str]] = []
+
+    def progress(done: int, of: int, found: str) -> None:
+        told.append((done, of, found))
+        if done == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        ls.smooth_chance_constrained(problem, UNCERTAINTY, chance=1e-3, controller=tracked, progress=progress)
+    plan = stopped.value.found  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(plan, ls.types.SafePlan)
+    assert [one[:2] for one in told] == [(0, 8), (0, 8), (1, 8), (2, 8)]
+    assert told[1][2].startswith(f"chance {plan.rounds[0][-1]:.2g} with margins of")
+    assert plan.tube.collision_chance == min(one[-1] for one in plan.rounds)
 
 
 @pytest.mark.parametrize("sharpness", [10.0, 100.0])

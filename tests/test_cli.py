@@ -1,5 +1,6 @@
 """The commands, each on what the one before wrote; and bad input: one line, no traceback, a non-zero exit."""
 
+import re
 import shlex
 import signal
 import subprocess
@@ -274,15 +275,14 @@ def test_help_of_reproduce_lists_all_results(capsys: pytest.CaptureFixture[str])
     assert all(name in printed for name in SCRIPTS)
 
 
-@pytest.mark.parametrize(
-    "command", ["", "list", "solve", "simulate", "render", "demo", "stress", "replay", "rare", "break", "funnel"]
-)
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main([*command.split(), "--help"])
     assert stop.value.code == 0
     printed = capsys.readouterr().out
     assert f"usage: lqrsim {command}".strip() in printed
+    assert not re.search(r"\{None\}|\{\[|\[\{|\[\.\.\.\]|NoneType", printed)  # types, as tyro prints them
 
 
 def test_unknown_option_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:

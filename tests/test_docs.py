@@ -49,7 +49,7 @@ def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     # The pole stands at the end, and the plan is what MuJoCo did.
     assert np.abs(solution.trajectory.states[-1]).max() < 0.05
     assert names["rollout"].tracking_error.max() < 1e-6
-    assert kept.constraints[0].high == {"slider": 3.0}
+    assert kept.constraints[0].bounds == {"slider": (-3.0, 3.0)}
 
 
 def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,6 +107,38 @@ def test_environments_of_gymnasium(capsys: pytest.CaptureFixture[str]) -> None:
     single, many = capsys.readouterr().out.split("\n", 1)
     assert single == "reached"
     assert many.count("reached") == len(names["ended"]) == 16
+
+
+def test_wheels_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's numbers, to a quarter: wheels that slip amplify rounding."""
+    monkeypatch.chdir(tmp_path)
+    page = (DOCS / "wheels_and_servos.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| ([^|]+) \| (\d+) (c?m) \|$", page, re.MULTILINE)
+    errors = run_page("wheels_and_servos.md")["errors"]
+    assert [name for name, *_ in told] == list(errors)
+    for name, number, unit in told:
+        assert errors[name] == pytest.approx(float(number) * (1 if unit == "cm" else 100), rel=0.25)
+
+
+def test_least_time_is_that_of_the_formula() -> None:
+    names = run_page("least_time.md")
+    assert names["fast"].trajectory.horizon == pytest.approx(2 * np.sqrt(2), rel=1e-4)
+    assert names["quick"].success
+
+
+def test_what_does_not_converge_and_what_helps(capsys: pytest.CaptureFixture[str]) -> None:
+    """0.56 m of 2 m can be gone in 1.5 s: ahead for one half, back for the other, in steps of 0.1 s."""
+    names = run_page("not_converging.md")
+    assert names["failed"].remedy in capsys.readouterr().out
+    assert names["priced"].violation == pytest.approx(2 - 0.56, abs=1e-3)
+
+
+def test_an_arm_goes_round_a_post(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("arms.md")
+    assert names["plan"].success
+    assert names["careful"].clearance.min() >= 0.1 - 1e-3
+    assert names["run"].outcome == ("reached",) * 5
 
 
 @pytest.mark.long

@@ -1,6 +1,7 @@
 """`lqrsim rare` and `lqrsim break`: what they print holds, the same seed gives the same files, nothing is left over."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress.trial_score import TrialScore
 
@@ -251,6 +253,81 @@ def test_bad_input_is_one_line(
     assert error.count("\n") == 1
     assert all(part in error for part in says), error
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("funnel quadrotor --rate 1", "rate: got 1"),
+        ("funnel quadrotor --confidence 0.3", "confidence: got 0.3"),
+        ("funnel quadrotor --knots 150", "knots: got (150,), want some of 0 to 149"),
+        ("funnel quadrotor --states q", "states: got 'q'"),
+        ("funnel quadrotor --failures -1", "failures: got -1"),
+        ("funnel quadrotor --seed -1", "seed: got -1"),
+        ("funnel quadrotor --goal-tolerance 0.1", "goal_tolerance: got 0.1, want goal_radius"),
+        ("funnel quadrotor --policy track --design-disturbances gale", "got 'gale'"),
+        ("rare quadrotor --goal-tolerance 0.1", "goal_tolerance: got 0.1, want goal_radius"),
+        ("rare quadrotor --policy track --design-disturbances gale", "got 'gale'"),
+        ("rare quadrotor --repetitions 0", "repetitions: got 0"),
+        ("break quadrotor --rounds 0", "rounds: got 0"),
+    ],
+)
+def test_commands_check_their_options_before_they_solve(
+    command: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solutions, "solve", lambda *_: pytest.fail("solved"))
+    assert main([*command.split(), "--out", str(tmp_path / "out")]) == 2
+    assert says in capsys.readouterr().err
+
+
+# The command as it is, which says at each step of its progress how far it is.
+TELLING = """
+import sys
+
+from lqrsim.cli import main
+from lqrsim.commands import console
+
+console.Progress.__call__ = lambda self, done, total, found="": print(f"{done} of {total}; {found}", flush=True)
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
+@pytest.mark.parametrize(
+    ("command", "at", "says"),
+    [
+        ("rare --particles 20 --repetitions 500", "2 of 500", r"stopped after \d+ of 500 repetitions"),
+        ("break --rounds 900 --strength 3", "1 of 900", r"stopped after \d+ of 900 rounds"),
+        ("funnel --rate 0.6 --knots 0 1 2 --disturbances light", "1 of 3", "stopped before this knot was done"),
+    ],
+)
+def test_ctrl_c_keeps_what_there_is_and_says_how_far_it_came(
+    command: str, at: str, says: str, own: str, tmp_path: Path
+) -> None:
+    """SIGINT to a process that has done some of its work, but not all: it ends with 130, and its files can be used."""
+    name, *more = command.split()
+    words = [sys.executable, "-c", TELLING, name, f"{own}:shifted", *more, *OPEN, "--out", str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while not (line := process.stdout.readline()).startswith(at):
+            assert process.poll() is None, line
+        process.send_signal(signal.SIGINT)
+        printed, error = process.communicate(timeout=60)
+    assert (process.returncode, error.splitlines()[-1]) == (130, "lqrsim: stopped")
+    assert re.search(says, printed)
+    if name == "funnel":
+        funnel = ls.load(tmp_path / "funnel.npz", ls.Funnel)
+        assert funnel.levels[0] > 0
+        assert funnel.levels[-1] == 0
+        assert funnel.reasons[-1] == says
+        return
+    written = found(tmp_path / f"{name}.json")
+    assert written["stopped"] in printed
+    assert (
+        f"after {len(written['found']['repetitions' if name == 'rare' else 'history']) - (name == 'break')} of"
+        in printed
+    )
+    assert ls.load(tmp_path / "rollout.npz", ls.Rollout).outcome[0] == "collided"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")

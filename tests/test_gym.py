@@ -1,5 +1,7 @@
 """Environments of Gymnasium: its own checks, and that they are the closed loop of `simulate`, to the last bit."""
 
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -46,6 +48,25 @@ def test_gymnasiums_own_check_finds_nothing(case: tuple[str, ls.Scenario, ls.Sol
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=not gl.available())
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *((name, "") for name in NAMES),
+        ("lqrsim/Scenario-v0", "scenario='quadrotor'"),
+        ("lqrsim/Quadrotor-v0", "num_envs=2"),
+    ],
+)
+def test_a_name_alone_is_enough_where_nothing_has_imported_lqrsim(name: str, options: str) -> None:
+    make = "make_vec" if "num_envs" in options else "make"
+    program = f"""
+import sys, gymnasium
+assert not any("lqrsim" in module for module in sys.modules)
+print(gymnasium.{make}("lqrsim.gym:{name}", {options}).spec.id)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.returncode) == (f"{name}\n", 0), done.stderr
 
 
 def test_an_episode_is_the_trial_of_simulate(case: tuple[str, ls.Scenario, ls.Solution]) -> None:

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,7 @@ FLOORS_WITHIN = {
         ("collision_spheres", "noise"),
         ("costs",),
         ("constraints",),
+        ("clearance",),
         ("problem",),
     ),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
@@ -154,6 +156,34 @@ def test_importing_is_light(module: str) -> None:
     code = f"import sys, {module}; print(*[name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(
+    ("installed", "line"),
+    [
+        ({"numpy": "1.26.4"}, "got numpy 1.26.4, want newer: pip install 'numpy>=2.1'"),
+        ({"numpy": "2.0.2rc1", "mujoco": "3.10"}, "got mujoco 3.10, numpy 2.0.2rc1, want newer: pip install 'mujoco>="),
+        ({"numpy": "2.10.0", "scipy": "1.14"}, ""),
+    ],
+)
+def test_what_is_older_than_lqrsim_needs_is_named_at_import(
+    installed: dict[str, str], line: str, tmp_path: Path
+) -> None:
+    for name, version in installed.items():
+        (tmp_path / f"{name}-{version}.dist-info").mkdir()
+        text = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+        (tmp_path / f"{name}-{version}.dist-info" / "METADATA").write_text(text)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    for first in ("from lqrsim import smooth", "import lqrsim as ls; ls.Problem", "import lqrsim.results.save_load"):
+        done = subprocess.run([sys.executable, "-c", first], capture_output=True, text=True, env=environment)
+        assert done.returncode == bool(line)
+        if line:
+            assert done.stderr.splitlines()[-1].startswith(f"ImportError: lqrsim: {line}")
+    command = [sys.executable, "-m", "lqrsim.cli", "list"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == (2 if line else 0)
+    assert done.stderr.startswith(f"lqrsim: error: {line}" if line else "")
+    assert len(done.stderr.splitlines()) == bool(line)
 
 
 @pytest.mark.parametrize("command", ["--help", "solve --help", "--version"])

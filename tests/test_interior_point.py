@@ -79,6 +79,18 @@ def is_optimal(of: ls.Problem, solution: ls.Solution, tolerance: float = 1e-5) -
     assert max(found.slope, found.pressing, found.spare) < (tolerance if acts else 1e-2), found
 
 
+def reached(x, u, p):
+    return -p.worth * x[0]
+
+
+def racing(*constraints: ls.Constraint, limit: float = 1.0) -> ls.Problem:
+    """As far as possible in the time there is."""
+    of = problem(*constraints, limit=limit)
+    nothing = ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0])
+    final = ls.SymbolicCost(reached, parameters={"worth": 1.0}, convex=True)
+    return replace(of, stage_cost=nothing, final_cost=final)
+
+
 # Whole problems that can be solved: what is asked for is kept by a motion that was drawn first.
 
 
@@ -93,7 +105,7 @@ def drawn(number: int) -> ls.Problem:
     (x, v), u, room = z[:, :2].T, controls, rng.choice([0.02, 0.3])
     kept: list[ls.Constraint] = []
     if rng.random() < 0.5:
-        kept.append(ls.StateBounds(low={"x": x.min() - room}, high={"v": v.max() + room}))
+        kept.append(ls.StateBounds(x=(x.min() - room, np.inf), v=(-np.inf, v.max() + room)))
     if rng.random() < 0.5:
         strongest, beside = float((u * v[:-1]).max()) + room, 0.5
         most = float((u**2 + beside * v[:-1] ** 2).max()) + room
@@ -103,7 +115,7 @@ def drawn(number: int) -> ls.Problem:
     if end == "all":
         kept.append(ls.GoalState(z[-1, :2]))
     elif end == "place":
-        kept.append(ls.GoalState([x[-1]], states=["x"]))
+        kept.append(ls.GoalState(x=x[-1]))
     elif end == "met":
         numbers = {"share": 0.3, "bent": 0.2, "place": 1.0, "speed": 1.0}
         there = x[-1] + 0.3 * v[-1] + 0.2 * x[-1] ** 2
@@ -149,7 +161,7 @@ def weighed(units: Mapping[str, float], *, effort: float = 1.0) -> ls.Problem:
     sizes = np.array([place, speed])
     parameters = {"power": 1.2, "most": 9.0, "beside": 1.0, "force": force, "speed": speed}
     return problem(
-        ls.GoalState([2.0 * place], states=["x"]), ls.StateBounds(high={"v": 1.7 * speed}),
+        ls.GoalState(x=2.0 * place), ls.StateBounds(v=(-np.inf, 1.7 * speed)),
         ls.SymbolicConstraint(power, parameters=parameters),
         dynamics=system(pull=1.0, units=units), start=(0.0, 0.0), goal=sizes * (1.5, 0.5), limit=2.5 * force, steps=20,
         effort=effort * cost / force**2, final=cost * np.array([1.0, 3.0]) / sizes**2,
@@ -181,7 +193,7 @@ def test_nor_do_all_of_them_at_once(powers: tuple[float, ...]) -> None:
 @pytest.mark.parametrize("bounded", [False, True])
 def test_what_the_goal_weighs_does_not_matter_where_the_plan_is_to_reach_it(bounded: bool) -> None:
     """On a convex problem; unbounded it is the cubic in time, from the normal equations of the least effort."""
-    bound = [ls.StateBounds(high={"v": 0.9})] if bounded else []
+    bound = [ls.StateBounds(v=(-np.inf, 0.9))] if bounded else []
     limit = 3.0 if bounded else np.inf
     plans = [
         solved(problem(ls.GoalState([1.0, 0.0]), *bound, final=[weight, weight], limit=limit)).trajectory
@@ -215,7 +227,7 @@ def test_constraints_are_missed_by_the_tolerance_at_most(tolerance: float) -> No
 
 def priced() -> list[ls.Problem]:
     """Convex ones with equalities, inequalities or both."""
-    speed, goal = ls.StateBounds(high={"v": 0.65}), ls.GoalState([0.7, 0.0])
+    speed, goal = ls.StateBounds(v=(-np.inf, 0.65)), ls.GoalState([0.7, 0.0])
     return [
         problem(goal, final=[3.0, 1.0]), problem(speed, final=[100.0, 10.0]),
         problem(goal, speed, final=[3.0, 1.0], limit=3.0),
@@ -271,7 +283,7 @@ def kept_plan(number: int) -> tuple[ls.Problem, ls.Trajectory]:
     controls = 0.3 * rng.normal(size=(15, 1))
     states = Shooting(problem()).points(controls.ravel())[:, :2]
     low, high = states.min(axis=0) - 0.01, states.max(axis=0) + 0.01
-    bounds = ls.StateBounds(low={"x": low[0], "v": low[1]}, high={"x": high[0], "v": high[1]})
+    bounds = ls.StateBounds(x=(low[0], high[0]), v=(low[1], high[1]))
     return problem(bounds, goal=(0.5, 1.0), final=[100.0, 10.0]), ls.Trajectory(states, controls, DT)
 
 
@@ -295,10 +307,10 @@ def test_a_plan_that_is_given_and_keeps_the_constraints_is_not_left_behind(numbe
 @pytest.mark.parametrize(
     ("constraints", "changes", "named", "against"),
     [
-        ([ls.GoalState([5.0], states=["x"])], {"limit": 1.0}, "the goal of 5 m for x", ["the limits of u"]),
-        ([ls.GoalState([1.0], states=["x"]), ls.StateBounds(high={"v": 0.2})], {}, "the goal of 1 m", ["v of at most"]),
+        ([ls.GoalState(x=5.0)], {"limit": 1.0}, "the goal of 5 m for x", ["the limits of u"]),
+        ([ls.GoalState(x=1.0), ls.StateBounds(v=(-np.inf, 0.2))], {}, "the goal of 1 m", ["v of at most"]),
         ([ls.GoalState([5.0, 0.0])], {"limit": 1.0}, "the goal of 5 m for x", ["the limits of u", "the goal of 0 m/s"]),
-        ([ls.GoalState([4.0], states=["x"])], {"limit": 1.0, "dynamics": system(pull=4.0)}, "the goal", ["limits of"]),
+        ([ls.GoalState(x=4.0)], {"limit": 1.0, "dynamics": system(pull=4.0)}, "the goal", ["limits of"]),
     ],
     ids=["too far", "too slow", "too far to stop", "too weak to swing up"],
 )  # fmt: skip
@@ -319,11 +331,59 @@ def test_what_cannot_be_is_infeasible(
         assert solution.violation == pytest.approx(float(np.abs(shooting.rows(best, True)).max()), rel=1e-3)
 
 
+def blocked(place: float) -> ls.Problem:
+    """A mass in the plane, whose goal may be in a ball about (1, 0)."""
+    world = ls.World([ls.Obstacle("ball", "sphere", np.array([1.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]))])
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[2], x[3], u[0], u[1]], states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
+        controls={"fx": "N", "fy": "N"}, position=("x", "y"),
+    )  # fmt: skip
+    return ls.Problem(
+        dynamics=dynamics, dt=DT, steps=15, initial=ls.FixedState(np.zeros(4)), stage_cost=ls.ControlCost(np.ones(2)),
+        final_cost=ls.QuadraticCost(np.ones(4), about=np.zeros(4)),
+        constraints=[ls.Clearance(world, radius=0.1), ls.GoalState(x=1.0, y=place, vx=0.0, vy=0.0)],
+    )  # fmt: skip
+
+
+FAR, LATE = ls.GoalState(x=1.5), ls.GoalState(x=2.0, v=0.0)
+UPRIGHT = problem(dynamics=system(pull=4.0), goal=(3.0, 0.0), final=(100.0, 100.0), steps=40)
+SLOW, QUICK = ls.StateBounds(v=(-np.inf, 0.2)), ls.StateBounds(v=(-np.inf, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "status", "remedy", "mended", "then"),
+    [
+        (problem(LATE, limit=1.0), {}, "INFEASIBLE", "allow more time than 1.5 s, ",
+         problem(LATE, limit=1.0, steps=40), {}),
+        (problem(FAR, limit=1.0), {}, "INFEASIBLE", "relax the limits of u, ", problem(FAR, limit=9.0), {}),
+        (problem(FAR, SLOW), {}, "INFEASIBLE", "relax v of at most 0.2 m/s, ", problem(FAR, QUICK), {}),
+        (blocked(0.1), {}, "", "move the goal, which is at (1, 0.1) m, 0.2 m inside obstacle 'ball'", blocked(0.5), {}),
+        (replace(racing(), control_limits=None), {}, "NOT_POSITIVE_DEFINITE",
+         "the cost is linear or flat in u: give control_limits, or add a ControlCost", racing(), {}),
+        (racing(), {"finish": None}, "NOT_POSITIVE_DEFINITE", 'solve with finish="newton"', racing(), {}),
+        (UPRIGHT, {"max_iterations": 3}, "MAX_ITERATIONS",
+         "raise max_iterations: the cost still fell in the last one, by ", UPRIGHT, {}),
+        (problem(FAR), {"time_limit": 1e-9}, "TIME_LIMIT", "raise time_limit", problem(FAR), {"time_limit": 60.0}),
+    ],
+)  # fmt: skip
+def test_the_remedy_is_for_this_case_and_helps(
+    of: ls.Problem, options: dict[str, Any], status: str, remedy: str, mended: ls.Problem, then: dict[str, Any]
+) -> None:
+    failed = ls.smooth(of, **options)
+    assert not failed.success
+    assert failed.status.name == status or not status
+    assert remedy in failed.remedy
+    assert failed.remedy in str(failed)
+    assert "raise the weights" not in str(failed)  # which does not help here
+    assert "violation: " in str(failed) or failed.violation <= 1e-6
+    assert solved(mended, **then).remedy == ""
+
+
 def test_bounds_that_contradict_each_other_are_infeasible() -> None:
     """One as a bound, one as a formula: half of what is between them is the least that can be missed."""
     numbers = {"share": 0.0, "bent": 0.0, "place": 1.0, "speed": 1.0, "there": 0.5}
     at_least = ls.SymbolicConstraint(meeting, parameters=numbers)
-    of = problem(at_least, ls.StateBounds(high={"x": 0.3}), start=(0.4, 0.0))
+    of = problem(at_least, ls.StateBounds(x=(-np.inf, 0.3)), start=(0.4, 0.0))
     solution = ls.smooth(of)
     assert solution.status is Status.INFEASIBLE, solution.summary()
     assert 0.1 - 1e-3 <= solution.violation <= 0.2 + 1e-3
@@ -427,26 +487,14 @@ def test_one_constraint_may_couple_controls(effort: float, most: float) -> None:
 # A cost that is flat in the control.
 
 
-def reached(x, u, p):
-    return -p.worth * x[0]
-
-
-def racing(*constraints: ls.Constraint, limit: float = 1.0) -> ls.Problem:
-    """As far as possible in the time there is."""
-    of = problem(*constraints, limit=limit)
-    nothing = ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0])
-    final = ls.SymbolicCost(reached, parameters={"worth": 1.0}, convex=True)
-    return replace(of, stage_cost=nothing, final_cost=final)
-
-
 def test_without_a_cost_of_the_control_it_is_at_its_limits() -> None:
     solution = solved(racing())
     np.testing.assert_array_equal(solution.trajectory.controls, 1.0)
     # To end at rest: full speed ahead for one half, and back for the other, of which the middle step is zero.
-    stopped = solved(racing(ls.GoalState([0.0], states=["v"])))
+    stopped = solved(racing(ls.GoalState(v=0.0)))
     switch = np.sign(7.0 - np.arange(15))
     np.testing.assert_allclose(stopped.trajectory.controls[:, 0], switch, rtol=0, atol=1e-6)
-    again = solved(racing(ls.GoalState([0.0], states=["v"])), start=stopped)
+    again = solved(racing(ls.GoalState(v=0.0)), start=stopped)
     assert len(again.iterations) <= 4
     assert again.cost == pytest.approx(stopped.cost, rel=1e-8)
 
@@ -454,7 +502,7 @@ def test_without_a_cost_of_the_control_it_is_at_its_limits() -> None:
 def test_a_cost_without_end_is_not_called_a_solution() -> None:
     solution = ls.smooth(racing(limit=np.inf))
     assert not solution.success
-    assert solution.status.remedy
+    assert solution.remedy
 
 
 # Re-plans.
@@ -481,7 +529,7 @@ def test_what_cannot_be_kept_is_not_called_converged() -> None:
     """Twice as much power as there may be, at once: the plan is the one that misses least, or no worse."""
     numbers = {"power": 1.0, "most": 9.0, "beside": 0.5, "force": 1.0, "speed": 1.0}
     of = problem(
-        ls.StateBounds(high={"v": 0.5}), ls.SymbolicConstraint(power, parameters=numbers), dynamics=system(), limit=2.0
+        ls.StateBounds(v=(-np.inf, 0.5)), ls.SymbolicConstraint(power, parameters=numbers), dynamics=system(), limit=2.0
     )
     before = ls.smooth(of)
     found = ls.prepare(of).solve([0.0, 1.5], before.shifted(0), time_limit=5.0)

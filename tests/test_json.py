@@ -14,6 +14,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
+from lqrsim.commands import COMMANDS
 from lqrsim.stress.statistics import rate
 from lqrsim.view import gl
 
@@ -126,6 +127,16 @@ def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytes
     found = json.loads(captured.out)
     assert (found["version"], found["exit_code"]) == (1, 2)
     assert says in found["error"]
+    assert captured.err == f"lqrsim: error: {found['error']}\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_option_that_no_command_has_is_an_object_of_each(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--no-such-option", "--json"]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.out.splitlines()
+    found = json.loads(line)
+    assert (found["format"], found["version"], found["exit_code"]) == (f"lqrsim {command}", 1, 2)
     assert captured.err == f"lqrsim: error: {found['error']}\n"
 
 

@@ -356,8 +356,8 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
 class TestSolvers:
     def test_dual_form_with_limits_and_constraints(self) -> None:
         kept = [
-            ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState([1.4], states=("x",)),
-            ls.StateBounds(low={"heading": -0.2}, high={"y": 0.6}),
+            ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState(x=1.4),
+            ls.StateBounds(heading=(-0.2, np.inf), y=(-np.inf, 0.6)),
         ]  # fmt: skip
         smoothed(problem(constraints=kept), task="damped", penalty=30.0)
 
@@ -867,7 +867,7 @@ class TestParts:
 
     def test_constraints(self) -> None:
         of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))
-        of_constraint(ls.StateBounds(low={"x": 0.5}, high={"y": 0.2}).bind(CART))
+        of_constraint(ls.StateBounds(x=(0.5, np.inf), y=(-np.inf, 0.2)).bind(CART))
         of_constraint(ls.GoalState([1.0, 0.0, 0.0]).bind(CART), equality=1)
 
     @pytest.mark.parametrize("seed", range(4))
@@ -1078,7 +1078,7 @@ class TestInteriorPoint:
     def test_models_steps_and_where_they_lead(self) -> None:
         """From a soft start, with constraints that bend; the plan is no motion."""
         rng = np.random.default_rng(0)
-        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
         one = problem(steps=3, constraints=kept)
         stages, source = Stages(one), source_of(interior_point)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
@@ -1123,7 +1123,7 @@ class TestActiveSet:
     def test_models_and_pivots(self) -> None:
         """From a soft start, with constraints that bend, an equality and limits, some of them held."""
         rng = np.random.default_rng(0)
-        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
         stages, source = Stages(problem(steps=3, constraints=kept)), source_of(active_set)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         rows = len(stages.owners)

@@ -338,3 +338,6 @@ def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> No
     }  # fmt: skip
     with pytest.raises(InputError, match=r"initial: got a start .* inside obstacle 'post', want it clear"):
         ls.Problem(**bad)
+    blocked = ls.QuadraticCost(np.ones(6), about=robot.at(a=0.72))
+    there = ls.Problem(**bad | {"initial": ls.FixedState(robot.at()), "final_cost": blocked})
+    assert there.goal_inside.endswith("m inside obstacle 'post'")

@@ -284,8 +284,8 @@ def test_a_camera_and_a_light_where_there_are_none() -> None:
 def test_joint_limits_are_bounds() -> None:
     robot, _ = robot_of("cart", 0)
     bounds = robot.joint_limits
-    assert (bounds.low, bounds.high) == ({"slider": -0.3}, {"slider": 0.3})
-    with pytest.raises(InputError, match="got no bounds"):
+    assert bounds.bounds == {"slider": (-0.3, 0.3)}
+    with pytest.raises(InputError, match="StateBounds: got nothing"):
         _ = robot_of("wheel", 0)[0].joint_limits
 
 

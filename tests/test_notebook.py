@@ -72,7 +72,7 @@ def test_a_solution_that_failed_shows_its_remedy(solution: ls.Solution) -> None:
     assert not failed.success
     html = failed._repr_html_()
     assert failed.status.name in html
-    assert failed.status.remedy in "".join(parsed(html).itertext())
+    assert failed.remedy in "".join(parsed(html).itertext())
     nowhere = np.full_like(solution.trajectory.states, np.nan)
     plan = Trajectory(nowhere, solution.trajectory.controls, solution.trajectory.dt)
     broken = replace(solution, status=ls.Status.NOT_FINITE, trajectory=plan)

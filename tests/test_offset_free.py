@@ -10,6 +10,7 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.disturbances import (
+    CommandDropouts,
     ControlDelay,
     Disturbance,
     Effect,
@@ -101,6 +102,14 @@ def test_lost_measurements_are_predicted() -> None:
     for k in np.flatnonzero(~came_first):
         np.testing.assert_allclose(begun.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
         assert np.isnan(begun.innovations[: first[k], k]).all()
+
+
+def test_commands_that_get_lost_are_no_cliff(quadrotor: ls.Scenario) -> None:
+    """Of 60 flights with 4 in 5 commands lost at least 50 arrive: 98 % do of 200; told of nothing, 41 %."""
+    plan, lost = ls.smooth(quadrotor.problem), [CommandDropouts(0.8)]
+    law = ls.OffsetFree(quadrotor.problem, plan, ls.uncertainty_of(quadrotor.plant(), lost))
+    flights = ls.simulate(quadrotor.plant(), plan, controller=law, disturbances=lost, trials=60, frames=False)
+    assert flights.outcome.count("reached") >= 50
 
 
 def test_nothing_winds_up_at_the_limits() -> None:
@@ -274,7 +283,8 @@ def test_what_has_no_spread_is_no_reason_to_refuse(quadrotor: ls.Scenario) -> No
 def test_the_digest_is_of_all_that_the_controls_depend_on() -> None:
     system, digests = double_integrator(steps=5), set()
     base = {"unknowns": [PUSH], "start": 0.1, "measurement": 0.1}
-    changes = [{}, {"latency": 1}, {"delay": 1}, {"lag": 0.1}, {"measurement": 0.2}, {"unknowns": []}]
+    late = [{"latency": 1}, {"delay": 1}, {"lag": 0.1}, {"command_loss": 0.1}]
+    changes = [{}, *late, {"measurement": 0.2}, {"unknowns": []}]
     for change in changes:
         uncertainty = ls.Uncertainty(**(base | change))  # type: ignore[arg-type]
         digests.add(ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=1.0).digest)

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 
 import lqrsim as ls
@@ -81,6 +84,44 @@ def test_a_planar_quadrotor_over_a_floor_among_obstacles_agrees() -> None:
     found = ls.check_plant(PlanarQuadrotor(), scene_from_xml(mjcf(BLOCK + floor), "planar"))
     assert found.good, found
     assert found.contacts == ()
+
+
+def swung(**stated: Any) -> ls.Problem:
+    return ls.Problem(**{
+        "dynamics": Arm().dynamics, "dt": 0.02, "steps": 5, "initial": ls.FixedState((0.3, 0.0)),
+        "stage_cost": ls.ControlCost([1.0]), "final_cost": ls.QuadraticCost(np.ones(2), about=np.zeros(2)), **stated,
+    })  # fmt: skip
+
+
+@settings(max_examples=8, deadline=None)
+@given(low=st.floats(-1.0, 0.2), high=st.floats(0.4, 1.5), most=st.floats(0.1, 2.0), seed=st.integers(0, 99))
+def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: float, seed: int) -> None:
+    """A stop of the joint, of which the dynamics know nothing, is outside of them; the change shows the controls."""
+    ends = f"{np.degrees(low - 0.15)} {np.degrees(high + 0.15)}"
+    stops = f'<joint name="shoulder" type="hinge" axis="0 -1 0" limited="true" range="{ends}"/>'
+    scene = scene_from_xml(arm("").xml.replace('<joint name="shoulder" type="hinge" axis="0 -1 0"/>', stops), "stops")
+    bounds = [ls.StateBounds(angle=(low, high), speed=(-5.0, 5.0)), ls.StateBounds(speed=(-np.inf, 4.0))]
+    problem = swung(constraints=bounds, control_limits=(-most, most))
+    found = ls.check_plant(Arm(), scene, problem=problem, spread=3.0, seed=seed, samples=20)
+    assert found.good, found
+    assert low <= found.state[0] <= high
+    assert abs(found.control[0]) <= most
+    assert not ls.check_plant(Arm(), scene, spread=3.0, seed=seed, samples=20).good
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"problem": swung(constraints=[ls.StateBounds(speed=(1.0, 2.0))])},
+         "around: got 0 for speed, want one within the problem's bounds, 1 to 2"),
+        ({"problem": swung(), "around": (0.0, np.inf)}, "around: got inf"),
+        ({"problem": ls.scenarios.differential_drive().problem}, "problem: got one of .*, want one of the robot's"),
+        ({"problem": 3}, "problem: got 3, want a Problem of the robot"),
+    ],
+)  # fmt: skip
+def test_a_problem_that_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        ls.check_plant(Arm(), arm(""), **options)
 
 
 def test_contacts_that_stay_are_named() -> None:

@@ -1,9 +1,14 @@
 """Problems and costs: what is refused, each with one line that names the field, what it got and what it wanted."""
 
 import dataclasses
+import logging
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 import lqrsim as ls
 from lqrsim.solvers import compiled
@@ -52,7 +57,7 @@ DYNAMICS = ls.Dynamics(
     lambda x, u, p: [x[2], 0 * x[2], u[0]], states=STATES, controls={"force": "N"}, position=("x", "y")
 )
 PILLAR = ls.World([ls.Obstacle("pillar", "cylinder", np.zeros(3), np.eye(3), np.array([0.5, 1.0, 0.0]))])
-FIELDS = {
+FIELDS: dict[str, Any] = {
     "dynamics": DYNAMICS,
     "dt": 0.1,
     "steps": 10,
@@ -101,6 +106,44 @@ def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
     with pytest.raises(ls.InputError, match=message) as caught:
         ls.Problem(**{**FIELDS, **fields})
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("solve", [ls.smooth, ls.ilqr])
+@settings(max_examples=8, deadline=None)
+@given(x=st.floats(-1.0, 1.0), y=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0), weighed=st.booleans())
+def test_a_goal_inside_an_obstacle_is_said_before_the_solve(
+    solve: Callable[..., ls.Solution], x: float, y: float, speed: float, weighed: bool
+) -> None:
+    """The pillar's radius is 0.5 m, the robot's 0.1 m. A goal without a weight on its place is no place."""
+    depth = 0.6 - np.hypot(x, y)
+    assume(abs(depth) > 1e-6)
+    weight = [1.0, 1.0, 0.0] if weighed else [1.0, 0.0, 1.0]
+    problem = ls.Problem(**{**FIELDS, "final_cost": ls.QuadraticCost(weight, about=(x, y, speed))})
+    said, begun = list[str](), list[int]()
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage() * (not begun))
+    logging.getLogger("lqrsim").addHandler(handler)
+    try:
+        solve(problem, max_iterations=1, callback=lambda *_: begun.append(1))
+    finally:
+        logging.getLogger("lqrsim").removeHandler(handler)
+    about = [line for line in said if "the goal is" in line]
+    if depth > 0 and weighed:
+        assert about == [f"the goal is {problem.goal_inside}: a plan that ends there collides"]
+        assert f"{depth:.3g} m inside obstacle 'pillar'" in problem.goal_inside
+    else:
+        assert (about, problem.goal_inside) == ([], "")
+
+
+def test_where_a_goal_is_inside_is_known_of_constraints_and_of_what_moves() -> None:
+    """A ball that is 1 m away at the start, and at the goal when the plan ends."""
+    ball = ls.Obstacle(
+        "ball", "sphere", np.array([3.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]), velocity=np.array([1.0, 0, 0])
+    )
+    stage, kept = ls.ControlCost([1.0], about=[0.0]), [ls.Clearance(ls.World([ball]), radius=0.1), ls.GoalState(x=4.0)]
+    problem = ls.Problem(**{**FIELDS, "stage_cost": stage, "constraints": kept})
+    assert problem.goal_inside == "at (4, 0) m, 0.3 m inside obstacle 'ball'"
+    assert not dataclasses.replace(problem, begin=1.0).goal_inside
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_what_other_endings_claim_is_so(cases: list[Case]) -> None:
         assert solution.status in (
             Status.MAX_ITERATIONS, Status.DIVERGED, Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE,
         ), case  # fmt: skip
-        assert solution.status.remedy
+        assert solution.remedy
         if solution.status is Status.MAX_ITERATIONS:
             assert len(solution.iterations) >= 500 or "line search" in solution.detail, case
             last = solution.iterations[-1]

@@ -30,6 +30,7 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import memory
 from lqrsim.problem.costs import CostTerm
+from lqrsim.stress.statistics import rate
 
 api: Any = import_module("robustness.api")
 of_runs: Any = import_module("robustness.of_runs")
@@ -369,6 +370,59 @@ class TestFunctions:
 
         with pytest.raises(Mine):
             ls.smooth(differential_drive.problem, starts=1, callback=callback)
+
+
+def enormous(x: Any, u: Any, p: Any) -> list[int]:
+    return [10**400]
+
+
+RECORD: Any = {
+    "step": 0, "trial": 0, "status": "converged", "iterations": 3, "seconds": 0.1, "cost": 1.0, "before": 2.0,
+    "used": True, "reason": "",
+}  # fmt: skip
+DEEP: Any = []
+for _ in range(3000):
+    DEEP = [DEEP]
+
+
+class Biting:
+    """What cannot be looked into."""
+
+    def __iter__(self) -> Any:
+        raise TypeError("it bites")
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: dataclasses.replace(ls.load_scene("arena"), geoms=0), "Scene: geoms: got 0, want ids of geoms"),
+        (lambda: dataclasses.replace(rate(1, 2), value=[1.0]), "Estimate: value: got [1.0]"),
+        (lambda: lq.MjcfRobot("cage", position=Biting()), "MjcfRobot cage: position: got "),
+        (lambda: lq.verify_video("it.mp4", np.eye(3)), "rollout: got array"),
+        (
+            lambda: ls.check_derivatives(lq.Dynamics(enormous, states={"x": "m"}, controls={"u": "N"}, level="plain")),
+            "enormous(x, u, p): got ",
+        ),
+        (lambda: ls.Uncertainty(model_error=DEEP), "Uncertainty: model_error: got "),
+        (lambda: ls.Uncertainty(start={"m": -1.0}), "Uncertainty: start: 'm': got -1.0, want a finite number >= 0"),
+        (lambda: ls.rotations.vector_rate((1e300, 1e300, 1e300), (0.0, 0.0, 1.0)), "r: got a rotation vector whose"),
+        (lambda: lq.Capsule(0.4, 0.1, 0.02).between((0, 0, 0), itertools.count()), "between: got "),
+        (lambda: ls.stress.FunnelCheck(0, DEEP, rate(1, 2), np.ones(2, dtype=bool)), "FunnelCheck: level: got "),
+        (lambda: ls.stress.ComparedPlan("", DEEP, np.ones(2, dtype=bool)), "ComparedPlan: solution: got "),
+        (lambda: ls.types.ReplanRecord(**RECORD | {"reason": DEEP}), "ReplanRecord: reason: got "),
+    ],
+)
+def test_what_hostile_calls_once_found(call: Callable[[], object], says: str) -> None:
+    assert refusal(call).startswith(says)
+
+
+@pytest.mark.parametrize(
+    ("robot", "positions", "velocities"),
+    [(ls.DifferentialDrive, 9, 8), (ls.Quadrotor, 7, 6), (lambda: ls.MjcfRobot("cage"), 7, 6)],
+)
+def test_positions_and_velocities_are_of_as_many_states(robot: Any, positions: int, velocities: int) -> None:
+    line = refusal(lambda: robot().state(np.zeros((2, positions)), np.zeros(velocities)))
+    assert line == f"qvel: got shape ({velocities},), want that of qpos, (2, {positions}), with {velocities} numbers"
 
 
 def test_a_robot_at_rest_has_a_state() -> None:

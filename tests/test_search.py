@@ -258,7 +258,7 @@ class TestConstraintsInTheWay:
 
     def test_a_bound_of_a_speed_has_no_other_side(self) -> None:
         """A plan at its bound is not searched for a way round; it is asked for in a line."""
-        problem = replace(among_discs(0), constraints=[ls.StateBounds(high={"vx": 0.8})])
+        problem = replace(among_discs(0), constraints=[ls.StateBounds(vx=(-np.inf, 0.8))])
         solution = ls.smooth(problem)
         assert any(one.values.any() for one in solution.multipliers)
         assert solution.candidates == ()

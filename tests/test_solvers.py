@@ -224,7 +224,7 @@ class TestEndings:
         solution = solver(scalar_problem(cubic=100.0), max_iterations=30)
         assert solution.status in (Status.NOT_FINITE, Status.DIVERGED, Status.NOT_POSITIVE_DEFINITE)
         assert "remedy" in str(solution)
-        assert solution.status.remedy in str(solution)
+        assert solution.remedy in str(solution)
 
     def test_a_cost_without_a_minimum(self) -> None:
         solution = ls.smooth(scalar_problem(paid=1.0), safeguard=False)

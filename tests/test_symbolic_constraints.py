@@ -143,7 +143,7 @@ class TestGoalState:
         assert solution.violation == pytest.approx(off, abs=1e-15)
 
     def test_of_some_states_leaves_the_others(self) -> None:
-        case = problem(ls.GoalState([1.0], states=("x",)))
+        case = problem(ls.GoalState(x=1.0))
         solution, dense = ls.smooth(case, **EXACT), Dense(case)
         z, multiplier = dense.optimum(dense.states[-1, :1], np.array([1.0]))
         np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
@@ -247,7 +247,7 @@ class TestInequality:
 class TestStateBounds:
     @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_are_kept_at_every_step(self, soft: bool) -> None:
-        case = problem(ls.GoalState([1, 0]), ls.StateBounds(low={"v": -0.1}, high={"v": 0.55}), soft=soft)
+        case = problem(ls.GoalState([1, 0]), ls.StateBounds(v=(-0.1, 0.55)), soft=soft)
         solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
         speeds = solution.trajectory.states[:, 1]
 
@@ -264,7 +264,7 @@ class TestStateBounds:
 
     def test_may_be_where_the_goal_is(self) -> None:
         """A bound wants some room, and the goal leaves none: at the end it does not act."""
-        solution = ls.smooth(problem(ls.GoalState([1, 0]), ls.StateBounds(low={"v": 0.0}, high={"x": 1.0})))
+        solution = ls.smooth(problem(ls.GoalState([1, 0]), ls.StateBounds(v=(0.0, np.inf), x=(-np.inf, 1.0))))
         assert solution.status is Status.CONVERGED, solution.summary()
         np.testing.assert_allclose(solution.trajectory.states[-1], [1, 0], rtol=0, atol=1e-6)
         assert solution.trajectory.states[:-1, 1].min() >= 0
@@ -319,7 +319,7 @@ class TestInfeasible:
             ([ls.GoalState([1, 0])], "the goal of 1 m for x is missed by"),
             ([ls.SymbolicConstraint(line, parameters={"slope": 0.0}, equality=True, at="final")],
              "that line(x, u, p) is zero is missed by"),
-            ([ls.GoalState([0.3], states=("x",)), ls.StateBounds(low={"v": 0.5})],
+            ([ls.GoalState(x=0.3), ls.StateBounds(v=(0.5, np.inf))],
              "v of at least 0.5 m/s is missed by 0.47 at 0.10 s (step 1)"),
         ],
     )  # fmt: skip
@@ -331,7 +331,7 @@ class TestInfeasible:
 
 
 def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path) -> None:
-    case = problem(ls.GoalState([1, 0]), ls.StateBounds(high={"v": 0.6}))
+    case = problem(ls.GoalState([1, 0]), ls.StateBounds(v=(-np.inf, 0.6)))
     solution = ls.smooth(case)
     loaded = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
     assert loaded.multipliers[0].values.min() < 0
@@ -345,7 +345,8 @@ def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path)
 
 def test_derivatives_are_right() -> None:
     kept = [
-        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}), ls.StateBounds({"x": -1})
+        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}),
+        ls.StateBounds(x=(-1, np.inf)),
     ]  # fmt: skip
     checks = [check for check in ls.check_derivatives(problem(*kept)) if "slope of" in check.what]
     assert len(checks) == 4
@@ -372,18 +373,22 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
          "SymbolicConstraint: at: got 'start', want one of: all, final"),
         (lambda: anything.SymbolicConstraint(line, equality="yes"), "SymbolicConstraint: equality: got 'yes'"),
         (lambda: problem(ls.GoalState([1, 2, 3])), "GoalState: goal: got 3 numbers, want 2, one for each of x, v"),
-        (lambda: ls.GoalState([1, 2], states=("x",)), "GoalState: goal: got 2 numbers, want 1, one a name"),
-        (lambda: ls.GoalState([1, 2], states=("x", "x")), "want names of states, at least one, and each once"),
-        (lambda: ls.GoalState([1], states="x"), "GoalState: states: got 'x', want a tuple of names: ('x',)"),
-        (lambda: problem(ls.GoalState([1], states=("y",))), "GoalState: states: got 'y', want one of: x, v"),
-        (lambda: problem(ls.GoalState([1, 0]), ls.GoalState([2], states=("x",))),
+        (lambda: ls.GoalState(), "GoalState: got nothing, want a number by name of a state, as GoalState(x=...)"),
+        (lambda: ls.GoalState({"x": 1}, x=2), "GoalState: got 'x' twice, want each state once"),
+        (lambda: anything.GoalState([1, 0], x=2), "GoalState: got [1, 0], want a number by name of a state"),
+        (lambda: anything.GoalState({0: 1}), "GoalState: got 0 at 0, want a number by name of a state"),
+        (lambda: ls.GoalState(x=np.inf), "GoalState: 'x': got inf, want a finite number"),
+        (lambda: problem(ls.GoalState(y=1)), "GoalState: states: got 'y', want one of: x, v"),
+        (lambda: problem(ls.GoalState([1, 0]), ls.GoalState(x=2)),
          "constraints: got goals of 1 and 2 for x, want one"),
-        (lambda: ls.StateBounds(), "StateBounds: got no bounds"),
-        (lambda: ls.StateBounds(low={"x": 1}, high={"x": -1}), "StateBounds: got 1 to -1 for 'x', want low below high"),
-        (lambda: anything.StateBounds(low=[0, 0]), "StateBounds: low: got [0, 0], want a dictionary of name: number"),
-        (lambda: ls.StateBounds(low={"x": np.nan}), "StateBounds: low: 'x': got nan"),
-        (lambda: problem(ls.StateBounds(low={"y": 0})), "StateBounds: states: got 'y', want one of: x, v"),
-        (lambda: problem(ls.StateBounds(high={"x": 0.5}), ls.GoalState([1, 0])),
+        (lambda: ls.StateBounds(), "StateBounds: got nothing, want (low, high) by name of a state"),
+        (lambda: ls.StateBounds(x=(1, -1)), "StateBounds: 'x': got 1 to -1, want low below high"),
+        (lambda: ls.StateBounds(x=(-np.inf, np.inf)), "StateBounds: 'x': got -inf to inf, want low below high, and"),
+        (lambda: anything.StateBounds([0, 0]), "StateBounds: got [0, 0], want (low, high) by name of a state"),
+        (lambda: anything.StateBounds(x=1.0), "StateBounds: 'x': got shape (), want (2,)"),
+        (lambda: ls.StateBounds(x=(np.nan, 1)), "StateBounds: 'x': got nan"),
+        (lambda: problem(ls.StateBounds(y=(0, 1))), "StateBounds: states: got 'y', want one of: x, v"),
+        (lambda: problem(ls.StateBounds(x=(-np.inf, 0.5)), ls.GoalState([1, 0])),
          "constraints: got a goal of 1 m for x, want x of at most 0.5 m"),
         (lambda: ls.ilqr(problem(ls.GoalState([1, 0]))), "constraints: got some, want none for ilqr"),
     ],

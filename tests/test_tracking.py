@@ -2,6 +2,8 @@
 
 import dataclasses
 import importlib.util
+from collections.abc import Sequence
+from itertools import product
 
 import hypothesis
 import numpy as np
@@ -11,6 +13,7 @@ from linear_plans import DT, Linear, linear
 from scipy.linalg import expm
 
 import lqrsim as ls
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.errors import Array
@@ -92,18 +95,26 @@ class Oracle:
         root = np.sqrt(self.weights.state)
         return np.linalg.lstsq(root[:, None] * self.system.B, root * self.push(d, t), rcond=None)[0]
 
-    def residuals(self, commands: Array, e: Array, a: Array, d: Array) -> Array:
-        """The roots of all that the cost adds up, of a run that begins off the plan by e, a and d."""
+    def residuals(self, commands: Array, e: Array, a: Array, d: Array, lost: Sequence[bool] = ()) -> Array:
+        """The roots of all that the cost adds up, of a run that begins off the plan by e, a and d.
+
+        Args:
+          lost: whether each command gets lost: then the actuators stay, and it costs nothing.
+        """
         system, plan, weights = self.system, self.system.plan, self.weights
         x, reached, d = plan.states[0] + e, plan.controls[0] + a, d.copy()
         found = []
         for t, command in enumerate(commands):
             found.append(np.sqrt(weights.state) * (x - plan.states[t]))
-            found.append(np.sqrt(weights.control) * (command - plan.controls[t] + self.undone(d, t)))
-            applied = command
-            if self.lag:
+            effort = np.sqrt(weights.control) * (command - plan.controls[t] + self.undone(d, t))
+            if lost and lost[t]:
+                effort, applied = 0 * effort, reached
+            elif self.lag:
                 applied = command + self.mean * (reached - command)
                 reached = command + self.left * (reached - command)
+            else:
+                applied = reached = command
+            found.append(effort)
             x = system.A @ x + system.B @ applied + self.push(d, t)
             place = 0
             for move, _, _ in () if self.persistent else self.unknowns:
@@ -140,6 +151,78 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
         np.testing.assert_allclose(system.plan.controls[t] + u, commands[t], rtol=0, atol=1e-5 * (1 + np.abs(u).max()))
         z = model.F[t] @ z + model.G[t] @ u + model.c[t]
         z[n + model.lagging :] = d
+
+
+@hypothesis.given(
+    st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans(), st.sampled_from([0.05, 0.5, 0.95])
+)
+@hypothesis.settings(max_examples=8)
+def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
+    structure: int, seed: int, unstable: bool, share: float
+) -> None:
+    """The first command against one least-squares problem over all 16 patterns of losses: 1e-5, as above.
+
+    Its unknowns are the commands of a tree: each may depend on which of those before it got lost.
+    """
+    steps = 4
+    system, uncertainty = drawn(structure, seed, unstable=unstable, steps=steps)
+    uncertainty = dataclasses.replace(uncertainty, command_loss=share)
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    weights = Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n))
+    gain, offset = tracking_laws(model, weights)
+    oracle = Oracle(system, uncertainty, weights, persistent=True)
+    e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
+    patterns = list(product((False, True), repeat=steps))
+    nodes = {before: i for t in range(steps) for i, before in enumerate(product((False, True), repeat=t), 2**t - 1)}
+
+    def residuals(tree: Array) -> Array:
+        found = []
+        for lost in patterns:
+            chance = np.prod([share if one else 1 - share for one in lost])
+            commands = np.array([tree[nodes[lost[:t]]] for t in range(steps)])
+            found.append(np.sqrt(chance) * oracle.residuals(commands, e, a, d, lost))
+        return np.concatenate(found)
+
+    base = residuals(np.zeros((len(nodes), m)))
+    slope = np.array([residuals(one.reshape(-1, m)) - base for one in np.eye(len(nodes) * m)]).T
+    best = np.linalg.lstsq(slope, -base, rcond=None)[0].reshape(-1, m)
+    u = gain[0] @ np.concatenate([e, a[: model.lagging], d]) + offset[0]
+    np.testing.assert_allclose(system.plan.controls[0] + u, best[0], rtol=0, atol=1e-5 * (1 + np.abs(u).max()))
+
+
+@hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.05, 0.5, 0.95]))
+@hypothesis.settings(max_examples=12)
+def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: int, seed: int, share: float) -> None:
+    """Mean and covariance at the end of a run with any law, from the oracle's run of each of 32 patterns: 1e-9."""
+    steps = 5
+    system, uncertainty = drawn(structure, seed, unstable=False, steps=steps)
+    uncertainty = dataclasses.replace(uncertainty, command_loss=share, start=0.3, unknowns=())
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    gain, offset, no = rng.normal(size=(steps, m, n)), rng.normal(size=(steps, m)), np.zeros(0)
+    moments = LinearLoop(model, gain, offset, None, np.full(m, -np.inf), np.full(m, np.inf)).moments()
+    oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
+
+    def end(e: Array, lost: tuple[bool, ...]) -> Array:
+        commands = np.zeros((0, m))
+        for t in range(steps):
+            off = oracle.residuals(np.vstack([commands, np.zeros(m)]), e, np.zeros(m), no, (*lost[:t], True))
+            off = off[: (t + 1) * (n + m)].reshape(t + 1, n + m)[t, :n]
+            commands = np.vstack([commands, system.plan.controls[t] + gain[t] @ off + offset[t]])
+        return oracle.residuals(commands, e, np.zeros(m), no, lost)[-n:]
+
+    mean, second = np.zeros(n), np.zeros((n, n))
+    for lost in product((False, True), repeat=steps):
+        chance = np.prod([share if one else 1 - share for one in lost])
+        middle = end(np.zeros(n), lost)
+        slope = np.array([end(one, lost) - middle for one in np.eye(n)]).T
+        mean += chance * middle
+        second += chance * (np.outer(middle, middle) + 0.3**2 * slope @ slope.T)
+    size = np.abs(second).max()
+    np.testing.assert_allclose(moments.mean[-1, :n], mean, rtol=0, atol=1e-9 * (1 + np.sqrt(size)))
+    expected = second - np.outer(mean, mean)
+    np.testing.assert_allclose(moments.covariance[-1, :n, :n], expected, rtol=0, atol=1e-9 * (1 + size))
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())

@@ -52,13 +52,13 @@ DT = 1 / 30
 # One of each; "in words" are those that no linear model has.
 EXAMPLES = [
     InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), ls.disturbances.MeasurementNoise(0.005),
-    MeasurementLatency(1), MeasurementDropouts(0.2), ControlNoise(0.02), ControlOffset(0.02), ControlDelay(1),
-    MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
+    MeasurementLatency(1), MeasurementDropouts(0.2), CommandDropouts(0.2), ControlNoise(0.02),
+    ControlOffset(0.02), ControlDelay(1), MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
     ls.disturbances.MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
     AxleMismatch(0.02),
 ]  # fmt: skip
 IN_WORDS = [
-    InertiaMismatch(0.1), MeasurementBias(0.005), CommandDropouts(0.2), Saturation(share=0.9),
+    InertiaMismatch(0.1), MeasurementBias(0.005), Saturation(share=0.9),
     ActuatorLoss(at=0.2, remaining=0.7), Push((0.1, 0.0, 0.0), at=0.1), FrictionMismatch(0.1),
 ]  # fmt: skip
 
@@ -109,8 +109,8 @@ def test_presets_of_the_quadrotor_are_the_numbers_written_out(cage, name):
     np.testing.assert_allclose(per_entry("", stated.start, units), 0.01 * k, rtol=1e-12)
     controls = cage.robot.dynamics.control_coordinates
     np.testing.assert_allclose(per_entry("", stated.control, controls), 0.0371 * k, rtol=1e-12)  # 1 % of 3.71 N
-    numbers = stated.lag, stated.loss, stated.obstacles, stated.delay, stated.latency
-    np.testing.assert_allclose(numbers, (0.024 * k, 0.01 * k, 0.01 * k, 0, 0), rtol=1e-12)
+    numbers = stated.lag, stated.loss, stated.command_loss, stated.obstacles, stated.delay, stated.latency
+    np.testing.assert_allclose(numbers, (0.024 * k, 0.01 * k, 0.01 * k, 0.01 * k, 0, 0), rtol=1e-12)
     of = named(stated)
     cut = 0.98658  # the standard deviation of a standard normal number that is cut at 3
     np.testing.assert_allclose(of["mass"].std, 0.02 * k * 0.5 * cut, rtol=1e-5)
@@ -125,7 +125,7 @@ def test_presets_of_the_quadrotor_are_the_numbers_written_out(cage, name):
         assert one.order == order
         np.testing.assert_allclose((one.std, one.time_constant), (std, length / wind.airspeed), rtol=1e-12)
     assert len(of) == 11
-    assert [words.split(" ")[0] for words in stated.left_out] == ["inertia", f"{k:g}"]  # and commands lost
+    assert [words.split(" ")[0] for words in stated.left_out] == ["inertia"]
 
 
 def test_the_cut_normal_numbers_have_the_standard_deviation_that_is_stated(cage):

@@ -306,7 +306,7 @@ def test_goals_that_cannot_be_moved(quadrotor: ls.Scenario) -> None:
     cases = (
         (replace(problem, final_cost=problem.final_cost + problem.final_cost), "got 2 QuadraticCosts of the position"),
         (replace(problem, final_cost=ls.QuadraticCost(weight, about=np.zeros(12))), "got 0 QuadraticCosts"),
-        (replace(problem, constraints=(ls.GoalState([1.0], states=["y"]),)), "got a GoalState that holds y"),
+        (replace(problem, constraints=(ls.GoalState(y=1.0),)), "got a GoalState that holds y"),
         (arm_problem(PlanarArm()), "got a robot without a position"),
     )
     for wrong, line in cases:

@@ -116,8 +116,8 @@ def rocket(seed: int) -> tuple[ls.Problem, NDArray[np.float64]]:
         constraints=[
             ls.SymbolicConstraint(_engine, parameters=engine),
             ls.SymbolicConstraint(_glide, parameters={"slope": 1.0, "below": 0.1}),
-            ls.StateBounds(low={"z": 0.0, "mass": DRY}),
-            ls.GoalState(np.zeros(6), states=("x", "y", "z", "vx", "vy", "vz")),
+            ls.StateBounds(z=(0.0, np.inf), mass=(DRY, np.inf)),
+            ls.GoalState(x=0, y=0, z=0, vx=0, vy=0, vz=0),
         ],
     )
     return problem, np.tile([0.0, 0.0, WET * GRAVITY], (problem.steps, 1))

@@ -71,14 +71,16 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
         function = partial(_spare, obstacles, list(space.position), constraint.radius + constraint.margin)
         return Kept(function, np.tile(changeable[:, None], (1, len(obstacles))), False)
     if isinstance(constraint, ls.GoalState):
-        indices = [names.index(name) for name in constraint.states or names]
-        return Kept(lambda z: z[..., indices] - constraint.goal, np.tile(at_end[:, None], (1, len(indices))), True)
+        goal = constraint._numbers(dynamics)
+        indices, wanted = list(goal), np.array(list(goal.values()))
+        return Kept(lambda z: z[..., indices] - wanted, np.tile(at_end[:, None], (1, len(indices))), True)
     if isinstance(constraint, ls.StateBounds):
-        rows = [(names.index(name), 1, number) for name, number in constraint.low.items()]
-        rows += [(names.index(name), -1, number) for name, number in constraint.high.items()]
+        bounds = constraint.bounds.items()
+        rows = [(names.index(name), sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for name, bound in bounds]
         indices, signs, numbers = (np.array(column) for column in zip(*rows, strict=True))
+        indices, signs, numbers = (column[np.isfinite(numbers)] for column in (indices, signs, numbers))
         goals = [one for one in problem.constraints if isinstance(one, ls.GoalState)]
-        fixed = {names.index(name) for one in goals for name in one.states or names}
+        fixed = {i for one in goals for i in one._numbers(dynamics)}
         acts = np.stack([changeable & ~(at_end & (i in fixed)) for i in indices], axis=1)
         return Kept(lambda z: signs * (z[..., indices] - numbers), acts, False)
     if isinstance(constraint, ls.SymbolicConstraint):

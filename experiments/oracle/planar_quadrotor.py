@@ -76,7 +76,7 @@ def problem(
     )
 
 
-def draw(rng: Generator, *, clearance: bool) -> ls.Problem:
+def draw(rng: Generator, *, clearance: bool, sharpness: float = 20.0) -> ls.Problem:
     """A random one; start and goal are drawn until both are clear by the margin."""
     obstacles = world().seen_by("xy")
 
@@ -87,4 +87,4 @@ def draw(rng: Generator, *, clearance: bool) -> ls.Problem:
                 return drawn
 
     start, goal = place(-2.0, -1.0), place(1.2, 2.3)
-    return problem(start, goal, steps=int(rng.integers(120, 301)), clearance=clearance)
+    return problem(start, goal, steps=int(rng.integers(120, 301)), clearance=clearance, sharpness=sharpness)

@@ -143,7 +143,7 @@ def problem_of(task: Task) -> ls.Problem:
     low, high = task.road
     constraints: list[ls.Constraint] = [
         ls.Clearance(world, balls=balls, margin=task.clearance),
-        ls.StateBounds(low={name: -most for name, most in widest.items()}, high=widest),
+        ls.StateBounds({name: (-most, most) for name, most in widest.items()}),
         ls.SymbolicConstraint(_on_road, parameters={"low": low, "high": high}),
     ]
     if task.exact:

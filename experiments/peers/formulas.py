@@ -102,7 +102,7 @@ def parameters(problem: ls.Problem) -> Array:
         if isinstance(one, ls.SymbolicConstraint):
             found.append(np.array(list(one.parameters.values())))
         elif isinstance(one, ls.GoalState):
-            found.append(one.goal)
+            found.append(np.array(list(one._numbers(problem.dynamics).values())))
     return np.concatenate(found)
 
 
@@ -146,8 +146,7 @@ def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, 
     if isinstance(constraint, ls.StateBounds):  # which are bounds of the variables
         return _Rows(ca.SX(0, 1))
     if isinstance(constraint, ls.GoalState):
-        names = problem.dynamics.state_coordinates.names
-        places = [names.index(name) for name in constraint.states or names]
+        places = list(constraint._numbers(problem.dynamics))
         return _Rows(x[places] - given(len(places)), equality=True, at_end=True)
     if isinstance(constraint, ls.SymbolicConstraint):
         numbers = given(len(constraint.parameters))
@@ -196,11 +195,11 @@ def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
     high = -low
     for one in problem.constraints:
         if isinstance(one, ls.StateBounds):
-            for side, numbers, tighter in ((low, one.low, np.maximum), (high, one.high, np.minimum)):
-                for name, number in numbers.items():
-                    i = names.index(name)
-                    last = problem.steps if i in fixed else problem.steps + 1
-                    side[1:last, i] = tighter(side[1:last, i], number)
+            for name, (least, most) in one.bounds.items():
+                i = names.index(name)
+                last = problem.steps if i in fixed else problem.steps + 1
+                low[1:last, i] = np.maximum(low[1:last, i], least)
+                high[1:last, i] = np.minimum(high[1:last, i], most)
     if problem.duration is not None:
         low, high = (
             np.column_stack([side, np.full(len(side), bound)])

@@ -50,7 +50,7 @@ def reach_exactly(problem: ls.Problem) -> ls.Problem:
     goal = problem.goal
     assert goal is not None
     space = problem.dynamics.state_coordinates
-    place = ls.GoalState(goal[list(space.position)], states=[space.names[i] for i in space.position])
+    place = ls.GoalState({space.names[i]: goal[i] for i in space.position})
     return replace(fixed(problem), constraints=[*problem.constraints, place])
 
 

@@ -144,7 +144,7 @@ class UserFunction:
             if array.dtype.kind not in "biufO":  # no text, no complex numbers
                 raise TypeError
             vector = np.array([float(entry) for entry in array.reshape(-1)])
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):  # the last for an int beyond all floats
             raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
         if self.columns and array.shape != (wanted := (self.values // self.columns, self.columns)):
             raise InputError(f"{self.name}: got shape {array.shape}, want {wanted}: {self._wanted()}")

@@ -80,7 +80,7 @@ def of_solution(solution: "Solution") -> Object:
         "status": solution.status.name,
         "success": solution.success,
         "detail": solution.detail,
-        "remedy": solution.status.remedy,
+        "remedy": solution.remedy,
         "steps": plan.steps,
         "dt": plan.dt,
         "cost": solution.cost,

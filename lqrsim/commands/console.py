@@ -5,7 +5,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -113,6 +113,17 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
         reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
         place = excerpt_of(folder / name)
         raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
+
+
+@contextlib.contextmanager
+def keeping(write: Callable[[Any], object]) -> Iterator[None]:
+    """A block after which `write` is called with what Ctrl-C left, if it did (see `process.keeping`)."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if (found := getattr(stop, "found", None)) is not None:
+            write(found)
+        raise
 
 
 def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":

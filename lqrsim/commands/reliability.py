@@ -10,6 +10,7 @@ from tyro.conf import arg
 from lqrsim.commands.options import Folder, PolicyOptions, optional
 
 if TYPE_CHECKING:
+    from lqrsim.results.funnel import Funnel
     from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, SmallestFailure
 
 
@@ -54,7 +55,7 @@ class Rare(FailureOptions):
     Multilevel splitting needs far fewer trials than plain sampling: it multiplies the probabilities of levels that come
     nearer and nearer to a failure. Prints the levels as a pilot run finds them, then the probability with its interval,
     from independent, unbiased repetitions. Writes rollout.npz, with the worst failure and typical ones, for `lqrsim
-    render`, and rare.json, with settings and results.
+    render`, and rare.json, with settings and results. Ctrl-C keeps the repetitions that are done, from the second on.
 
     Exits with 1 if no failure was found.
     """
@@ -75,16 +76,20 @@ class Rare(FailureOptions):
         check_count("shown", self.shown)
         problem, folder = self._begin("rare")
         options = {"particles": self.particles, "repetitions": self.repetitions, "seed": self.seed}
+
+        def write(rare: "RareFailures") -> int:
+            console.say(rare.summary())
+            failures = len(rare.splitting.failures)
+            written = min(failures, self.shown)
+            console.say(f"the worst of {failures:,} failures, as trial 0, and {written - 1} others:")
+            return _write(rare, folder, "rare.json", shown=self.shown)
+
         try:
-            with console.progress("splitting", "repetition") as progress:
+            with console.keeping(write), console.progress("splitting", "repetition") as progress:
                 rare = problem.rare_failures(report=console.say, progress=progress, **options)
         except NoFailure as none:
             return _say_none(none)
-        console.say(rare.summary())
-        failures = len(rare.splitting.failures)
-        written = min(failures, self.shown)
-        console.say(f"the worst of {failures:,} failures, as trial 0, and {written - 1} others:")
-        return _write(rare, folder, "rare.json", shown=self.shown)
+        return write(rare)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +99,7 @@ class Break(FailureOptions):
     It is the failure nearest to the undisturbed trial, measured over all random numbers of a trial in standard
     deviations. Prints that distance, the first-order estimate of the failure probability, the share of each
     disturbance, and the largest values in physical units. Writes rollout.npz, with that trial, for `lqrsim render`, and
-    break.json, with settings, results and the random numbers.
+    break.json, with settings, results and the random numbers. Ctrl-C keeps the result of the rounds that are done.
 
     The result does fail; that nothing nearer fails is not proven. Exits with 1 if no failure was found.
     """
@@ -108,15 +113,19 @@ class Break(FailureOptions):
         from lqrsim.stress.multilevel_splitting import NoFailure
 
         problem, folder = self._begin("break")
+
+        def write(smallest: "SmallestFailure") -> int:
+            console.say(smallest.summary())
+            return _write(smallest, folder, "break.json")
+
         try:
-            with console.progress("searching", "round") as progress:
+            with console.keeping(write), console.progress("searching", "round") as progress:
                 smallest = problem.smallest_failure(
                     rounds=self.rounds, seed=self.seed, report=console.say, progress=progress
                 )
         except NoFailure as none:
             return _say_none(none)
-        console.say(smallest.summary())
-        return _write(smallest, folder, "break.json")
+        return write(smallest)
 
 
 def _say_none(none: Exception) -> int:
@@ -144,7 +153,7 @@ class FunnelCommand(PolicyOptions):
 
     Prints, for some knots of the plan, the largest ellipsoid about it from which runs under disturbances reach the goal
     with the wanted success rate, and the fresh trials that certify it. Writes funnel.npz, and funnel.png if the robot
-    has a position. Solves the scenario first, unless a solution is given.
+    has a position. Solves the scenario first, unless a solution is given. Ctrl-C keeps the knots that are done.
 
       lqrsim funnel quadrotor --disturbances light --rate 0.9
       lqrsim funnel differential_drive --states x y --knots 0 50 100
@@ -174,13 +183,18 @@ class FunnelCommand(PolicyOptions):
         from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
         from lqrsim.scenarios.solutions import given
         from lqrsim.simulation.disturbances import InitialStateError
-        from lqrsim.stress.funnels import funnel
+        from lqrsim.stress.funnels import FunnelOptions, funnel
         from lqrsim.stress.policies import make_policy
         from lqrsim.view.funnel_plot import plot_funnel
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
+        space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
+        knots, states = self.knots or None, self.states or None
+        options = self.rate, self.confidence, knots, states, self.failures, None, self.seed
+        FunnelOptions.of(space, steps, *options)  # before it is solved
+        scenario.target_radius(self.goal_radius, self.goal_tolerance)
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):
             if isinstance(one, InitialStateError):
@@ -189,7 +203,17 @@ class FunnelCommand(PolicyOptions):
             disturbances.append(one.scaled(self.strength))
         stored = None if self.solution is None else given(scenario, self.solution)
         solution, controller = make_policy(self.policy, scenario, self.design_disturbances, stored)
-        with console.progress("looking", "knot") as progress:
+
+        def write(found: "Funnel") -> int:
+            console.say(found.summary())
+            console.result(funnel=as_json.of_funnel(found))
+            console.wrote(save_load.save(found, folder / "funnel.npz"))
+            if space.position and set(space.position) <= set(found.chosen):
+                world, radius = scenario.scene.world, scenario.robot.radius
+                console.wrote(plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
+            return 0 if found.levels.any() else 1
+
+        with console.keeping(write), console.progress("looking", "knot") as progress:
             found = funnel(
                 scenario.plant(),
                 solution,
@@ -197,18 +221,11 @@ class FunnelCommand(PolicyOptions):
                 controller=controller,
                 rate=self.rate,
                 confidence=self.confidence,
-                knots=self.knots or None,
-                states=self.states or None,
+                knots=knots,
+                states=states,
                 failures=self.failures,
                 seed=self.seed,
                 progress=progress,
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
-        console.say(found.summary())
-        console.result(funnel=as_json.of_funnel(found))
-        console.wrote(save_load.save(found, folder / "funnel.npz"))
-        position = scenario.problem.dynamics.state_coordinates.position
-        if position and set(position) <= set(found.chosen):
-            world, radius = scenario.scene.world, scenario.robot.radius
-            console.wrote(plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
-        return 0 if found.levels.any() else 1
+        return write(found)

@@ -48,10 +48,10 @@ class Render:
     """More cameras, in panes beside the first. top and side are calibrated, and show a mark on the robot."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Title of each run. By default the robot and the scene."""
-    overlays: tuple[Overlay, ...] = OVERLAYS
-    """Drawn over the scene. tube: the predicted tube under the run's disturbances, 2 sigma, if there is one. cost_tube:
-    where the total cost is near its minimum; it needs --solution. funnel: the funnel about the plan; it needs --funnel.
-    These two are not drawn by default."""
+    overlays: Annotated[tuple[Overlay, ...], arg(metavar="NAME ...")] = OVERLAYS
+    """Drawn over the scene: plan, ghost, trace, forces, measured, caption. tube: the predicted tube under the run's
+    disturbances, 2 sigma, if there is one. cost_tube: where the total cost is near its minimum; it needs --solution.
+    funnel: the funnel about the plan; it needs --funnel."""
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
     """Solution of the runs, one for all or one each, for cost_tube."""
     funnel: Annotated[tuple[Path, ...], optional("FUNNEL ...")] = ()

@@ -25,6 +25,7 @@ from lqrsim.errors import (
     check_number,
 )
 from lqrsim.problem.problem import Problem
+from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.solvers.smoother import smooth
@@ -85,7 +86,7 @@ def smooth_chance_constrained(
     chance: float = 1e-3,
     controller: MakeController | None = None,
     rounds: int = 8,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Callable[[int, int, str], object] | None = None,
 ) -> SafePlan:
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
@@ -100,32 +101,38 @@ def smooth_chance_constrained(
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
       rounds: plans to solve for, at most.
-      progress: called with the rounds that are done, and all of them.
+      progress: called with the rounds that are done, all of them, and what the last one found as text.
 
     Returns:
       The SafePlan.
 
     Raises:
       InputError: there are no obstacles, an option is out of range, or something does not fit the system.
+      KeyboardInterrupt: Ctrl-C; its `found` is the SafePlan of the rounds that are done, None if there are none.
     """
     check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
     check_kind("uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
     chance = check_number("chance", chance, above=0.0, below=1.0)
     check_count("rounds", rounds)
     check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
-    check_function("progress", progress, "a function of how many rounds are done, of how many", arguments=2)
+    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.worlds:
         raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
     search = _Search(problem, uncertainty, chance, controller, surroundings)
-    search.solve(None)
-    for done in range(rounds):
+    with keeping(lambda _: search.result() if search.plans else None):
         if progress is not None:
-            progress(done, rounds)
-        deviations = search.next_deviations()
-        if deviations is None:
-            break
-        search.solve(deviations)
+            progress(0, rounds, "")
+        search.solve(None)
+        for done in range(rounds):
+            if progress is not None:
+                progress(done, rounds, search.last())
+            deviations = search.next_deviations()
+            if deviations is None:
+                break
+            search.solve(deviations)
+    if progress is not None:
+        progress(rounds, rounds, search.last())
     return search.result()
 
 
@@ -244,6 +251,11 @@ class _Search:
         if safe:
             return min(safe, key=lambda plan: plan.solution.cost)
         return min(self.plans, key=lambda plan: (not plan.solution.success, plan.tube.collision_chance))
+
+    def last(self) -> str:
+        """The last plan, for the progress."""
+        low, high, cost, chance = self.lines[-1]
+        return f"chance {chance:.2g} with margins of {low:.3g} to {high:.3g} m, cost {cost:.5g}"
 
     def result(self) -> SafePlan:
         return replace(self._best(), rounds=tuple(self.lines))

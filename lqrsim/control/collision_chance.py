@@ -173,9 +173,9 @@ def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, floa
 
 def both_below(first: Array, second: Array, correlation: Array) -> Array:
     """P(a < first, b < second) of standard normal numbers with that correlation, elementwise, by Owen's T (1956)."""
-    # T needs ratios to both numbers, and to the spread of one given the other: zeros count as tiny. No chance tells 40
-    # from infinity.
-    a, b = (np.where(one == 0, 1e-200, np.clip(one, -40.0, 40.0)) for one in (first, second))
+    # T needs ratios to both numbers, and to the spread of one given the other: what is tiny counts as 1e-200. No chance
+    # tells 40 from infinity.
+    a, b = (np.where(np.abs(one) < 1e-200, 1e-200, np.clip(one, -40.0, 40.0)) for one in (first, second))
     spread = np.maximum(np.sqrt((1 - correlation) * (1 + correlation)), 1e-100)
     with np.errstate(over="ignore"):
         beyond = owens_t(a, (b - correlation * a) / (a * spread)) + owens_t(b, (a - correlation * b) / (b * spread))

@@ -3,6 +3,7 @@
 The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
 law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: for u normal with
 mean mu and std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
+Of commands that get lost it has the exact moments, those of a mixture; their distribution is not Gaussian.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.plan_model import PlanModel, Step
 from lqrsim.errors import Array
 
 
@@ -69,27 +70,38 @@ class LinearLoop:
             answer = (law @ mean[..., t, :, None])[..., 0]
             slope, level, left = limited(planned + self.offset[..., t, :] + answer, std[..., t, :], self.low, self.high)
             saturation[..., t, :] = 1 - slope
-            F = model.F[t]
-            free, onto = self._without_control(t, seen)
-            moved = free @ P + onto @ (slope[..., None] * response)
-            to_noise = onto @ (slope[..., None] * gain)
-            if estimates:
-                to_noise[..., size:, :] += F
-            ahead = moved @ free.T + moved @ np.swapaxes(slope[..., None] * law, -1, -2) @ onto.T
-            ahead += to_noise @ noise @ np.swapaxes(to_noise, -1, -2) + (onto * left[..., None, :]) @ onto.T
-            ahead[..., :size, :size] += model.process_noise[t]
-            across[..., t, :, :] = moved[..., :n, :n]
-            covariance[..., t + 1, :, :] = 0.5 * (ahead + np.swapaxes(ahead, -1, -2))
-            drift = np.tile(model.c[t], width // size)
-            mean[..., t + 1, :] = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
+            ways = []
+            for step in model.steps_of_commands:
+                free, onto, drift = self._without_control(step, t, seen)
+                moved = free @ P + onto @ (slope[..., None] * response)
+                to_noise = onto @ (slope[..., None] * gain)
+                if estimates:
+                    to_noise[..., size:, :] += model.F[t]
+                ahead = moved @ free.T + moved @ np.swapaxes(slope[..., None] * law, -1, -2) @ onto.T
+                ahead += to_noise @ noise @ np.swapaxes(to_noise, -1, -2) + (onto * left[..., None, :]) @ onto.T
+                means = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
+                ways.append((step.share, means, ahead, moved[..., :n, :n]))
+            mean[..., t + 1, :] = sum(share * means for share, means, _, _ in ways)
+            across[..., t, :, :] = sum(share * moved for share, _, _, moved in ways)
+            total = np.zeros_like(P)
+            for share, means, ahead, _ in ways:
+                apart = means - mean[..., t + 1, :]
+                total += share * (ahead + apart[..., :, None] * apart[..., None, :])
+            total[..., :size, :size] += model.process_noise[t]
+            covariance[..., t + 1, :, :] = 0.5 * (total + np.swapaxes(total, -1, -2))
         return LoopMoments(mean, covariance, across, std, saturation)
 
-    def _without_control(self, t: int, seen: Array) -> tuple[Array, Array]:
-        """Transition of X without control deviations, and their input matrix, (X, X) and (X, m)."""
-        F, G = self.model.F[t], self.model.G[t]
+    def _without_control(self, step: Step, t: int, seen: Array) -> tuple[Array, Array, Array]:
+        """Transition of X without control deviations, their input matrix and the drift: (X, X), (X, m) and (X,).
+
+        The estimates' are those of the mean over commands, for the filter is not told which are lost.
+        """
+        F, G, c = step.F[t], step.G[t], step.c[t]
         if self.filter_gain is None:
-            return F, G
-        return np.vstack([F @ np.eye(len(F), 2 * len(F)), F @ seen]), np.vstack([G, G])
+            return F, G, c
+        own = self.model.F[t] @ seen
+        free = np.vstack([F @ np.eye(len(F), 2 * len(F)), own])
+        return free, np.vstack([G, self.model.G[t]]), np.concatenate([c, self.model.c[t]])
 
     def _seen(self, t: int) -> tuple[Array, Array]:
         """Input of the law as a matrix times X, and the covariance of its noise."""

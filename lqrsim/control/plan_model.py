@@ -6,6 +6,8 @@ the states of the unknowns (D). With u the deviation of the command,
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 
 c is the effect of the lag on a plan made without it: nominally the actuators are where the planned controls take them.
+If commands get lost, F, G and c are means: those of a command that arrives, and of one that is lost, where the
+actuators stay as they are.
 """
 
 from collections.abc import Callable, Sequence
@@ -135,6 +137,19 @@ class Lag:
         return cls(float(np.exp(-step)), float(-np.expm1(-step) / step))
 
 
+class Step(NamedTuple):
+    """The linear model of all steps, for commands of one kind.
+
+    Attributes:
+      share: of the commands. F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
+    """
+
+    share: float
+    F: Array
+    G: Array
+    c: Array
+
+
 @dataclass(frozen=True)
 class PlanModel:
     """A plan and its uncertainty, linearised.
@@ -178,11 +193,13 @@ class PlanModel:
     @cached_property
     def lagging(self) -> int:
         """Number of entries of z for the actuators."""
-        return self.m if self.uncertainty.lag > 0 else 0
+        return self.m if self.uncertainty.lag > 0 or self.uncertainty.command_loss > 0 else 0
 
     @cached_property
     def lag(self) -> Lag:
-        return Lag.of(self.uncertainty.lag, self.plan.dt)
+        """In the mean over commands that arrive and that get lost."""
+        lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
+        return Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
 
     @cached_property
     def remembered(self) -> tuple[Unknown, ...]:
@@ -313,7 +330,27 @@ class PlanModel:
     @cached_property
     def F(self) -> Array:
         """State matrices F_t, (T, Z, Z)."""
-        n, a, lag = self.n, self.lagging, self.lag
+        return self._F(self.lag)
+
+    @cached_property
+    def G(self) -> Array:
+        """Input matrices G_t, (T, Z, m)."""
+        return self._G(self.lag)
+
+    @cached_property
+    def c(self) -> Array:
+        """Drift c_t, (T, Z)."""
+        return self._c(self.lag)
+
+    @cached_property
+    def steps_of_commands(self) -> list[Step]:
+        """The model for a command that arrives; and for one that is lost, if any are."""
+        lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
+        kinds = [(1 - lost, arrived), (lost, Lag(1.0, 1.0))] if lost else [(1.0, arrived)]
+        return [Step(share, self._F(lag), self._G(lag), self._c(lag)) for share, lag in kinds]
+
+    def _F(self, lag: Lag) -> Array:
+        n, a = self.n, self.lagging
         F = np.zeros((self.plan.steps, self.size, self.size))
         F[:, :n, :n] = self.jacobian[:, :, :n]
         F[:, :n, n : n + a] = lag.mean * self.jacobian[:, :, n : n + a]
@@ -322,10 +359,8 @@ class PlanModel:
         F[:, n + a :, n + a :] = self.transition
         return F
 
-    @cached_property
-    def G(self) -> Array:
-        """Input matrices G_t, (T, Z, m)."""
-        n, a, lag = self.n, self.lagging, self.lag
+    def _G(self, lag: Lag) -> Array:
+        n, a = self.n, self.lagging
         G = np.zeros((self.plan.steps, self.size, self.m))
         G[:, :n] = (1 - lag.mean) * self.jacobian[:, :, n:]
         G[:, n : n + a] = (1 - lag.left) * np.eye(self.m)[:a]
@@ -341,14 +376,13 @@ class PlanModel:
             reached[t + 1] = plan.controls[t] + self.lag.left * (reached[t] - plan.controls[t])
         return reached
 
-    @cached_property
-    def c(self) -> Array:
-        """Drift c_t, (T, Z)."""
+    def _c(self, lag: Lag) -> Array:
         n, a = self.n, self.lagging
         c = np.zeros((self.plan.steps, self.size))
         if a:
-            behind = self.lag.mean * (self.reached[:-1] - self.plan.controls)
-            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], behind)
+            behind = self.reached[:-1] - self.plan.controls
+            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
+            c[:, n : n + a] = (lag.left - self.lag.left) * behind
         return c
 
     @cached_property
@@ -372,7 +406,9 @@ class PlanModel:
         """Square root of the covariance of w, (T, Z, Z), lower triangular."""
         n, first, steps = self.n, self.n + self.lagging, self.plan.steps
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
-        commanded = self.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
+        commanded = self.steps_of_commands[0].G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
+        if self.uncertainty.lag == 0:
+            commanded[:, n:first] = 0.0  # what a lost command leaves in force has new noise
         white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
         pushed = np.zeros((steps, self.size, len(white)))
         if white:

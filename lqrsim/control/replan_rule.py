@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.problem.problem import Problem
+from lqrsim.results.fields import LINE, Line, check_fields
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import HORIZONS
@@ -83,15 +85,16 @@ class ReplanRecord:
 
     step: int
     trial: int
-    status: str
+    status: Line
     iterations: int
     seconds: float
     cost: float
     before: float
     used: bool
-    reason: str
+    reason: Annotated[str, 10 * LINE]
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("step", "trial", "iterations"):
             check_count(f"ReplanRecord: {name}", getattr(self, name), at_least=0)
 

@@ -201,7 +201,8 @@ def track(
       effort: the most that may be added to each control to return to the plan; by default a quarter of its range.
       at_end: the tolerances of the position at the plan's end, relative to before; of all states if there is no
         position.
-      uncertainty: the uncertainty in a run, as from `uncertainty_of`; only for choosing tolerances.
+      uncertainty: the uncertainty in a run, as from `uncertainty_of`, for choosing tolerances, and for what a lost
+        command leaves in force.
       risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise along the plan;
         above 0 it penalises large deviations more. Tolerances must then be given.
 
@@ -217,7 +218,10 @@ def track(
         missing = "a problem without noise" if problem.noise is None else "no tolerances"
         raise InputError(f"track: risk: got {risk:g} and {missing}, want noise=Noise(...) and tolerate=, or 0")
     plan, dynamics = solution.trajectory, problem.dynamics
-    model = PlanModel.of(dynamics, plan, Uncertainty())
+    if uncertainty is not None:
+        check_kind("track: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+    command_loss = 0.0 if uncertainty is None else uncertainty.command_loss
+    model = PlanModel.of(dynamics, plan, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
     if tolerate is not None:
         weights = Weights.of(tolerate, efforts, dynamics, at_end=at_end)
@@ -227,14 +231,14 @@ def track(
             " uncertainty=, from which it is chosen"
         )
     else:
-        check_kind("track: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
         truth = PlanModel.of(dynamics, plan, uncertainty)
         space = solution.policy.control_coordinates
         limits = np.array(space.low), np.array(space.high)
         surroundings = Surroundings.of(problem, uncertainty.obstacles)
 
         def predicted(tried: Weights) -> list[Prediction]:
-            moments, n = LinearLoop(truth, *tracking_laws(model, tried), None, *limits).moments(), model.n
+            gain, offset = tracking_laws(model, tried)
+            moments, n = LinearLoop(truth, gain[..., : model.n], offset, None, *limits).moments(), model.n
             saturation = moments.saturation.mean(axis=(1, 2)).tolist()
             return [
                 prediction_of(
@@ -246,6 +250,7 @@ def track(
 
         weights = choose_tolerances(model, predicted, efforts, at_end).weights
     gain, offset = _laws(problem, solution, model, weights, risk)
+    gain = gain[..., : model.n]  # what a lost command leaves in force is nothing to a command that arrives
     return AffinePolicy(
         gain=gain,
         offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),

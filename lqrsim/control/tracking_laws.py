@@ -7,6 +7,9 @@ It minimises, with z = (e, a, d) as in `plan_model.py` and u the deviation of th
 M_t d is the control that cancels the unknowns' effect on the next state as far as controls can. It costs nothing;
 otherwise a steady disturbance would leave a steady error. For the same reason a law assumes that the current
 disturbance continues: a law that expects a wind to abate yields to one that does not.
+
+If commands get lost, it is the expected sum, over which of them do (Schenato 2009: LQG with a hold). What a lost
+command leaves in force may be large, which makes the law gentle; the effort of a lost command does not count.
 """
 
 from dataclasses import dataclass
@@ -102,8 +105,8 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z)."""
     n, m, steps = model.n, model.m, model.plan.steps
     own = n + model.lagging  # states that controls can move
-    F, G, c = model.F[:, :own, :own], model.G[:, :own], model.c[:, :own]
-    E = model.F[:, :own, own:]
+    (arrives, slopes, G, c), *lost = model.steps_of_commands
+    F, G, c, E = slopes[:, :own, :own], G[:, :own], c[:, :own], slopes[:, :own, own:]
     many = weights.state.shape[:-1]
     Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
     Q[..., range(n), range(n)] = weights.state
@@ -122,7 +125,11 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
         right[..., own:-1] += undo[t]
         law = -np.linalg.solve(R + G[t].T @ S @ G[t], right)
         gain[..., t, :, :], offset[..., t, :] = law[..., :-1], law[..., -1]
-        left = F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law
+        left = arrives * (F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law)
+        for share, kept, _, drift in lost:
+            slope = S @ np.concatenate([kept[t, :own], drift[t, :own, None]], axis=1)
+            slope[..., own:] += ahead
+            left += share * (kept[t, :own, :own].T @ slope)
         S, ahead = Q + left[..., :own], left[..., own:]
         S = 0.5 * (S + np.swapaxes(S, -1, -2))
     return gain, offset

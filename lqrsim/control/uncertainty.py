@@ -115,6 +115,7 @@ class Uncertainty:
       delay: control periods by which commands come late.
       latency: delay of measurements.
       loss: share of the measurements that get lost.
+      command_loss: share of the commands that get lost; the actuators keep to the last one that arrived.
       obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
       left_out: disturbances that no linear model can represent, for the record.
 
@@ -131,17 +132,26 @@ class Uncertainty:
     delay: int = 0
     latency: int = 0
     loss: float = 0.0
+    command_loss: float = 0.0
     obstacles: float = 0.0
     left_out: Sequence[str] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         unknowns = check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown")
         object.__setattr__(self, "unknowns", unknowns)
+        for name in SUMMED:
+            numbers = getattr(self, name)
+            for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
+                check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
+            if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
+                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want a number, or one for each")
         object.__setattr__(self, "lag", check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
             count = check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)
             object.__setattr__(self, name, count)
-        object.__setattr__(self, "loss", check_number("Uncertainty: loss", self.loss, at_least=0.0, at_most=1.0))
+        for name in ("loss", "command_loss"):
+            share = check_number(f"Uncertainty: {name}", getattr(self, name), at_least=0.0, at_most=1.0)
+            object.__setattr__(self, name, share)
         object.__setattr__(self, "obstacles", check_number("Uncertainty: obstacles", self.obstacles, at_least=0.0))
         left_out = check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts")
         object.__setattr__(self, "left_out", left_out)
@@ -313,6 +323,7 @@ def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
             delay=total.delay + one.delay,
             latency=total.latency + one.latency,
             loss=1 - (1 - total.loss) * (1 - one.loss),
+            command_loss=1 - (1 - total.command_loss) * (1 - one.command_loss),
             obstacles=float(np.hypot(total.obstacles, one.obstacles)),
             left_out=(*total.left_out, *one.left_out),
         )

@@ -28,7 +28,7 @@ from lqrsim.kernels.model_functions import (
 )
 from lqrsim.kernels.records import LinearStep, QuadraticStage
 
-TINY = 1e-9  # least curvature that a control block must have, relative to the control's own
+TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
 STEP = 6e-6  # of differences of gradients, relative to a number and at least to 1: the cube root of the precision
 
 

@@ -7,7 +7,7 @@ import abc
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,7 @@ from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
 STEPS = ("all", "final")  # at which a constraint can act
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
@@ -216,29 +217,33 @@ class SymbolicConstraint(Constraint):
 class GoalState(Constraint):
     """The final state equals a goal: `x_T = goal`. A final cost only draws it there.
 
-        ls.GoalState([1.0, 0.0], states=("x", "velocity"))
+        ls.GoalState(x=1.0, velocity=0.0)
 
     Args:
-      goal: (n,) the state, or with `states` one number for each, in the states' units. Angles count whole turns, as for
-        a QuadraticCost.
-      states: names of the states that it is for; all by default.
+      goal: (n,) the state, in the states' units; or a dictionary of name: number, for some of the states. Angles count
+        whole turns, as for a QuadraticCost.
+      **named: name of a state -> number, which says the same as a dictionary.
+
+    Raises:
+      InputError: no goal, a number that is not finite, or a state that is named twice.
     """
 
-    def __init__(self, goal: npt.ArrayLike, *, states: Sequence[str] | None = None) -> None:
-        self.goal = check_array("GoalState: goal", goal, (None,))
-        self.states = None if states is None else _names("GoalState: states", states)
-        if self.states is not None and len(self.states) != len(self.goal):
-            raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
+    def __init__(self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, **named: float) -> None:
+        self.goal: Array | dict[str, float]
+        if goal is None or named or isinstance(goal, Mapping):
+            self.goal = _by_name("GoalState", goal, named, "a number", check_number)
+        else:
+            self.goal = check_array("GoalState: goal", goal, (None,))
 
     def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
-        """The required value or bounds of each state, by its index. Raises InputError if it does not fit."""
-        names = dynamics.state_coordinates.names
-        wanted = names if self.states is None else self.states
-        if len(self.goal) != len(wanted):
+        """The goal of each state that has one, by its index. Raises InputError if it does not fit."""
+        names, goal = dynamics.state_coordinates.names, self.goal
+        if isinstance(goal, dict):
+            return {names.index(check_name("GoalState: states", name, names)): goal[name] for name in goal}
+        if len(goal) != len(names):
             each = f"one for each of {', '.join(names)}"
-            raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(names)}, {each}")
-        indices = [names.index(check_name("GoalState: states", name, names)) for name in wanted]
-        return dict(zip(indices, self.goal.tolist(), strict=True))
+            raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
+        return dict(enumerate(goal.tolist()))
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
@@ -253,23 +258,22 @@ class GoalState(Constraint):
 class StateBounds(Constraint):
     """Bounds on states, `low <= x_t <= high`, at each step; only at a start that is given exactly they do not act.
 
-        ls.StateBounds(low={"height": 0.1}, high={"height": 2.0, "velocity": 1.5})
+        ls.StateBounds(height=(0.1, 2.0), velocity=(-np.inf, 1.5))
 
     Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
     Args:
-      low: name of a state -> its lower bound, in its unit.
-      high: name of a state -> its upper bound, in its unit.
+      bounds: a dictionary of name of a state: (low, high), in its unit; an infinite one is none.
+      **named: name of a state -> (low, high), which says the same as a dictionary.
+
+    Raises:
+      InputError: no bounds, none that is finite for a state, low not below high, or a state that is named twice.
     """
 
-    def __init__(self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None) -> None:
-        self.low, self.high = (_bounds(f"StateBounds: {name}", side) for name, side in (("low", low), ("high", high)))
-        if not self.low and not self.high:
-            raise InputError("StateBounds: got no bounds, want a dictionary of name: number for low, high or both")
-        for name in self.low.keys() & self.high.keys():
-            if not self.low[name] < self.high[name]:
-                span = f"{self.low[name]:g} to {self.high[name]:g}"
-                raise InputError(f"StateBounds: got {span} for {excerpt(name)}, want low below high")
+    def __init__(
+        self, bounds: Mapping[str, tuple[float, float]] | None = None, /, **named: tuple[float, float]
+    ) -> None:
+        self.bounds = _by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_to_goal(dynamics, {}, 0)
@@ -282,9 +286,11 @@ class StateBounds(Constraint):
         """
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         data, described = [], []
-        for sign, side, word in ((1.0, self.low, "at least"), (-1.0, self.high, "at most")):
-            for name, number in side.items():
+        for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
+            for name, number in ((name, bound[side]) for name, bound in self.bounds.items()):
                 i = names.index(check_name("StateBounds: states", name, names))
+                if not np.isfinite(number):
+                    continue
                 wanted = f"{name} of {word} {_quantity(number, units[i])}"
                 if sign * (goals.get(i, number) - number) < 0:
                     goal = _quantity(goals[i], units[i])
@@ -343,23 +349,27 @@ def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: s
     return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)
 
 
-def _names(field: str, names: Sequence[str]) -> tuple[str, ...]:
-    """The names of states, each once."""
-    if isinstance(names, str):
-        raise InputError(f"{field}: got {excerpt(names)}, want a tuple of names: ({excerpt(names)},)")
-    listed = check_items(field, names, str, "a tuple of names of states, at least one")
-    if not listed or len(set(listed)) < len(listed):
-        raise InputError(f"{field}: got {excerpt(listed)}, want names of states, at least one, and each once")
-    return listed
+def _by_name(
+    who: str, given: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
+) -> dict[str, _Value]:
+    """What is given for names of states, in a dictionary or by keyword. Raises InputError."""
+    want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
+    check_kind(who, given, (Mapping, type(None)), want)
+    stated = dict(given or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
+    check_items(who, tuple(stated), str, want)
+    for name in stated.keys() & named.keys():
+        raise InputError(f"{who}: got {excerpt(name)} twice, want each state once")
+    if not stated and not named:
+        raise InputError(f"{who}: got nothing, want {want}")
+    return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
 
 
-def _bounds(field: str, side: Mapping[str, float] | None) -> dict[str, float]:
-    if side is None:
-        return {}
-    wanted = "a dictionary of name: number"
-    check_kind(field, side, Mapping, wanted)
-    check_items(field, tuple(side), str, wanted)
-    return {name: check_number(f"{field}: {excerpt(name)}", number) for name, number in side.items()}
+def _bound(field: str, given: object) -> tuple[float, float]:
+    """(low, high), one of them finite."""
+    low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
+    if not low < high or not np.isfinite([low, high]).any():
+        raise InputError(f"{field}: got {low:g} to {high:g}, want low below high, and one of them finite")
+    return low, high
 
 
 def _quantity(number: float, unit: str) -> str:

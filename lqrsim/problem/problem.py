@@ -20,7 +20,7 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
-from lqrsim.problem.collision_geoms import CollisionGeoms
+from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_spheres import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
@@ -28,7 +28,6 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
-from lqrsim.scenes.world import World
 
 TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
@@ -383,43 +382,55 @@ class Problem:
 
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot is in an obstacle where it starts."""
-        if self.start is None:
-            return
+        found = None if self.start is None else self._inside(self.obstacle_costs, self.start, self.begin)
+        if found is not None:
+            where, advice = found
+            raise InputError(f"initial: got a start {where}, want it clear{advice}")
+
+    @property
+    def goal_inside(self) -> str:
+        """Where the goal is inside an obstacle of a cost or a Clearance, in words; empty where it is clear, or not a
+        place.
+        """
+        goal, clearances = self.weighed_goal, [one for one in self.constraints if isinstance(one, Clearance)]
+        end = self.begin + self.steps * self.dt
+        found = None if goal is None else self._inside([*self.obstacle_costs, *clearances], goal, end)
+        return "" if found is None else found[0]
+
+    def _inside(
+        self, outlines: Sequence[ObstacleCost | Clearance], state: Array, time: float
+    ) -> tuple[str, str] | None:
+        """Where a state, which may have NaNs, is inside an obstacle, and what to do about a start there."""
         space = self.dynamics.state_coordinates
-        for cost in self.obstacle_costs:
-            if cost.geoms is not None:
-                self._check_start_of(cost.geoms, cost.world)
+        for outline in outlines:
+            if outline.geoms is not None:
+                if not len(outline.world) or np.isnan(state).any():
+                    continue
+                distances = outline.geoms.clearances(self.dynamics, outline.world, state)
+                if distances.min() < -TOUCHING:
+                    where = f"{-distances.min():.3g} m inside obstacle {outline.world.names[int(distances.argmin())]!r}"
+                    return where, "; or, if that geom is no obstacle, obstacles= of the robot without it"
                 continue
-            if cost.balls is None:
-                world = cost.world.moved(self.begin).seen_by(space.plane, space.offset)
-                places = self.start[None, list(space.position)]
-                parts = [("a start", "the robot's radius", cost.radius)]
+            if outline.balls is None:
+                world = outline.world.moved(time).seen_by(space.plane, space.offset)
+                places = state[None, list(space.position)]
+                parts = [("", "the robot's radius", outline.radius)]
             else:
-                bound = cost.balls.bind(self.dynamics)
-                world = bound.world_seen(cost.world.moved(self.begin), space)
-                places = evaluate(bound, len(cost.balls), self.start)
-                balls = zip(cost.balls.names, cost.balls.radii, strict=True)
-                parts = [(f"a start with {name!r}", "its radius", radius) for name, radius in balls]
+                bound = outline.balls.bind(self.dynamics)
+                world = bound.world_seen(outline.world.moved(time), space)
+                places = evaluate(bound, len(outline.balls), state)
+                balls = zip(outline.balls.names, outline.balls.radii, strict=True)
+                parts = [(f"with {name!r} ", "its radius", radius) for name, radius in balls]
             for place, (what, whose, radius) in zip(places, parts if len(world) else (), strict=False):
+                if np.isnan(place).any():
+                    continue
                 distances = world.distances(place) - radius
                 if distances.min() < 0:
-                    where = ", ".join(f"{value:g}" for value in place)
+                    at = ", ".join(f"{value:g}" for value in place)
                     name = world.names[int(distances.argmin())]
-                    raise InputError(
-                        f"initial: got {what} at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
-                        f" want it clear of obstacles by {whose} of {radius:g} m"
-                    )
-
-    def _check_start_of(self, geoms: CollisionGeoms, world: World) -> None:
-        """Raises InputError if a geom is in an obstacle where the robot starts."""
-        if len(world) and self.start is not None:
-            distances = geoms.clearances(self.dynamics, world, self.start)
-            if distances.min() < -TOUCHING:
-                name = world.names[int(distances.argmin())]
-                raise InputError(
-                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or,"
-                    " if that geom is no obstacle, obstacles= of the robot without it"
-                )
+                    where = f"{what}at ({at}) m, {-distances.min():.3g} m inside obstacle {name!r}"
+                    return where, f" of obstacles by {whose} of {radius:g} m"
+        return None
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

@@ -33,7 +33,7 @@ def of_solution(solution: "Solution") -> str:
         away = float(solution.target.distance(plan.states[-1]))
         rows.append((f"from the {solution.target.name}", f"{_number(away)} {solution.target.unit}"))
     rows.append(("horizon", f"{plan.steps} steps of {_number(plan.dt)} s"))
-    remarks = [text for text in (solution.status.meaning, solution.detail, solution.status.remedy) if text]
+    remarks = [text for text in (solution.status.meaning, solution.detail, solution.remedy) if text]
     none = np.empty((0, *plan.states.shape))
     picture = _drawing(solution.policy.state_coordinates, plan.times, plan.states, none)
     return _page(f"{solution.status.name}, {solution.solver}", remarks, rows, picture, head=False)

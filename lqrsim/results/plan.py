@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Self
 
+import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_shape
@@ -47,10 +48,16 @@ class Plan:
         if self.cost_to_go is not None:
             check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
         _ = self.target  # which refuses anything but a goal
-        if self.status.success and not self.trajectory.finite:
-            raise InputError(
-                f"{who}: trajectory: got NaN or infinity in a plan that is {self.status.name}, want numbers"
-            )
+        self._check_finite("trajectory", "policy", "cost_to_go")
+
+    def _check_finite(self, *names: str) -> None:
+        """Raises InputError if a record or an array of a plan that converged has NaN or infinity in it."""
+        for name in names if self.status.success else ():
+            value = getattr(self, name)
+            arrays = [value] if isinstance(value, np.ndarray) else vars(value).values() if value is not None else ()
+            if not all(np.isfinite(array).all() for array in arrays if isinstance(array, np.ndarray)):
+                got = f"got NaN or infinity in a plan that is {self.status.name}"
+                raise InputError(f"{type(self).__name__}: {name}: {got}, want numbers")
 
     @property
     def success(self) -> bool:

@@ -30,7 +30,7 @@ _Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, 
 
 # The name in the file, and the version.
 FORMATS: dict[type, tuple[str, int]] = {
-    Solution: ("solution", 6),
+    Solution: ("solution", 7),
     Rollout: ("rollout", 5),
     AffinePolicy: ("policy", 2),
     OutputFeedbackPolicy: ("output feedback policy", 1),

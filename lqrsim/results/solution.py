@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_shape
 from lqrsim.results import notebook
-from lqrsim.results.fields import Line
+from lqrsim.results.fields import LINE, Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
@@ -37,6 +37,7 @@ class Solution(Plan):
       options: its settings; with noise, a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
+      remedy: what to try, in this case; empty for a success.
       scenario: the scenario that the command line solved; empty where a program called the solver.
       candidates: the starts that were tried, if there were several.
     """
@@ -51,6 +52,7 @@ class Solution(Plan):
     options: Mapping[str, object]
     problem_digest: Line
     versions: Mapping[str, Line]
+    remedy: Annotated[str, 10 * LINE] = ""
     scenario: Line = ""
     candidates: tuple[Candidate, ...] = ()
 
@@ -78,6 +80,7 @@ class Solution(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check_finite("inverse_policy", "cost_to_come", "clearance")
         come = self.cost_to_come
         if come is not None:
             mean = come.gradient if isinstance(come, Quadratic) else come.mean
@@ -139,10 +142,12 @@ class Solution(Plan):
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
-        if self.status.remedy:
-            lines.append(f"  remedy:    {self.status.remedy}")
+        if self.remedy:
+            lines.append(f"  remedy:    {self.remedy}")
         gap = f"{self.gap:.1e}" if np.isfinite(self.gap) else "none (no cost-to-come)"
         lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
+        if self.violation > 1e-6:  # the tolerance by default
+            lines[-1] += f"   violation: {self.violation:.1e}"
         if "noise" in self.options:
             meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
             if self.cost_to_go is None:
@@ -166,7 +171,8 @@ class Solution(Plan):
         target, radius = self.target, self.goal_radius
         if radius is None and not target.places:
             radius = target.radius(None, None, None)
-        return target.of_plan(radius)
+        lines = target.of_plan(radius)
+        return lines if self.success else lines[:1]  # what to do about a failure is its remedy
 
     def _beyond_limits(self) -> list[str]:
         """A line for each control that is planned beyond its limits."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from lqrsim.errors import Array, check_number
+from lqrsim.errors import Array, InputError, check_number, vectors_of
 
 if TYPE_CHECKING:
     from lqrsim.problem.collision_geoms import CollisionGeoms
@@ -105,3 +105,11 @@ class Robot(abc.ABC):
             least = {"above": 0.0} if field in above_zero else {"at_least": 0.0}
             number = check_number(f"{type(self).__name__}: {field}", getattr(self, field), **least)
             object.__setattr__(self, field, number)  # robots are frozen
+
+
+def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int) -> tuple[Array, Array]:
+    """Positions (..., nq) and velocities (..., nv) of MuJoCo, as arrays. Raises InputError unless they fit."""
+    qpos, qvel = vectors_of("qpos", qpos, nq), vectors_of("qvel", qvel, nv)
+    if qpos.shape[:-1] != qvel.shape[:-1]:
+        raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with {nv} numbers")
+    return qpos, qvel

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, vectors_of
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, configuration_of
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,7 @@ class DifferentialDrive(Robot):
         return _dynamics(self)
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        qpos = vectors_of("qpos", qpos, 9)
-        vectors_of("qvel", qvel, 8)
+        qpos, _ = configuration_of(qpos, qvel, 9, 8)
         qw, qx, qy, qz = np.moveaxis(qpos[..., 3:7], -1, 0)
         heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
         state = np.concatenate([qpos[..., :2], heading[..., None]], axis=-1)

@@ -13,6 +13,7 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_flag,
+    check_items,
     check_name,
     check_number,
     check_weights,
@@ -23,7 +24,7 @@ from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_geoms import MjcfGeoms
@@ -172,7 +173,8 @@ class MjcfRobot(Robot):
             if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
                 return (), ""
         else:
-            found = [names.index(check_name(f"{who}: position", name, names)) for name in asked]
+            listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
+            found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
@@ -369,10 +371,7 @@ class MjcfRobot(Robot):
           InputError: no joint has any.
         """
         names = self.dynamics.state_coordinates.names
-        limited = {names[one.dof]: one.limits for one in self._joints if one.limits is not None}
-        return StateBounds(
-            {name: low for name, (low, _) in limited.items()}, {name: high for name, (_, high) in limited.items()}
-        )
+        return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
@@ -407,7 +406,7 @@ class MjcfRobot(Robot):
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
-        qpos, qvel = vectors_of("qpos", qpos, model.nq), vectors_of("qvel", qvel, model.nv)
+        qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
         parts = []
         for one in self._joints:
             own = qpos[..., one.qpos : one.qpos + _WIDTH[one.kind][0]]

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.errors import Array, InputError, vectors_of
+from lqrsim.errors import Array, vectors_of
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.robots.base import Robot
+from lqrsim.robots.base import Robot, configuration_of
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,7 @@ class Quadrotor(Robot):
         return _dynamics(self)
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        qpos, qvel = vectors_of("qpos", qpos, 7), vectors_of("qvel", qvel, 6)
-        if qpos.shape[:-1] != qvel.shape[:-1]:
-            raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with 6 numbers")
+        qpos, qvel = configuration_of(qpos, qvel, 7, 6)
         rotation = rotations.rotation_vector(qpos[..., 3:7])
         state = np.concatenate([qpos[..., :3], qvel[..., :3], rotation, qvel[..., 3:6]], axis=-1)
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)

@@ -80,6 +80,7 @@ class Scene:
         check_kind("Scene: xml", self.xml, str, "the MJCF as text")
         check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
         check_kind("Scene: world", self.world, World, "a World")
+        object.__setattr__(self, "geoms", check_items("Scene: geoms", self.geoms, (int, np.integer), "ids of geoms"))
         if len(self.world) != len(self.geoms):
             raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {len(self.geoms)}, one a geom")
 

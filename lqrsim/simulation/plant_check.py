@@ -7,16 +7,20 @@ from typing import Annotated, NamedTuple
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
     check_count,
+    check_kind,
     check_number,
     check_seed,
     excerpt,
 )
+from lqrsim.problem.constraints import StateBounds
+from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
@@ -107,6 +111,7 @@ def check_plant(
     robot: Robot,
     scene: Scene,
     *,
+    problem: Problem | None = None,
     period: float | None = None,
     around: npt.ArrayLike | None = None,
     spread: float = 0.3,
@@ -125,10 +130,12 @@ def check_plant(
     Args:
       robot: the robot, with its dynamics.
       scene: a scene whose MJCF has the robot.
+      problem: a problem of the robot. The random states keep its StateBounds, and the controls its limits: beyond them
+        the dynamics need not hold.
       period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
-      around: (n,) mean of the random states, zero by default.
+      around: (n,) mean of the random states; by default the problem's start, or zero.
       spread: their standard deviation, in each state's unit.
-      controls: lowest and highest random control, (m,) each; by default the dynamics' limits.
+      controls: lowest and highest random control, (m,) each; by default the limits of the problem, or the dynamics'.
       settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as those of
         wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
@@ -143,8 +150,12 @@ def check_plant(
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
-    middle = check_array("around", np.zeros(n) if around is None else around, (n,))
-    low, high = _control_range(robot, controls)
+    start = None if problem is None else _checked(problem, robot).start
+    if around is None:
+        around = np.zeros(n) if start is None else start
+    middle = check_array("around", around, (n,))
+    lowest, highest = _state_range(robot, problem, middle)
+    low, high = _control_range(robot, controls, problem)
     taken_away = [plant.model.geom(name).id for name in plant.obstacles]
     plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
     rng = np.random.default_rng(check_seed("seed", seed))
@@ -162,7 +173,7 @@ def check_plant(
     found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
-            state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
+            state, control = _drawn(rng, middle, spread, lowest, highest), rng.uniform(low, high)
             sample, touched = _sample(plant, data, state, control, round(waiting), period)
             found.append(sample)
             touching.update(sorted(touched))
@@ -178,9 +189,46 @@ class _Sample(NamedTuple):
     predicted: Array
 
 
-def _control_range(robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] | None) -> tuple[Array, Array]:
+def _checked(problem: Problem, robot: Robot) -> Problem:
+    """The problem. Raises InputError unless it is one of the robot's states and controls."""
+    check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
+    for what in ("state_coordinates", "control_coordinates"):
+        found, own = getattr(problem.dynamics, what).names, getattr(robot.dynamics, what).names
+        if found != own:
+            raise InputError(f"problem: got one of {excerpt(found)}, want one of the robot's {excerpt(own)}")
+    return problem
+
+
+def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> tuple[Array, Array]:
+    """The lowest and the highest state, (n,) each, infinite where there is no bound, with the mean between them."""
+    names = robot.dynamics.state_coordinates.names
+    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for one in () if problem is None else problem.constraints:
+        for name, (least, most) in one.bounds.items() if isinstance(one, StateBounds) else ():
+            i = names.index(name)
+            low[i], high[i] = max(low[i], least), min(high[i], most)
+    for name, least, mean, most in zip(names, low, middle, high, strict=True):
+        if not least <= mean <= most:
+            raise InputError(
+                f"around: got {mean:g} for {name}, want one within the problem's bounds, {least:g} to {most:g}"
+            )
+    return low, high
+
+
+def _drawn(rng: np.random.Generator, middle: Array, spread: float, low: Array, high: Array) -> Array:
+    """A normal state (n,) about `middle`, truncated to the bounds, coordinate by coordinate."""
+    state = middle + spread * rng.normal(size=len(middle))
+    for i in np.flatnonzero((state < low) | (state > high)):
+        ends = special.ndtr((np.array([low[i], high[i]]) - middle[i]) / spread)
+        state[i] = np.clip(middle[i] + spread * special.ndtri(rng.uniform(*ends)), low[i], high[i])  # for rounding
+    return state
+
+
+def _control_range(
+    robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] | None, problem: Problem | None
+) -> tuple[Array, Array]:
     """The lowest and the highest control, (m,) each. Raises InputError unless they are finite and in order."""
-    space = robot.dynamics.control_coordinates
+    space = robot.dynamics.control_coordinates if problem is None else problem.applied_coordinates
     m = len(space)
     if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
         raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")

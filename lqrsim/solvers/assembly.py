@@ -14,7 +14,8 @@ from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Iteration, Trajectory
+from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
+from lqrsim.solvers import compiled
 from lqrsim.solvers.engine import RunResult
 from lqrsim.versions import versions
 
@@ -53,6 +54,7 @@ def assemble(
         later,
         status=found.status,
         detail=found.detail,
+        remedy=remedy_of(problem, found, log, options),
         policy=policy(*law, states[:-1]),
         cost_to_go=_copied(found.values.get("cost_to_go")),
         cost_to_come=_copied(found.values.get("cost_to_come")),
@@ -68,6 +70,46 @@ def assemble(
         goal=problem.weighed_goal,
         goal_radius=goal_radius_of(problem),
     )
+
+
+def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
+    """What would help in this case, or where nothing is known, what helps others that end so; empty for a success."""
+    status = found.status
+    if status.success:
+        return ""
+    if inside := problem.goal_inside:
+        geoms = any(one.geoms is not None for one in _kept_clear(problem))
+        return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
+    if status is Status.TIME_LIMIT and log:
+        took = sum(one.seconds for one in log)
+        return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of one like it"
+    if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
+        fell = log[-1].improvement * abs(log[-1].cost)
+        return f"raise max_iterations: the cost still fell in the last one, by {fell:.2g} to {log[-1].cost:.6g}"
+    exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
+    limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
+    paper = options.get("finish", "newton") is None or options["stop"] == "cost"
+    if status is not Status.TIME_LIMIT and exact and paper and (problem.constraints or limited):
+        return (
+            'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
+        )
+    if status is Status.INFEASIBLE and found.against:
+        relaxed = f"relax {found.against[0].rsplit(' at ', 1)[0]}"
+        return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"
+    if status is Status.NOT_POSITIVE_DEFINITE and (flat := _flat_controls(problem, found)):
+        return f"the cost is linear or flat in {', '.join(flat)}: give control_limits, or add a ControlCost"
+    return status.remedy
+
+
+def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
+    """The controls in which the stage cost is not curved at the first step of a plan."""
+    n, names = found.states.shape[1], problem.control_coordinates.names
+    joint = n + len(names)
+    hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
+    state, control = found.states[0].copy(), found.controls[0].copy()
+    stage = compiled.arguments(problem).stage
+    compiled.costs_module(problem).cost_quadratic(state, control, 0, stage, hessian, gradient)
+    return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 
 def _copied(value: Any) -> Any:

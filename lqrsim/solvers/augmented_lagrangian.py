@@ -33,6 +33,7 @@ ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped one
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
+REFINED = 5  # damped iterations from a plan of the search before Newton's method, or the interior point, goes on
 
 
 def finish(run: SolveRun) -> RunResult:
@@ -183,9 +184,13 @@ def refine(run: SolveRun) -> RunResult:
         return run.certified(run.solve())
     if not run.problem.constraints:
         run.work.memory["merit"] = cost
-        damped = run.damped()
-        if run.second_order and damped.success and not run.budget.over:  # damped ones do not reach all digits
-            return run.certified(run.newton())
+        if not run.second_order:
+            damped = run.damped()
+        else:
+            with run.budget.limited(REFINED):
+                damped = run.damped()
+            if not run.budget.over:
+                return run.certified(run.newton())
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
     lagrangian.evaluate(*run.work.plan)

@@ -39,7 +39,7 @@ class Stop:
         if self.error is None:
             return solution
         with contextlib.suppress(AttributeError, TypeError):  # an exception that takes no attributes
-            self.error.solution = replace(solution, status=Status.INTERRUPTED)  # pyright: ignore[reportAttributeAccessIssue]
+            self.error.solution = replace(solution, status=Status.INTERRUPTED, remedy=Status.INTERRUPTED.remedy)  # pyright: ignore[reportAttributeAccessIssue]
             self.error.add_note("lqrsim: the best plan so far is this exception's `solution`")
         raise self.error
 

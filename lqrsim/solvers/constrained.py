@@ -12,6 +12,7 @@ If none of these converges, the plan that violates the constraints least is the 
 lead to plans whose violation is stationary and equally large.
 """
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -34,6 +35,7 @@ from lqrsim.solvers.restoration import Restored, restore
 FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
 STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
 AUGMENTED = 100  # iterations of the augmented Lagrangian
+DEEP = 0.03  # part of a row's typical size by which the plan of smoothing may miss it for the interior point
 OPENING, GUIDED = 6, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
 MOST, RESTORED = 300, 150  # iterations of the interior point from one plan, and of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
@@ -110,10 +112,11 @@ class Ladder:
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
-            near = LITTLE if start.violation <= self._allowed else MUCH
-            rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
+            begin = guess.trajectory or start  # a sketch of a path is not near the answer, though standing still is kept
+            kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
+            rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
         if not stay:
-            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._smoothed)]
+            rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
         if stay or not self._known.from_start:  # the runs of a search have the same start
             rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
@@ -156,7 +159,16 @@ class Ladder:
             return self._remember(found)
         bottom = _plan(found) if found.success else self._smoothed
         run.go_on(checkpoint)
-        return None if self._budget.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
+        if self._budget.stop.due or (self._guided and self._cuts(bottom)):
+            return None  # far into an obstacle, the interior point stalls: the augmented Lagrangian leaves it
+        return self._interior(bottom, LITTLE if self._guided else MUCH)
+
+    def _cuts(self, plan: Motion) -> bool:
+        """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
+        stages = self._stages
+        sizes, numbers = stages.sizes(plan).rows, stages.values(plan)
+        missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
+        return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
 
     def _from_start(self, start: RunResult) -> RunResult | None:
         self._known.from_start = True
@@ -164,24 +176,27 @@ class Ladder:
 
     def _refined(self) -> RunResult | None:
         """From the plan of damped iterations on the augmented Lagrangian."""
-        with self._budget.limited(AUGMENTED):
+        with self._budget.limited(augmented_lagrangian.REFINED):
             found = augmented_lagrangian.refine(self._run)
         return self._after_multipliers(found)
 
-    def _augmented(self) -> RunResult | None:
-        """From the plan of the augmented Lagrangian, which stays in the valley that smoothing has chosen."""
+    def _augmented(self, start: RunResult) -> RunResult | None:
+        """From the plan of the augmented Lagrangian, which stays in the valley that smoothing has chosen.
+
+        Where it costs more than the start, it has diverged.
+        """
         run = self._run
         if self._smoothed is None or run.settings.elastic is not None or not self._guided:
             return None
         with self._budget.limited(AUGMENTED):
             found = augmented_lagrangian.satisfy(run, run.result(run.ending))
-        return self._after_multipliers(found)
+        return self._after_multipliers(found, most=start.cost)
 
-    def _after_multipliers(self, found: RunResult) -> RunResult | None:
-        """The interior point from the last plan of the method of multipliers."""
+    def _after_multipliers(self, found: RunResult, *, most: float = sys.float_info.max) -> RunResult | None:
+        """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
         plan = _plan(found)
         self._without_multipliers()
-        if self._budget.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
+        if self._budget.stop.due or not found.cost <= most or not np.isfinite(plan.states).all():
             return None
         return self._interior(plan, LITTLE)
 
@@ -409,8 +424,8 @@ class Ladder:
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                beside = least.beside(detail)
-                detail += f"; against it stand {beside}" if beside else ""
+                best = replace(best, against=least.beside(detail))
+                detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 

@@ -129,7 +129,7 @@ def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
     """A constraint of n states as a constraint of n + 1, independent of the last."""
     names = dynamics.state_coordinates.names
     if isinstance(constraint, GoalState):
-        return GoalState(constraint.goal, states=names if constraint.states is None else constraint.states)
+        return GoalState({names[i]: number for i, number in constraint._numbers(dynamics).items()})
     if isinstance(constraint, SymbolicConstraint):
         return _of_fewer(constraint, len(names))
     if isinstance(constraint, (StateBounds, Clearance)):

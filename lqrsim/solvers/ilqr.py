@@ -31,7 +31,7 @@ from lqrsim.solvers.engine import RunResult, check_finite_at_start, iterate
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import named
-from lqrsim.solvers.settings import Settings, check_callback, check_problem, settings_from
+from lqrsim.solvers.settings import Settings, check_callback, check_problem, settings_from, warn_of_goal
 
 TOLERANCE = 1e-4  # by default
 
@@ -79,6 +79,7 @@ def ilqr(
     check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
+    warn_of_goal(problem)
     with problem.dynamics.solving(check_threads(None)):
         return _solve(problem, settings, attentive=True, callback=callback)
 

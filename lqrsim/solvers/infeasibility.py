@@ -35,9 +35,9 @@ class Evidence:
     missed: float
     against: tuple[str, ...]
 
-    def beside(self, worst: str) -> str:
+    def beside(self, worst: str) -> tuple[str, ...]:
         """The conflicting constraints other than the one that a message begins with, in words."""
-        return ", ".join([name for name in self.against if not worst.startswith(name.split(" at ")[0])][:NAMED])
+        return tuple(name for name in self.against if not worst.startswith(name.rsplit(" at ", 1)[0]))[:NAMED]
 
 
 def evidence(

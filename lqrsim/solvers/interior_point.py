@@ -875,6 +875,7 @@ class InteriorPoint:
                     other = self._step(sigma, duals, corrections, beyond)
                     corrected = self._at(other, self._longest(self.point.slack, other.slack))
                     if corrected is not None and self._acceptable(corrected, part, slope):
+                        corrected = self._closed(corrected, hessian, sigma, duals, part, slope)
                         # Multipliers and costates are those of the uncorrected step.
                         return corrected, part, step
             first = False

@@ -78,6 +78,7 @@ def smooth_lq(
     return Solution(
         status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
         detail=detail,
+        remedy="" if solved else Status.NOT_POSITIVE_DEFINITE.remedy,
         policy=_policy(*passes.law, states[:-1], dt),
         inverse_policy=_policy(*passes.inverse_law, states[1:], dt) if whole and form == "primal" else None,
         cost_to_go=Quadratic(*passes.cost_to_go) if solved else None,

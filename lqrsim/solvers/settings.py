@@ -1,5 +1,6 @@
 """The options of the solvers, with defaults and checks."""
 
+import logging
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
 
 MOST_STARTS = 10_000
+_log = logging.getLogger("lqrsim")
 ROUGH, FINE = 1e-4, 1e-8  # default tolerances of smoothing and of Newton's method
 INSIDE = 1e-3  # how far constraints that press are kept inside, as a share of the tolerance, to leave room for rounding
 MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
@@ -157,3 +159,9 @@ def check_runs(problem: Problem, starts: int) -> None:
 def check_problem(problem: Problem) -> None:
     """Raises InputError unless it is a problem."""
     check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
+
+
+def warn_of_goal(problem: Problem) -> None:
+    """Log a warning if the goal is inside an obstacle."""
+    if where := problem.goal_inside:
+        _log.warning("the goal is %s: a plan that ends there collides", where)

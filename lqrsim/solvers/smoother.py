@@ -11,7 +11,14 @@ from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.initial_guess import StartLike
 from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.settings import SmootherSettings, check_callback, check_problem, check_runs, settings_from
+from lqrsim.solvers.settings import (
+    SmootherSettings,
+    check_callback,
+    check_problem,
+    check_runs,
+    settings_from,
+    warn_of_goal,
+)
 from lqrsim.solvers.strategy import solve
 
 
@@ -104,6 +111,7 @@ def smooth(
     check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
+    warn_of_goal(problem)
     return solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
 
 

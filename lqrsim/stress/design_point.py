@@ -31,6 +31,7 @@ from lqrsim.errors import (
     check_number,
     check_seed,
 )
+from lqrsim.process import keeping
 from lqrsim.results.rollout import Rollout
 from lqrsim.stress.multilevel_splitting import MOST, CountedScore, Progress, Score, failure_probability
 from lqrsim.stress.trial_score import normal_tail
@@ -97,6 +98,7 @@ def smallest_failure(
     Raises:
       InputError: an option is out of range, or none of the failures fails.
       NoFailure: none was given, and none was found.
+      KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
@@ -114,34 +116,33 @@ def smallest_failure(
     best = _nearest_of(counted, failures)
     history = [float(np.linalg.norm(best))]
     halves, remaining, converged = np.zeros((2, size)), float("nan"), False
+
+    def so_far() -> DesignPoint:
+        distance = history[-1]
+        return DesignPoint(
+            numbers=best, distance=distance, score=float(counted(best[None])[0]),
+            first_order_probability=normal_tail(distance), history=np.array(history),
+            simulations=counted.evaluations, remaining=remaining, converged=converged,
+        )  # fmt: skip
+
     if progress is not None:
         progress(0, rounds, f"distance {history[-1]:.3g}")
-    for number in range(rounds):
-        # The oldest rounds were around another point.
-        discount = DISCOUNT if history[-1] < (1 - MOVED) * history[-2:][0] else 1.0
-        halves = discount * halves + _gradients(counted, best, pairs, spread, rng)
-        remaining = _remaining(halves)
-        nearer = _nearer(counted, best, halves.sum(axis=0))
-        best = best if nearer is None else nearer
-        history.append(float(np.linalg.norm(best)))
-        if progress is not None:
-            progress(number + 1, rounds, f"distance {history[-1]:.3g}")
-        settled = number >= 5 and history[-1] > (1 - tolerance / 10) * history[-6]
-        converged = settled and remaining < tolerance
-        if converged:
-            break
-    final = float(counted(best[None])[0])
-    distance = history[-1]
-    return DesignPoint(
-        numbers=best,
-        distance=distance,
-        score=final,
-        first_order_probability=normal_tail(distance),
-        history=np.array(history),
-        simulations=counted.evaluations,
-        remaining=remaining,
-        converged=converged,
-    )
+    with keeping(lambda _: so_far()):
+        for number in range(rounds):
+            # The oldest rounds were around another point.
+            discount = DISCOUNT if history[-1] < (1 - MOVED) * history[-2:][0] else 1.0
+            halves = discount * halves + _gradients(counted, best, pairs, spread, rng)
+            remaining = _remaining(halves)
+            nearer = _nearer(counted, best, halves.sum(axis=0))
+            best = best if nearer is None else nearer
+            history.append(float(np.linalg.norm(best)))
+            if progress is not None:
+                progress(number + 1, rounds, f"distance {history[-1]:.3g}")
+            settled = number >= 5 and history[-1] > (1 - tolerance / 10) * history[-6]
+            converged = settled and remaining < tolerance
+            if converged:
+                break
+    return so_far()
 
 
 def _nearest_of(score: Score, failures: Array) -> Array:

@@ -28,6 +28,7 @@ from lqrsim.errors import (
     check_text,
 )
 from lqrsim.machine import description
+from lqrsim.process import keeping
 from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
@@ -99,6 +100,8 @@ class ReliabilityProblem:
     def score(self) -> TrialScore:
         """The score of trials as a function of their random numbers. Raises InputError if no such failure can occur."""
         scenario, plant = self.resolved, self.resolved.plant()
+        scenario.target_radius(self.goal_radius, self.goal_tolerance)  # before it is solved
+        disturbances = self.disturbances
         if self.failure == "collision" and not len(plant.world):
             raise InputError(
                 f"failure: got 'collision' for {self.scenario}, which has no obstacles with a distance, want 'miss'"
@@ -107,7 +110,7 @@ class ReliabilityProblem:
         score = TrialScore(
             plant,
             solution,
-            self.disturbances,
+            disturbances,
             controller=controller,
             **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             failure=FAILURES[self.failure],
@@ -166,6 +169,7 @@ class ReliabilityProblem:
         Raises:
           InputError: an option is out of range, or as `score` does.
           NoFailure: none was found.
+          KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
         options: dict[str, Any] = {
             "seed": check_seed("seed", seed),
@@ -173,7 +177,8 @@ class ReliabilityProblem:
             "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
         }
         score = self._begin(report, progress)
-        splitting = failure_probability(score, score.size, level=self._level(report), progress=progress, **options)
+        with keeping(lambda done: None if done is None else RareFailures(self, done, options)):
+            splitting = failure_probability(score, score.size, level=self._level(report), progress=progress, **options)
         return RareFailures(self, splitting, options)
 
     def smallest_failure(
@@ -199,6 +204,7 @@ class ReliabilityProblem:
           InputError: an option is out of range, the policy fails without any disturbance, or for the reasons of
             `score`.
           NoFailure: none was found.
+          KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)
         score = self._begin(report, progress)
@@ -208,24 +214,29 @@ class ReliabilityProblem:
                 f"scenario: got {self.scenario}, where {self.policy} fails with all random numbers at zero, want a"
                 " policy that fails only with others"
             )
-        first = failure_probability(
-            score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed
-        )
-        point = smallest_failure(
-            score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
-        )
-        simulations = score.simulations - before
-        rollout = score.rollout(point.numbers[None], frames=False)
-        ends = np.cumsum(score.sizes)[:-1]
-        return SmallestFailure(
-            problem=self,
-            point=point,
-            simulations=simulations,
-            disturbances=tuple(rollout.disturbances),
-            shares=tuple(float(part @ part) / point.distance**2 for part in np.split(point.numbers, ends)),
-            largest=tuple(largest_effects(rollout)),
-            options={"seed": seed, "rounds": rounds},
-        )
+
+        def found(point: DesignPoint) -> SmallestFailure:
+            simulations = score.simulations - before
+            rollout = score.rollout(point.numbers[None], frames=False)
+            ends = np.cumsum(score.sizes)[:-1]
+            return SmallestFailure(
+                problem=self,
+                point=point,
+                simulations=simulations,
+                disturbances=tuple(rollout.disturbances),
+                shares=tuple(float(part @ part) / point.distance**2 for part in np.split(point.numbers, ends)),
+                largest=tuple(largest_effects(rollout)),
+                options={"seed": seed, "rounds": rounds},
+            )
+
+        with keeping(lambda done: found(done) if isinstance(done, DesignPoint) else None):
+            first = failure_probability(
+                score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed
+            )
+            point = smallest_failure(
+                score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
+            )
+        return found(point)
 
     def _begin(self, report: Report | None, progress: Progress | None) -> TrialScore:
         """Check the callbacks, report the summary, and return the score."""
@@ -266,20 +277,27 @@ class RareFailures:
         return self.splitting.probability
 
     @property
+    def stopped(self) -> str:
+        """How far it came if it was stopped, such as "after 3 of 10 repetitions"; else empty."""
+        done, asked = len(self.splitting.repetitions), self.options["repetitions"]
+        return f"after {done} of {asked} repetitions" if done < asked else ""
+
+    @property
     def plain_trials(self) -> float | None:
         """Number of plain trials with the same standard error; None if all repetitions agree."""
         plain = self.splitting.plain_trials
         return plain if np.isfinite(plain) else None
 
     def summary(self) -> str:
-        """Two lines: the probability with its interval, and the number of simulated trials."""
+        """Two lines: the probability with its interval, and the number of simulated trials; one more if stopped."""
         one, plain = self.probability, self.plain_trials
-        interval = f"{100 * one.confidence:g} % interval, {self.options['repetitions']} repetitions"
+        interval = f"{100 * one.confidence:g} % interval, {len(self.splitting.repetitions)} repetitions"
         needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
-        return (
-            f"probability of failure: {one:.2g} ({interval})\n"
-            f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}"
-        )
+        lines = [
+            f"probability of failure: {one:.2g} ({interval})",
+            f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}",
+        ]
+        return "\n".join([f"stopped {self.stopped}", *lines] if self.stopped else lines)
 
     __str__ = summary
 
@@ -306,7 +324,8 @@ class RareFailures:
             "levels": result.levels.tolist(), "moves": result.step_sizes.tolist(), "simulations": result.simulations,
             "plain_trials": self.plain_trials, "failures": len(result.scores),
         }  # fmt: skip
-        return _write(self.problem, folder, "rare", {**self.options, "shown": shown}, found, numbers)
+        asked = {**self.options, "shown": shown}
+        return _write(self.problem, folder, "rare", asked, found, numbers, self.stopped)
 
 
 @dataclass(frozen=True)
@@ -329,6 +348,12 @@ class SmallestFailure:
     largest: tuple[LargestEffect, ...]
     options: Mapping[str, int]
 
+    @property
+    def stopped(self) -> str:
+        """How far it came if it was stopped, such as "after 3 of 40 rounds"; else empty."""
+        done, asked = len(self.point.history) - 1, self.options["rounds"]
+        return f"after {done} of {asked} rounds" if done < asked and not self.point.converged else ""
+
     def summary(self) -> str:
         """Lines with the distance, FORM's estimate, the share of each disturbance, and the largest disturbances."""
         point = self.point
@@ -338,7 +363,8 @@ class SmallestFailure:
         ]
         if not point.converged:
             left = "an unknown share" if np.isnan(point.remaining) else f"about {100 * point.remaining:.1f} %"
-            lines.append(f"not converged: {left} of the distance may be left to gain; use more --rounds")
+            why, then = (f"stopped {self.stopped}", "") if self.stopped else ("not converged", "; use more --rounds")
+            lines.append(f"{why}: {left} of the distance may be left to gain{then}")
         likely = point.first_order_probability
         lines.append(
             f"first-order estimate: one trial in {_rounded(1 / max(likely, 1e-300))} fails"
@@ -364,7 +390,7 @@ class SmallestFailure:
             "sizes": self.problem.score.sizes, "largest": [vars(one) for one in self.largest],
             "numbers": point.numbers.tolist(),
         }  # fmt: skip
-        return _write(self.problem, folder, "break", self.options, found, point.numbers[None])
+        return _write(self.problem, folder, "break", self.options, found, point.numbers[None], self.stopped)
 
 
 def _write(
@@ -374,6 +400,7 @@ def _write(
     options: Mapping[str, Any],
     found: Mapping[str, Any],
     numbers: Array,
+    stopped: str,
 ) -> Rollout:
     """Write trials with these numbers as rollout.npz, and options and results as NAME.json. Returns the trials."""
     # With contacts, for pictures; bit-identical until the collision.
@@ -390,6 +417,7 @@ def _write(
         "policy": digest_of_solution(problem.score.solution),
         "versions": versions(),
         "machine": description(),
+        "stopped": stopped or None,
         "found": found,
     }
     save_load.save(rollout, folder / "rollout.npz")

@@ -1,8 +1,8 @@
 """Funnels: the region around a plan from which a policy reaches the goal. `levels.py` says how a level is found."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,8 @@ from lqrsim.errors import (
     numbers_of,
 )
 from lqrsim.problem.noise import Noise
+from lqrsim.process import keeping
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel, flat
 from lqrsim.results.goal import Target, endings
 from lqrsim.results.solution import Solution
@@ -97,35 +99,69 @@ def funnel(
     Raises:
       InputError: as `simulate`; a disturbance changes the start of a run; an option is out of range; there is no
         cost-to-go and no shape; or an ellipsoid is flat.
+      KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
-    if largest is not None:
-        largest = check_number("largest", largest, above=0.0)
-    options = {"failures": failures, "largest": largest}
-    asked = {"rate": rate, "confidence": confidence, "seed": check_seed("seed", seed), "options": options}
-    blank = _blank(trials, asked, knots, states, shape)
-    test = smallest_test(blank.rate, 1 - (1 - blank.confidence) / len(blank.knots), failures)
-    found = _search(blank, trials, test, largest, progress)
-    return replace(
-        blank,
-        levels=np.array([one.level for one in found]),
-        trials=np.array([one.trials for one in found]),
-        successes=np.array([one.successes for one in found]),
-        reasons=tuple(one.reason for one in found),
-        simulated=sum(one.simulated for one in found),
-    )
+    space, steps = solution.policy.state_coordinates, solution.trajectory.steps
+    asked = FunnelOptions.of(space, steps, rate, confidence, knots, states, failures, largest, seed)
+    blank = _blank(trials, asked, shape)
+    found: list[FoundLevel] = []
+
+    def so_far() -> Funnel:
+        left = FoundLevel(0.0, 0, 0, "stopped before this knot was done", 0.0, 0)
+        every = [*found, *[left] * (len(blank.knots) - len(found))]
+        return replace(
+            blank,
+            levels=np.array([one.level for one in every]),
+            trials=np.array([one.trials for one in every]),
+            successes=np.array([one.successes for one in every]),
+            reasons=tuple(one.reason for one in every),
+            simulated=sum(one.simulated for one in every),
+        )
+
+    with keeping(lambda _: so_far() if found else None):
+        _search(blank, trials, asked, progress, found)
+    return so_far()
 
 
-def _blank(
-    trials: "_Trials", asked: dict[str, Any], knots: Sequence[int] | None, states: Sequence[str] | None,
-    shape: Tube | npt.ArrayLike | None,
-) -> Funnel:  # fmt: skip
-    """A funnel without levels. Raises InputError for invalid options."""
+class FunnelOptions(NamedTuple):
+    """Checked options of `funnel`, without those that need a solution.
+
+    Attributes:
+      rate, confidence, failures, largest, seed: as in `funnel`.
+      knots: in order. states: names.
+      test: what a level has to pass.
+    """
+
+    rate: float
+    confidence: float
+    knots: list[int]
+    states: tuple[str, ...]
+    failures: int
+    largest: float | None
+    seed: int
+    test: LevelTest
+
+    @classmethod
+    def of(
+        cls, space: Coordinates, steps: int, rate: float, confidence: float, knots: Sequence[int] | None,
+        states: Sequence[str] | None, failures: int, largest: float | None, seed: int,
+    ) -> "FunnelOptions":  # fmt: skip
+        """Raises InputError for what does not fit a plan of so many steps with these states."""
+        starts, names = _knots(knots, steps), _states(states, space)
+        confidence = check_number("confidence", confidence, at_least=0.5, below=1.0)
+        if largest is not None:
+            largest = check_number("largest", largest, above=0.0)
+        test = smallest_test(rate, 1 - (1 - confidence) / len(starts), failures)
+        return cls(rate, confidence, starts, names, failures, largest, check_seed("seed", seed), test)
+
+
+def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike | None) -> Funnel:
+    """A funnel without levels. Raises InputError for a shape that does not fit."""
     solution = trials.solution
     plan, law = solution.trajectory, solution.policy
-    asked["confidence"] = check_number("confidence", asked["confidence"], at_least=0.5, below=1.0)
-    starts, names = _knots(knots, plan.steps), _states(states, solution)
+    starts, names = asked.knots, asked.states
     shapes = _shapes(solution, shape, [law.state_coordinates.names.index(name) for name in names])
     for knot in starts:
         if flat(shapes[knot]):
@@ -137,16 +173,17 @@ def _blank(
         plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
         shape=shapes, family=_family(shape), knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
         reasons=("",) * len(starts), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
-        disturbances=tuple(one.describe(trials.plant) for one in trials.disturbances), versions=versions(), **asked,
+        disturbances=tuple(one.describe(trials.plant) for one in trials.disturbances), versions=versions(),
+        rate=asked.rate, confidence=asked.confidence, seed=asked.seed,
+        options={"failures": asked.failures, "largest": asked.largest},
     )  # fmt: skip
 
 
 def _search(
-    whole: Funnel, trials: "_Trials", test: LevelTest, largest: float | None, progress: Progress | None
-) -> list[FoundLevel]:  # fmt: skip
-    """Find the level at each knot of a funnel that has none yet."""
-    found: list[FoundLevel] = []
-    size, chosen = len(whole.knots), whole.chosen
+    whole: Funnel, trials: "_Trials", asked: FunnelOptions, progress: Progress | None, found: list[FoundLevel]
+) -> None:  # fmt: skip
+    """Find the level at each knot of a funnel that has none yet, and append it."""
+    size, chosen, largest, run = len(whole.knots), whole.chosen, asked.largest, 0
     for done, knot in enumerate(whole.knots.tolist()):
         last = f", level {found[-1].level:.3g} at the one before" if found else ""
         shape = whole.shape[knot]
@@ -156,18 +193,20 @@ def _search(
         def runs(
             level: float, numbers: npt.NDArray[np.intp], knot: int = knot, done: int = done, last: str = last
         ) -> npt.NDArray[np.bool_]:
+            nonlocal run
             if progress is not None:
-                progress(done, size, f"trying level {level:.3g} at knot {knot}{last}")
+                progress(done, size, f"trying level {level:.3g} at knot {knot}{last}; {run:,} trials")
+            run += len(numbers)
             points = points_of(numbers, whole.seed, len(chosen))
             return trials.reached(whole.states_at(knot, points, level), knot, whole.seed, numbers)
 
-        found.append(find_level(runs, test, guess=guess, largest=end, rate=whole.rate))
+        found.append(find_level(runs, asked.test, guess=guess, largest=end, rate=whole.rate))
     if progress is not None:
-        progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}")
-    return found
+        progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}; {run:,} trials")
 
 
-class FunnelCheck(NamedTuple):
+@dataclass(frozen=True)
+class FunnelCheck:
     """New trials at a knot of a funnel.
 
     Attributes:
@@ -181,6 +220,13 @@ class FunnelCheck(NamedTuple):
     level: float
     reached: Estimate
     successes: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        check_count("FunnelCheck: knot", self.knot, at_least=0)
+        check_number("FunnelCheck: level", self.level, at_least=0.0)
+        check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
+        successes = check_array("FunnelCheck: successes", self.successes, (None,)) != 0
+        object.__setattr__(self, "successes", successes)
 
 
 def check_funnel(
@@ -295,9 +341,9 @@ def _knots(knots: Sequence[int] | None, steps: int) -> list[int]:
     return found
 
 
-def _states(states: Sequence[str] | None, solution: Solution) -> tuple[str, ...]:
+def _states(states: Sequence[str] | None, space: Coordinates) -> tuple[str, ...]:
     """Names of the chosen states. Raises InputError for states that do not exist."""
-    known = solution.policy.state_coordinates.names
+    known = space.names
     if states is None:
         return known
     given = check_items("states", states, str, "names of states")

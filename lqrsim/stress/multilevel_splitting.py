@@ -24,6 +24,7 @@ import numpy as np
 from scipy import stats
 
 from lqrsim.errors import Array, InputError, check_count, check_function, check_memory, check_number, check_seed, shaped
+from lqrsim.process import keeping
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 Score = Callable[[Array], Array]
@@ -101,6 +102,7 @@ def failure_probability(
     Raises:
       InputError: an option is out of range, or a score is NaN.
       NoFailure: none was found.
+      KeyboardInterrupt: Ctrl-C; its `found` is the result of the repetitions that are done, None if none has failed.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
     size = check_count("size", size)
@@ -119,31 +121,30 @@ def failure_probability(
     levels, step_sizes = _pilot_run(
         counted, size, particles, keep, moves, most_levels, np.random.default_rng(first), level
     )
-    shares = np.zeros((repetitions, len(levels)))
-    failures, scores = [], []
-    for number, key in enumerate(rest):
-        if progress is not None:
-            progress(number, repetitions, f"{shares[:number].prod(axis=1).mean():.2g}" if number else "")
-        shares[number], failed, failed_scores = _repetition(
-            counted, size, particles, moves, levels, step_sizes, np.random.default_rng(key)
-        )
-        failures.append(failed)
-        scores.append(failed_scores)
-    estimates = shares.prod(axis=1)
+    done: list[tuple[Array, Array, Array]] = []
+
+    def so_far() -> SplittingResult | None:
+        shares = np.array([one for one, _, _ in done])
+        if len(done) < 2 or not shares.prod(axis=1).any():
+            return None
+        estimates = shares.prod(axis=1)
+        error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
+        failures, scores = (np.concatenate([one[i] for one in done]) for i in (1, 2))
+        interval = _estimate(shares, particles, confidence)
+        return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
+
+    with keeping(lambda _: so_far()):
+        for number, key in enumerate(rest):
+            if progress is not None:
+                mean = np.mean([shares.prod() for shares, _, _ in done]) if done else None
+                progress(number, repetitions, "" if mean is None else f"{mean:.2g}")
+            done.append(_repetition(counted, size, particles, moves, levels, step_sizes, np.random.default_rng(key)))
+    found = so_far()
     if progress is not None:
-        progress(repetitions, repetitions, f"{estimates.mean():.2g}")
-    if not estimates.any():
+        progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
+    if found is None:
         raise NoFailure(f"particles: got {particles}, of which none failed, want more")
-    return SplittingResult(
-        _estimate(shares, particles, confidence),
-        float(estimates.std(ddof=1) / np.sqrt(repetitions)),
-        estimates,
-        levels,
-        step_sizes,
-        counted.evaluations,
-        np.concatenate(failures),
-        np.concatenate(scores),
-    )
+    return found
 
 
 def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:

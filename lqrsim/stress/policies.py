@@ -190,5 +190,6 @@ def make_policy(
     """Solve for one policy. Returns its solution and the controller that runs it; raises InputError as `solve` does."""
     if design is not None:
         check_designed((policy,))
+        design = design_disturbances(scenario, design)  # before it is solved
     solution = solve((policy,), scenario, design, given)[policy]
     return solution, make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_seed
+from lqrsim.errors import InputError, check_array, check_count, check_items, check_kind, check_seed, check_text
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -22,7 +21,8 @@ from lqrsim.stress.statistics import rate as rate_of
 SAME = 0.02  # of a state's range along the plan; plans that differ nowhere by more count as the same
 
 
-class ComparedPlan(NamedTuple):
+@dataclass(frozen=True)
+class ComparedPlan:
     """A plan that was compared.
 
     Attributes:
@@ -34,6 +34,12 @@ class ComparedPlan(NamedTuple):
     start: str
     solution: Solution
     successes: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        check_text("ComparedPlan: start", self.start, "the name of a start", at_most=1000, empty=True)
+        check_kind("ComparedPlan: solution", self.solution, Solution, "a Solution")
+        successes = check_array("ComparedPlan: successes", self.successes, (None,)) != 0
+        object.__setattr__(self, "successes", successes)
 
 
 @dataclass(frozen=True, kw_only=True)

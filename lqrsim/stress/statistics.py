@@ -18,6 +18,7 @@ from lqrsim.errors import (
     check_seed,
     excerpt,
 )
+from lqrsim.results.fields import check_fields
 
 CONFIDENCE = 0.95
 
@@ -30,6 +31,9 @@ class Estimate:
     low: float
     high: float
     confidence: float = CONFIDENCE
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def __format__(self, spec: str) -> str:
         return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from av.error import FFmpegError
 
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -57,6 +57,7 @@ def verify_video(
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
     ground_truth.check_arguments(solution, progress)
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     trial = None if trial is None else check_count("trial", trial, at_least=0)
     metadata, plane = video_metadata.read(path), rollout.plane
     digest = video_metadata.digest(rollout)

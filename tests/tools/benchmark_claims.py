@@ -7,11 +7,13 @@
 Every claim is held against the problem alone, by whole_problems/claims.py, which shares nothing with the solvers.
 
 drawn        Random systems with fixed and soft starts, limits, constraints, warm starts, few and many iterations.
-planar       A planar quadrotor that has to get over a wall: 60 starts and goals, with a clearance and without.
+planar       A planar quadrotor that has to get over a wall: 60 starts and goals, with a clearance and without, and for
+             each sharpness of its ObstacleCost; to an optimality of 1e-8.
 known        Problems of which the answer is known beforehand, whole_problems/known.py: 100 of each kind.
 certificate  What the certificate costs of a solve, on the paper's queries and on warm starts.
 """
 
+import itertools
 import statistics
 import sys
 import time
@@ -37,6 +39,8 @@ from runner import Result, Settings, at_most, opening, run
 from whole_problems import known
 from whole_problems.claims import contradictions
 from whole_problems.draws import KINDS, draw, solve
+
+SHARPNESS = (5.0, 10.0, 20.0, 40.0)  # 1/m, of the cost of obstacles
 
 Section = Literal["drawn", "planar", "known", "certificate"]
 
@@ -104,17 +108,17 @@ def _on_all_processors(tasks: list[tuple[str, int, int]]) -> Iterator[tuple[str,
 def _planar(config: Config) -> dict[str, Any]:
     count = 6 if config.quick else 60
     result: dict[str, Any] = {}
-    for name, clearance in (("without", False), ("clearance", True)):
+    for clearance, sharpness in itertools.product((False, True), SHARPNESS):
         rng = np.random.default_rng(config.seed)
-        problems = [planar_quadrotor.draw(rng, clearance=clearance) for _ in range(count)]
+        problems = [planar_quadrotor.draw(rng, clearance=clearance, sharpness=sharpness) for _ in range(count)]
         clock = time.perf_counter()
-        solutions = ls.smooth_many(problems)
+        solutions = ls.smooth_many(problems, tolerance=1e-8, constraint_tolerance=1e-6)
         seconds = time.perf_counter() - clock
         away = [
             one.trajectory.states[-1][:2] - _goal(problem)[:2] for problem, one in zip(problems, solutions, strict=True)
         ]
         iterations = [len(solution.iterations) for solution in solutions]
-        result[name] = {
+        result[f"{'with' if clearance else 'without'} a clearance, sharpness {sharpness:g}"] = {
             "solved": sum(solution.status.name == "CONVERGED" for solution in solutions),
             "problems": count,
             "at_goal": sum(float(np.linalg.norm(one)) <= planar_quadrotor.RADIUS for one in away),

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_count, check_number
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, left_out, times, uniform
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, times, uniform
 from lqrsim.simulation.plant import Plant
 
 
@@ -233,9 +233,15 @@ class CommandDropouts(Dropouts):
         return Effect(actuate=_last_received(lost, plan.controls[0]))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        if self.share == 0:
-            return Uncertainty()
-        return left_out(self, plant, "its effect depends on how commands change, and that of noise does not")
+        """The share that is lost, as if losses were independent.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `command_loss`.
+        """
+        return Uncertainty(command_loss=self.share)
 
 
 def _last_received(lost: npt.NDArray[np.bool_], first: Array) -> Hook:

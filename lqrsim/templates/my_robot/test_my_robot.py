@@ -9,7 +9,7 @@ import lqrsim as ls
 def test_dynamics_are_those_of_the_mjcf() -> None:
     """One control period of both from random states; between knots both integrate by RK4 with other steps."""
     stated = scenario()
-    check = ls.check_plant(MyRobot(), stated.scene, period=stated.problem.dt)
+    check = ls.check_plant(MyRobot(), stated.scene, problem=stated.problem, period=stated.problem.dt)
     assert check.good, str(check)
 
 

@@ -91,10 +91,10 @@ def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
         "Funnel.left_at": ({"self": funnel, "rollout": place.rollout},),
         "Funnel.states_at": ({"self": funnel, "knot": 0, "points": np.zeros((2, 2)), "level": 0.1},),
         "check_funnel": ({"funnel": funnel} | common | check, 0.3),
-        "FunnelCheck": ({"knot": 0, "level": 1.0, "reached": None, "successes": np.ones(2, dtype=bool)},),
+        "FunnelCheck": ({"knot": 0, "level": 1.0, "reached": safest.reached, "successes": np.ones(2, dtype=bool)},),
         "smooth_safest": (chosen, 0.1),
         "SafestPlan": ({"solution": safest.solution, "compared": safest.compared, "reached": safest.reached},),
-        "ComparedPlan": (safest.compared[0]._asdict(),),
+        "ComparedPlan": (vars(safest.compared[0]),),
         "plot_funnel": (
             {"funnel": funnel, "path": place.folder / "funnel.png", "world": place.plant.world, "radius": 0.1},
             0.3,

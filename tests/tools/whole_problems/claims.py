@@ -26,7 +26,7 @@ def contradictions(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | 
         found = _of_any_plan(problem, solution, rate)
         if solution.success:
             found += _of_a_success(problem, solution, rate)
-    if solution.status is not Status.CONVERGED and not solution.status.success and not solution.status.remedy:
+    if solution.status is not Status.CONVERGED and not solution.status.success and not solution.remedy:
         found.append(f"{solution.status.name} has no remedy")
     limit = solution.options["max_iterations"]
     assert isinstance(limit, int)

@@ -230,8 +230,8 @@ def parking(rng: Generator) -> ls.Problem:
         final_cost=ls.QuadraticCost(_weights(rng, 4, 1.0, 100.0), about=goal),
         constraints=[
             ls.SymbolicConstraint(_aligned, parameters={"bearing": bearing}, equality=True, at="final"),
-            ls.GoalState([bearing, 0.0], states=("heading", "speed")),
-            ls.StateBounds(low={"speed": float(rng.choice([-1.0, 0.0]))}, high={"speed": float(rng.uniform(0.5, 3.0))}),
+            ls.GoalState(heading=bearing, speed=0.0),
+            ls.StateBounds(speed=(float(rng.choice([-1.0, 0.0])), float(rng.uniform(0.5, 3.0)))),
             ls.SymbolicConstraint(_sideways, parameters={"grip": float(rng.uniform(0.5, 5.0))}),
         ],
     )
