@@ -32,7 +32,8 @@ class FamilyTask:
       name: of it. package, file: the MJCF in that package, installed or unpacked in `folder`.
       moves: by how much joints are to move, by number, from the start. start: positions of the joints, one each; none
         for where they are in the MJCF. keyframe: to start from. post: a cylinder in the way, its place and size.
-      excluded: two bodies that do not collide, against the MJCF: they touch by construction, as `print(robot)` says.
+      excluded: pairs of bodies that do not collide, against the MJCF: they touch by construction, as `print(robot)`
+        says.
       steps: of dt seconds. weights: at the end, of positions and velocities; ends: of these, positions by name, the
         others being free, such as the legs of what stands on them. Then it starts at rest on its contacts.
     """
@@ -44,7 +45,7 @@ class FamilyTask:
     start: tuple[float, ...] = ()
     keyframe: str | None = None
     post: tuple[float, ...] = ()
-    excluded: tuple[str, ...] = ()
+    excluded: tuple[tuple[str, str], ...] = ()
     steps: int = 60
     dt: float = 0.02
     weights: tuple[float, float] = (1000.0, 100.0)
@@ -74,8 +75,7 @@ class FamilyTask:
             x, y, z, radius, half = self.post
             size = f'pos="{x} {y} {z}" size="{radius} {half}"'
             added += f'<worldbody><geom name="post" type="cylinder" {size} rgba=".2 .4 .6 1"/></worldbody>'
-        if self.excluded:
-            one, other = self.excluded
+        for one, other in self.excluded:
             added += f'<contact><exclude body1="{one}" body2="{other}"/></contact>'
         xml = xml.replace("</mujoco>", f"{added}</mujoco>")
         return ls.MjcfRobot(scene_from_xml(xml, name, obstacles=("post",) if self.post else ()))
@@ -167,7 +167,7 @@ FAMILY: tuple[FamilyTask, ...] = (
     FamilyTask(
         name="Sawyer", package="robosuite", file=ARMS + "sawyer/robot.xml",
         start=(0, -1.18, 0, 2.18, 0, 0.57, 3.3161), moves={0: 0.8, 1: 0.3},
-        excluded=("right_arm_base_link", "right_l0"),
+        excluded=(("right_arm_base_link", "right_l0"),),
     ),
     FamilyTask(
         name="Baxter", package="robosuite", file=ARMS + "baxter/robot.xml",
@@ -180,7 +180,7 @@ FAMILY: tuple[FamilyTask, ...] = (
     ),
     FamilyTask(
         name="Rethink gripper", package="robosuite", file=HANDS + "rethink_gripper.xml", moves={0: 0.005, 1: -0.005},
-        weights=(1e5, 1e3),
+        weights=(1e5, 1e3), excluded=(("gripper_base", "l_finger"), ("gripper_base", "r_finger")),
     ),
     FamilyTask(
         name="Inspire hand", package="robosuite", file=HANDS + "inspire_right_hand.xml",
