@@ -134,7 +134,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         "exact": replayed(robot, solution, EXACT), "unit": rollout.tracking_unit,
         "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
         "bindings": clearance_by_bindings(robot, solution),
-        "close": min(CLOSE, 0.1 * max(map(abs, task.moves.values()), default=1.0)) if isinstance(task, FamilyTask) else CLOSE,
+        "close": min([CLOSE, *(0.1 * abs(way) for way in (task.moves.values() if isinstance(task, FamilyTask) else ()))]),
         "missed": missed(task, robot, problem, solution.trajectory.states[-1]),
     }  # fmt: skip
     if config.pictures:
@@ -262,7 +262,8 @@ def report(result: Result) -> str:
     lines = [table(HEAD, [cells(row) for row in result["rows"]]), ""]
     solved = [row for row in result["rows"] if "cost" in row]
     there = sum(row["success"] and "off" in row and abs(farthest(row)[1]) <= row["close"] for row in solved)
-    lines.append(f"Solved, and within {CLOSE} rad or m, and a tenth of the way, of their goals: {there} of {len(result['rows'])}.")
+    near = f"{CLOSE} rad or m, and a tenth of the way,"
+    lines.append(f"Solved, and within {near} of their goals: {there} of {len(result['rows'])}.")
     ratios = [row["cost"] / row["ilqr_cost"] for row in solved if row["ilqr_cost"] is not None]
     lines.append(
         f"Cost not more than 1 % above iLQR's from the same start: {sum(one <= WORSE for one in ratios)} of"
