@@ -114,6 +114,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
     assert problem.start is not None
     # iLQR begins at rest, where what holds the robot between start and goal would let it fall.
     held = np.tile(robot.hold(problem.start), (problem.steps, 1)) if isinstance(task, FamilyTask) else None
+    ways = task.moves.values() if isinstance(task, FamilyTask) else ()
     most, seconds = limits["iterations"], limits["time_limit"]
     solution = ls.smooth(problem, max_iterations=most, time_limit=seconds)
     other = None  # iLQR keeps no constraints
@@ -134,7 +135,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         "exact": replayed(robot, solution, EXACT), "unit": rollout.tracking_unit,
         "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
         "bindings": clearance_by_bindings(robot, solution),
-        "close": min([CLOSE, *(0.1 * abs(way) for way in (task.moves.values() if isinstance(task, FamilyTask) else ()))]),
+        "close": min([CLOSE, *(0.1 * abs(way) for way in ways)]),
         "missed": missed(task, robot, problem, solution.trajectory.states[-1]),
     }  # fmt: skip
     if config.pictures:

@@ -105,7 +105,11 @@ def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> A
 
 def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
     """Weights (size,), from one number for all or an array. Raises InputError unless they are finite and >= 0."""
-    if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
+    try:
+        single = np.ndim(value) == 0  # pyright: ignore[reportArgumentType]
+    except Exception:  # lists of different lengths, of which `check_array` says so
+        single = False
+    if single:
         return np.full(size, check_number(field, value, at_least=0.0))
     weights = check_array(field, value, (size,))
     if (weights < 0).any():

@@ -12,6 +12,7 @@ functions of the same names in `kernels/rotation_ratios.py`, with a power series
 pi are singular.
 """
 
+import sys
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -109,7 +110,8 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
 def _three(field: str, vector: Vector) -> tuple[Any, ...]:
     """The three entries of a vector: numbers, arrays or expressions. Raises InputError for anything else."""
     found = check_items(field, vector, object, "three expressions or numbers", at_most=3)
-    if len(found) != 3 or any(isinstance(one, str) for one in found):
+    too_large = any(isinstance(one, int) and abs(one) > sys.float_info.max for one in found)
+    if len(found) != 3 or too_large or any(isinstance(one, str) for one in found):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
     if all(_numeric(one) for one in found):
         return found
@@ -142,7 +144,7 @@ def _cross(a: Vector, b: Vector) -> list[Any]:
 def _ratio(name: str, s: Any) -> Any:
     """A ratio at s: numeric for a number or an array, otherwise as a SymPy function."""
     if isinstance(s, float | int | np.number):
-        if np.isinf(float(s)):
+        if s > sys.float_info.max:
             raise InputError("r: got a rotation vector whose squared length is beyond all floats, want a shorter one")
         return _NUMERIC[name](float(s))
     if isinstance(s, np.ndarray) and s.dtype != object:

@@ -13,10 +13,11 @@ import warnings
 import zipfile
 from collections import Counter
 from pathlib import Path
-from types import ModuleType
+from types import GenericAlias, ModuleType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from funnels_by_hand import funnel_by_hand
 from scipy import stats
@@ -25,6 +26,7 @@ from spoiling import content_hash, contents, rewrite
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.results import save_load
+from lqrsim.results.fields import declared
 
 fuzzer: ModuleType = importlib.import_module("robustness.files")
 same = fuzzer.same
@@ -223,6 +225,13 @@ def test_a_damaged_tube_gets_one_line(
     with pytest.raises(ls.InputError, match=r"tube\.npz") as caught:
         ls.load(path, ls.Rollout)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("number", "dtype"), [(np.floating, np.float64), (np.int64, np.int64)])
+def test_annotations_of_arrays_are_understood_as_each_numpy_has_them(number: Any, dtype: type) -> None:
+    """Up to NumPy 2.4 and Python 3.11 an alias of np.ndarray, from 2.5 and 3.12 on a type alias of its own."""
+    forms = (npt.NDArray[number], np.ndarray[Any, np.dtype[number]], GenericAlias(npt.NDArray, (number,)))
+    assert [declared(form).dtype for form in forms] == [dtype] * 3
 
 
 def test_the_hash_is_of_the_content(saved: Path, run: Path) -> None:

@@ -21,6 +21,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import InputError, check_count, check_items, check_kind, check_number, excerpt, numbers_of, real
 
@@ -104,7 +105,7 @@ def declared(annotation: Any) -> Declared:
         return next((one for one in said if isinstance(one, kind)), None)
 
     dtype = None
-    if get_origin(kinds[0]) is np.ndarray:
+    if get_origin(kinds[0]) in (np.ndarray, npt.NDArray):  # the latter from NumPy 2.5 on, with Python 3.12
         dtype = np.int64 if "int64" in str(kinds[0]) else np.float64
     return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), optional)
 

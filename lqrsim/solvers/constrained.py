@@ -112,7 +112,8 @@ class Ladder:
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
-            begin = guess.trajectory or start  # a sketch of a path is not near the answer, though standing still is kept
+            # A sketch of a path is not near the answer, even where standing still keeps the constraints.
+            begin = guess.trajectory or start
             kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
             rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
         if not stay:
@@ -384,7 +385,8 @@ class Ladder:
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):
             size = found.row_size[self._stages.owners == k]
-            idle = (one.values * size / found.scale < values[k] / size) & ~self._problem.constraint_terms[k].equality
+            idle = one.values * size / found.scale < values[k] / size
+            idle &= not self._problem.constraint_terms[k].equality
             multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
         return tuple(multipliers)
 
