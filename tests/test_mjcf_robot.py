@@ -322,15 +322,15 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
         robot.settled(robot.at(base_z=1.0))
 
 
-def elbow(gear: float, least: float, *, size: float = 0.03, collides: int = 0) -> ls.MjcfRobot:
-    """Two links in a level plane, whose second joint has limits."""
-    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="{size}" mass="1" contype="{collides}" conaffinity="1"/>'
+def elbow(gear: float, least: float, *, collides: int = 0) -> ls.MjcfRobot:
+    """Two links on a fixed base, in a level plane; the second joint has limits. The first link overlaps the base."""
+    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1" contype="{collides}" conaffinity="1"/>'
     return ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true" angle="radian"/>
-      <option timestep="0.005"/><worldbody><body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}
-      <body name="fore" pos="0.4 0 0"><joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}
-      <body name="hand" pos="0.01 0 0"><geom size="0.05" mass="1e-3" contype="{collides}" conaffinity="1"/></body>
-      </body></body></worldbody><actuator><motor joint="a" gear="10" ctrlrange="-1 1"/>
-      <motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>""", "arm"))  # fmt: skip
+      <option timestep="0.005"/><worldbody><body name="base"><geom size="0.05" contype="{collides}" conaffinity="1"/>
+      <body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}<body name="fore" pos="0.4 0 0">
+      <joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}</body></body></body></worldbody><actuator>
+      <motor joint="a" gear="10" ctrlrange="-1 1"/><motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>
+      """, "arm"))  # fmt: skip
 
 
 @pytest.mark.parametrize("turn", [1.0, 1.5, 2.0])
@@ -366,7 +366,7 @@ def test_what_is_amiss_at_rest_is_said() -> None:
     assert "past their limits at rest: 'b 0 (want 0.2 to 2)'" in str(elbow(1.0, 0.2))
     assert "at rest: 'b" not in str(elbow(1.0, -0.2))
     assert "touching" not in str(elbow(1.0, 0.2))
-    assert "touching at rest: 'upper and hand'" in str(elbow(1.0, 0.2, collides=1))
+    assert "touching at rest: 'base and upper'" in str(elbow(1.0, 0.2, collides=1))
 
 
 def test_a_wrench_on_the_body_is_a_disturbance() -> None:
