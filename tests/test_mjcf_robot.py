@@ -289,15 +289,48 @@ def test_joint_limits_are_bounds() -> None:
         _ = robot_of("wheel", 0)[0].joint_limits
 
 
-def elbow(gear: float, least: float, *, size: float = 0.03, collides: int = 0) -> ls.MjcfRobot:
-    """Two links in a level plane, whose second joint has limits."""
-    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="{size}" mass="1" contype="{collides}" conaffinity="1"/>'
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS)
+def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
+    """A table with two bent legs and a load off its middle, by plain `mj_step` for half a second."""
+    rng = np.random.default_rng(seed)
+    bend, mass, aside = rng.uniform(-0.3, 0.3), rng.uniform(0.5, 5), rng.uniform(-0.15, 0.15)
+    legs = "".join(
+        f'<body pos="{x} {y} 0"><joint name="leg{i}" axis="0 1 0" damping="0.1"/>'
+        f'<geom size="0.03" pos="0 0 -0.3" mass="0.1"/></body>'
+        for i, (x, y) in enumerate([(0.25, 0.2), (0.25, -0.2), (-0.25, 0.2), (-0.25, -0.2)])
+    )
+    robot = ls.MjcfRobot(
+        scene_from_xml(
+            f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+      <body name="table" pos="0 0 0.33"><freejoint name="base"/><geom type="box" size="0.3 0.25 0.02" mass="1"/>
+      <geom size="0.01" pos="{aside} 0.05 0.05" mass="{mass}"/>{legs}</body></worldbody>
+      <actuator>{"".join(f'<motor name="m{i}" joint="leg{i}"/>' for i in range(4))}</actuator></mujoco>""",
+            "table",
+        )
+    )
+    bent = robot.at(None, base_z=0.03 + 0.3 * np.cos(bend) - 1e-4, **{f"leg{i}": bend for i in range(4)})
+    state = robot.settled(bent)
+    np.testing.assert_array_equal(state[6:10], bent[6:10])  # the legs keep their angles
+    held, model = robot.hold(state), robot.scene.model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.ctrl[:] = robot.configuration(state)[0], held
+    mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
+    moved = robot.state(data.qpos, data.qvel) - state[: 2 * model.nv]
+    np.testing.assert_allclose(moved, 0, atol=1e-6)  # MuJoCo's solver ends at 1e-8 of the forces
+    with pytest.raises(InputError, match="near which nothing is at rest"):
+        robot.settled(robot.at(base_z=1.0))
+
+
+def elbow(gear: float, least: float, *, collides: int = 0) -> ls.MjcfRobot:
+    """Two links on a fixed base, in a level plane; the second joint has limits. The first link overlaps the base."""
+    link = f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1" contype="{collides}" conaffinity="1"/>'
     return ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true" angle="radian"/>
-      <option timestep="0.005"/><worldbody><body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}
-      <body name="fore" pos="0.4 0 0"><joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}
-      <body name="hand" pos="0.01 0 0"><geom size="0.05" mass="1e-3" contype="{collides}" conaffinity="1"/></body>
-      </body></body></worldbody><actuator><motor joint="a" gear="10" ctrlrange="-1 1"/>
-      <motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>""", "arm"))  # fmt: skip
+      <option timestep="0.005"/><worldbody><body name="base"><geom size="0.05" contype="{collides}" conaffinity="1"/>
+      <body name="upper"><joint name="a" axis="0 0 1" damping="0.05"/>{link}<body name="fore" pos="0.4 0 0">
+      <joint name="b" axis="0 0 1" range="{least} 2" damping="0.02"/>{link}</body></body></body></worldbody><actuator>
+      <motor joint="a" gear="10" ctrlrange="-1 1"/><motor joint="b" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>
+      """, "arm"))  # fmt: skip
 
 
 @pytest.mark.parametrize("turn", [1.0, 1.5, 2.0])
@@ -333,7 +366,7 @@ def test_what_is_amiss_at_rest_is_said() -> None:
     assert "past their limits at rest: 'b 0 (want 0.2 to 2)'" in str(elbow(1.0, 0.2))
     assert "at rest: 'b" not in str(elbow(1.0, -0.2))
     assert "touching" not in str(elbow(1.0, 0.2))
-    assert "touching at rest: 'upper and hand'" in str(elbow(1.0, 0.2, collides=1))
+    assert "touching at rest: 'base and upper'" in str(elbow(1.0, 0.2, collides=1))
 
 
 def test_a_wrench_on_the_body_is_a_disturbance() -> None:
