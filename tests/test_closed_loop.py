@@ -270,7 +270,8 @@ def test_a_policy_that_returns_nan_fails_and_is_not_taken_for_zero(sled):
     solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((10, 2)), 0.1)
     offset = solution.policy.offset.copy()
     offset[4] = np.nan
-    rollout = simulate(sled, replace(solution, policy=replace(solution.policy, offset=offset)))
+    broken = replace(solution.policy, offset=offset)
+    rollout = simulate(sled, replace(solution, status=Status.MAX_ITERATIONS, policy=broken))
     assert rollout.outcome == ("error",)
     assert rollout.reasons == ("controller at 0.4 s: got nan for steer, want a finite number",)
     assert np.isfinite(rollout.states[0, :5]).all()

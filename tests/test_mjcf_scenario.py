@@ -31,7 +31,7 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     weighed = problem.final_cost
     assert isinstance(weighed, ls.QuadraticCost)
     np.testing.assert_array_equal(np.diag(weighed.weight), [5, 7, 0, 0])
-    efforts, velocities = terms_of(problem.stage_cost)
+    efforts, velocities, *_ = terms_of(problem.stage_cost)
     assert isinstance(efforts, ls.ControlCost)
     np.testing.assert_array_equal(efforts.weight, [[2.0]])
     assert isinstance(velocities, ls.QuadraticCost)
