@@ -9,7 +9,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import InputError
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.costs import LimitCost, terms_of
 from lqrsim.scenarios.references import from_anywhere, resolve
 
 
@@ -31,11 +31,12 @@ def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> Non
     weighed = problem.final_cost
     assert isinstance(weighed, ls.QuadraticCost)
     np.testing.assert_array_equal(np.diag(weighed.weight), [5, 7, 0, 0])
-    efforts, velocities, *_ = terms_of(problem.stage_cost)
+    efforts, velocities, limits = terms_of(problem.stage_cost)
     assert isinstance(efforts, ls.ControlCost)
     np.testing.assert_array_equal(efforts.weight, [[2.0]])
     assert isinstance(velocities, ls.QuadraticCost)
     np.testing.assert_array_equal(np.diag(velocities.weight), [0, 0, 1e-3, 1e-3])
+    assert isinstance(limits, LimitCost)
     assert problem.control_limits == ((-1.0,), (1.0,))
     assert scenario.name == "cart"
 

@@ -156,11 +156,11 @@ class Certify:
         """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.results import save_load
-        from lqrsim.results.certificate import Certificate
+        from lqrsim.results.certificate import FailureCertificate
         from lqrsim.stress.failure_search import certify
         from lqrsim.stress.multilevel_splitting import NoFailure
 
-        certificate = save_load.load(self.file, Certificate)
+        certificate = save_load.load(self.file, FailureCertificate)
         console.say(certificate.summary())
         try:
             with console.progress("splitting", "repetition") as progress:

@@ -12,7 +12,7 @@ _SHARE = Bounds(at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Certificate:
+class FailureCertificate:
     """The probability that a policy fails, as multilevel splitting has measured it, and what was measured.
 
     Attributes:
@@ -66,12 +66,12 @@ class Certificate:
         check_fields(self)
         if not self.low <= self.probability <= self.high:
             got = f"{self.probability:g} in an interval from {self.low:g} to {self.high:g}"
-            raise InputError(f"Certificate: probability: got {got}, want it inside")
+            raise InputError(f"FailureCertificate: probability: got {got}, want it inside")
         mean = float(self.repetitions.mean()) if len(self.repetitions) > 1 else -1.0
         if abs(mean - self.probability) > 1e-9 * self.probability:
             raise InputError(
-                f"Certificate: repetitions: got {len(self.repetitions)} whose mean is not {self.probability:g}, want at"
-                " least two, of which the probability is the mean"
+                f"FailureCertificate: repetitions: got {len(self.repetitions)} whose mean is not {self.probability:g},"
+                " want at least two, of which the probability is the mean"
             )
 
     def summary(self) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results.archive import Arrays, Header, digest, opened, write
 from lqrsim.results.archive import replacing as replacing
-from lqrsim.results.certificate import Certificate
+from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -26,8 +26,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.schema import anything, canonical, parse
 from lqrsim.results.solution import Solution
 
-Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | Certificate
-_Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, Certificate)
+Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate
+_Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, FailureCertificate)
 
 # The name in the file, and the version.
 FORMATS: dict[type, tuple[str, int]] = {
@@ -36,7 +36,7 @@ FORMATS: dict[type, tuple[str, int]] = {
     AffinePolicy: ("policy", 2),
     OutputFeedbackPolicy: ("output feedback policy", 1),
     Funnel: ("funnel", 2),
-    Certificate: ("certificate", 1),
+    FailureCertificate: ("certificate", 1),
 }
 VERSIONS = dict(FORMATS.values())
 
@@ -47,7 +47,7 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     A link is written through: the file that it points to changes. Nothing but a regular file is replaced.
 
     Args:
-      result: a Solution, a Rollout, a policy, a Funnel or a Certificate.
+      result: a Solution, a Rollout, a policy, a Funnel or a FailureCertificate.
       path: FILE.npz.
 
     Returns:
@@ -95,7 +95,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
     Args:
       path: path of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy`, `ls.Funnel`
-        or `ls.stress.Certificate`. By default, any.
+        or `ls.stress.FailureCertificate`. By default, any.
 
     Returns:
       What was saved.
@@ -123,7 +123,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
 
 
 def _public(kind: type) -> str:
-    return f"ls.stress.{kind.__name__}" if kind is Certificate else f"ls.{kind.__name__}"
+    return f"ls.stress.{kind.__name__}" if kind is FailureCertificate else f"ls.{kind.__name__}"
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:

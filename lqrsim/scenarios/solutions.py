@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind
-from lqrsim.results.certificate import Certificate
+from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
@@ -59,7 +59,7 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
       InputError: the file has something else, or it is for another system or number of steps.
     """
     found = load(path)
-    if isinstance(found, Certificate):
+    if isinstance(found, FailureCertificate):
         found = found.solution
     if isinstance(found, OutputFeedbackPolicy):
         raise InputError(

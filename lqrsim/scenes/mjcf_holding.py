@@ -89,6 +89,8 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
             forces.append(data.qfrc_actuator.copy())
         driven |= forces[0] != forces[1]
     free = np.flatnonzero(~driven)
+    if not len(free):
+        return qpos.copy(), 0.0
 
     def missing(moved: Array) -> tuple[Array, Array]:
         place, motion = qpos.copy(), np.zeros(model.nv)

@@ -1,7 +1,6 @@
 from .campaign import run_campaign as run_campaign
 from .design_point import smallest_failure as smallest_failure
-from .failure_search import Certificate as Certificate
-from .failure_search import Recheck as Recheck
+from .failure_search import FailureCertificate as FailureCertificate
 from .failure_search import ReliabilityProblem as ReliabilityProblem
 from .failure_search import certify as certify
 from .funnels import FunnelCheck as FunnelCheck

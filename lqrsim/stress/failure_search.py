@@ -31,7 +31,7 @@ from lqrsim.errors import (
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
-from lqrsim.results.certificate import Certificate
+from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -316,11 +316,11 @@ class RareFailures:
         chosen = np.linspace(0, len(others), count - 1, endpoint=False).astype(int)
         return self.splitting.failures[[worst, *others[np.unique(chosen)[: len(others)]]]]
 
-    def certificate(self) -> Certificate:
+    def certificate(self) -> FailureCertificate:
         """The probability with all that it takes to measure it again; `save` writes it, and `certify` checks it."""
         problem, one = self.problem, self.probability
         asked = {name: getattr(problem, name) for name in _ASKED}
-        return Certificate(
+        return FailureCertificate(
             **asked, **_facts(problem), solution=problem.score.solution, probability=one.value, low=one.low,
             high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions,
             particles=self.options["particles"], seed=self.options["seed"], versions=versions(),
@@ -364,14 +364,14 @@ class Recheck:
     """A certificate, measured again.
 
     Attributes:
-      certificate: the Certificate.
+      certificate: the FailureCertificate.
       measured: the RareFailures of the same seed.
       differences: how the two differ, a line each; empty if nothing does.
       changed: why the bits may differ, so that only the intervals were compared: another seed, or versions that have
         changed since; else empty.
     """
 
-    certificate: Certificate
+    certificate: FailureCertificate
     measured: RareFailures
     differences: tuple[str, ...]
     changed: str
@@ -393,7 +393,7 @@ class Recheck:
 
 
 def certify(
-    certificate: Certificate,
+    certificate: FailureCertificate,
     *,
     repetitions: int | None = None,
     seed: int | None = None,
@@ -418,7 +418,7 @@ def certify(
       InputError: an option is out of range; or the scenario is someone's own, and none is given.
       NoFailure: none was found.
     """
-    check_kind("certificate", certificate, Certificate, "a Certificate, such as rare.certificate()")
+    check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")
     every = len(certificate.repetitions)
     count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
     if scenario is None and ":" in certificate.scenario:

@@ -119,6 +119,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "parameters": {"mass": 2.0},
         }, 0.2),
         "MjcfRobot.with_parameters": ({"self": slider, "mass": 2.0, "slider_damping": 0.1},),
+        "MjcfRobot.settled": ({"self": slider, "state": slider.at(slider=0.1)},),
         "MjcfRobot.hold": ({"self": slider, "state": slider.at(slider=0.1)},),
         "MjcfRobot.problem": ({
             "self": slider, "start": slider.at(), "goal": slider.at(slider=0.2), "steps": 5, "dt": 0.02,

@@ -187,6 +187,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     searching = {"score": line, "size": 3, "seed": 0}
     # One in five or so fails.
     reliability = ls.stress.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
+    certificate = reliability.rare_failures(particles=20, repetitions=2, seed=0).certificate()
     return {
         "Campaign": (asked,),
         "Campaign.disturbances": ({"self": campaign, "cell": cell},),
@@ -237,6 +238,11 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "rare_failures": {"particles": 20, "repetitions": 2}, "smallest_failure": {"rounds": 1}
             }.items()
         },
+        "FailureCertificate": (vars(certificate),),
+        "certify": ({
+            "certificate": certificate, "repetitions": 2, "seed": 0, "scenario": reference, "report": print_nothing,
+            "progress": print_nothing,
+        }, 0.1),
         "report": ({
             "results": results, "out": place.folder / "report.html", "videos": 0, "progress": print_nothing
         }, 0.05),
