@@ -12,7 +12,6 @@ If none of these converges, the plan that violates the constraints least is the 
 lead to plans whose violation is stationary and equally large.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -193,11 +192,12 @@ class Ladder:
             found = augmented_lagrangian.satisfy(run, run.result(run.ending))
         return self._after_multipliers(found, most=start.cost)
 
-    def _after_multipliers(self, found: RunResult, *, most: float = sys.float_info.max) -> RunResult | None:
+    def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
         plan = _plan(found)
         self._without_multipliers()
-        if self._budget.stop.due or not found.cost <= most or not np.isfinite(plan.states).all():
+        usable = np.isfinite(found.cost) and found.cost <= most and np.isfinite(plan.states).all()
+        if self._budget.stop.due or not usable:
             return None
         return self._interior(plan, LITTLE)
 
