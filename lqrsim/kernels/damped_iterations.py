@@ -51,8 +51,8 @@ def damped_iterations(first, last, settings, model, work, memory, log):
     long.
 
     A small change of cost can come from a short step, so two in a row are required. Then one more undamped pass about
-    the plan measures its optimality, and computes the policy and the value functions of the answer. Where nothing but
-    rounding lowers the merit for IDLE iterations in a row, as at a kink of the dynamics, it has stalled.
+    the plan measures its optimality, and computes the policy and the value functions of the answer. Where the
+    merit falls by nothing but rounding in IDLE steps in a row, as at a kink of the dynamics, it has stalled.
 
     With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
     `smoother_iterations`.
@@ -80,9 +80,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
             write_row(log[done], cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
         else:
             tighten_damping(memory)
-            memory.idle += 1
-            stalled = memory.weight > 1e12 or memory.idle >= IDLE
-            settled = stalled
+            settled = stalled = memory.weight > 1e12
             write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
         if settled or full:
             outcome, _ = relinearize(settings, settled, negligible, model, work, memory, log[done])
