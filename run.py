@@ -31,6 +31,7 @@ COMMANDS = {
     "demo": "solve, simulate and render both robots (arguments go to `lqrsim demo`)",
     "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
     "check": "check lint, formatting and types",
+    "numbers": "print the numbers of the pages again, which takes hours (arguments: numbers --help)",
     "docs": "build the documentation site into build/site; warnings are errors",
     "setup": "only set up what the other commands need",
 }
@@ -42,7 +43,7 @@ def main() -> int:
         prog="run.py",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="The commands of this project. Each first sets up what it needs.",
-        epilog="commands:\n" + "\n".join(f"  {name:6} {text}" for name, text in COMMANDS.items()),
+        epilog="commands:\n" + "\n".join(f"  {name:7} {text}" for name, text in COMMANDS.items()),
     )
     parser.add_argument("command", choices=COMMANDS, metavar="command", help=" | ".join(COMMANDS))
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="passed on to the command")
@@ -67,6 +68,8 @@ def main() -> int:
         every = ["-n", str((os.cpu_count() or 1) + 1), "--dist", "loadfile", "--no-loadscope-reorder"]
         every += [] if rest == ["--long"] else ["-m", "not long"]
         return run([PYTHON, "-m", "pytest", *(every if rest in ([], ["--long"]) else rest)])
+    if options.command == "numbers":
+        return run([PYTHON, "tests/tools/print_numbers.py", *rest])
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])
