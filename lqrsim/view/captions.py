@@ -31,7 +31,8 @@ class Caption:
         self.recorded, self.overlays, self.speed, self.over = recorded, overlays, speed, over
         self.letter_height = _letter_height(box.width, box.height)
         which = f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else ""
-        title = title or f"{run.robot} in {run.scene}{which}".replace("_", " ")
+        where = "" if run.scene == run.robot else f" in {run.scene}"  # an MJCF with a robot is both
+        title = title or f"{run.robot}{where}{which}".replace("_", " ")
         self.width = box.width // 4 if over else box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
         # Readings keep their place: beside the title in a strip that is wide enough, otherwise in lines of their own.
