@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario
-    from lqrsim.view.viewed_replanner import MovableGoal
+    from lqrsim.view.viewer import MovableGoal
     from lqrsim.view.viewer_base import Viewer
 
 
@@ -260,7 +260,7 @@ class View:
         from lqrsim.commands import console
         from lqrsim.control.replanner import Replanner
         from lqrsim.errors import InputError
-        from lqrsim.view.viewed_replanner import MovableGoal
+        from lqrsim.view.viewer import MovableGoal
 
         assert self.replan is not None
         every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
