@@ -26,8 +26,8 @@ from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goa
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 
 TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 

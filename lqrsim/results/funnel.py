@@ -19,9 +19,9 @@ from lqrsim.errors import (
     shaped,
     vectors_of,
 )
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 

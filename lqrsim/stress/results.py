@@ -12,17 +12,16 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
 from lqrsim.results import notebook, save_load
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.stress.analysis import alike
-from lqrsim.stress.manifest import GIVEN, cells_of, digest_of_solution, read_manifest
+from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE, rate
-from lqrsim.stress.trial_tables import Damaged, Table, read
 from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # that a summary lists

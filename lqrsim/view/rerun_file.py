@@ -13,8 +13,8 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError, check_path
+from lqrsim.results.archive import sha256
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
 from lqrsim.view.decorative_geoms import PLAN_RGB

@@ -19,8 +19,8 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
