@@ -210,9 +210,6 @@ class Problem:
 
         Args:
           seconds: how much later, in seconds.
-
-        Returns:
-          Another Problem; this one does not change.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
         return other._bound_anew() if self.moving else other
@@ -300,9 +297,6 @@ class Problem:
 
         Args:
           which: "initial", "stage_cost" or "final_cost".
-
-        Returns:
-          The terms, one for each cost that was added.
         """
         return self._terms[check_name("which", which, self._terms)]
 

@@ -85,9 +85,6 @@ def run_campaign(
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
       progress: called with the number of finished trials and of all trials: at the start, and after each shard.
 
-    Returns:
-      The Results.
-
     Raises:
       InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder
         belongs to another campaign, holds other files, is being written by another process or cannot be written; the

@@ -129,7 +129,6 @@ def write(contents: bytes, path: Path) -> None:
 
 def read(path: Path, shard: Shard, campaign: str) -> Table:
     """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
-
     try:
         contents = path.read_bytes()
     except OSError as error:

@@ -93,9 +93,6 @@ class Results:
           cell: one of `cells`.
           partial: whether to accept a cell that is not finished.
 
-        Returns:
-          The Outcomes.
-
         Raises:
           InputError: a file is damaged, no trial has been run, or, without `partial`, one is missing.
         """
@@ -206,9 +203,6 @@ class Results:
         Args:
           policy: its name.
 
-        Returns:
-          The Solution.
-
         Raises:
           InputError: its file is damaged.
         """
@@ -223,9 +217,6 @@ class Results:
 
         Args:
           cell: one of `cells`; None for all.
-
-        Returns:
-          An iterator of Shards.
         """
         trials, size = self.manifest["campaign"]["trials"], self.manifest["campaign"]["shard"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
@@ -244,9 +235,6 @@ class Results:
         Args:
           cell: one of them.
 
-        Returns:
-          The index, from 0.
-
         Raises:
           InputError: it is none of them.
         """
@@ -261,9 +249,6 @@ class Results:
 
         Args:
           shard: one of `shards`.
-
-        Returns:
-          The path.
         """
         check_kind("shard", shard, Shard, "a Shard of the campaign")
         check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
@@ -274,9 +259,6 @@ class Results:
 
         Args:
           shard: one of `shards`.
-
-        Returns:
-          Column -> values, one per trial.
         """
         return read(self.path(shard), shard, self.manifest["digest"])
 
@@ -304,9 +286,6 @@ class Results:
         Args:
           shard: one of `shards`.
 
-        Returns:
-          Column -> values, one per trial.
-
         Raises:
           InputError: the file is missing or damaged.
         """
@@ -331,9 +310,6 @@ class Results:
         Args:
           command: "report" or "replay".
           *options: further words of the command line.
-
-        Returns:
-          The command line.
 
         Raises:
           InputError: another command, or an option that is not text.
@@ -365,9 +341,6 @@ def replay(
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
 
-    Returns:
-      A Rollout of one trial.
-
     Raises:
       InputError: there is no such cell or trial, or the scenario is a function of yours, and `Results` was not given
         it.
@@ -394,7 +367,6 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     Raises:
       InputError: the row's file is missing or damaged.
     """
-
     was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"

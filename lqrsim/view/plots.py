@@ -48,9 +48,6 @@ def plot_run(
       world: the obstacles, as the scene has them.
       trial: row of each rollout.
 
-    Returns:
-      The path.
-
     Raises:
       InputError: the rollouts are of other systems, or the file cannot be written.
     """
@@ -253,9 +250,6 @@ def plot_policy(
       radius: radius of the robot, in metres.
       tube: tube of the solution, from `predict_tube`.
 
-    Returns:
-      The path.
-
     Raises:
       InputError: the solution has no policy, the tube is of another plan or has no position, or the file cannot be
         written.
@@ -412,9 +406,6 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
       radius: radius of the robot, in metres.
-
-    Returns:
-      The path.
 
     Raises:
       InputError: the position is not among the funnel's states, or the file cannot be written.
