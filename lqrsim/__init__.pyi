@@ -72,8 +72,8 @@ from .solvers.sampling import sample_costs as sample_costs
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.funnels import funnel as funnel
-from .verify.rollout_check import verify_run as verify_run
-from .verify.video_check import verify_video as verify_video
+from .verify.checks import verify_run as verify_run
+from .verify.checks import verify_video as verify_video
 from .view.render import render as render
 
 __version__: str

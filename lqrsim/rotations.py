@@ -65,13 +65,10 @@ def vector_rate(r: Vector, w: Vector) -> list[Any]:
 
 
 def quaternion(rotation_vector: npt.ArrayLike) -> Array:
-    """Unit quaternions (..., 4), scalar first as in MuJoCo, of rotation vectors (..., 3).
+    """The unit quaternions (..., 4), scalar first as in MuJoCo, of rotation vectors (..., 3).
 
     Args:
       rotation_vector: (..., 3), in radians.
-
-    Returns:
-      (..., 4).
 
     Raises:
       InputError: the argument is not numbers of that shape.
@@ -83,13 +80,10 @@ def quaternion(rotation_vector: npt.ArrayLike) -> Array:
 
 
 def rotation_vector(quaternion: npt.ArrayLike) -> Array:
-    """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4), scalar first, of any length and sign.
+    """The rotation vectors (..., 3), at most half a turn in radians, of quaternions (..., 4), scalar first, any size.
 
     Args:
       quaternion: (..., 4), scalar first.
-
-    Returns:
-      (..., 3), in radians.
 
     Raises:
       InputError: the argument is not numbers of that shape.

@@ -25,8 +25,8 @@ from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, Cell, run_campaign
+from lqrsim.stress.campaign_files import Damaged, unpack
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.trial_tables import Damaged, unpack
 
 OWN = """
 import dataclasses
@@ -458,7 +458,7 @@ def test_a_full_disk_stops_it_until_there_is_room(
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
-    code = "import sys, time; from pathlib import Path; from lqrsim.stress.lock import sole_writer\n"
+    code = "import sys, time; from pathlib import Path; from lqrsim.stress.campaign_files import sole_writer\n"
     code += "with sole_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     campaign = replace(CAMPAIGN, trials=2)
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:

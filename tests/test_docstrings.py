@@ -52,8 +52,8 @@ def says_what_returns(function: Callable[..., Any], doc: str) -> bool:
     """Whether nothing is returned; or a record, which has a docstring of its own; or the summary names what it is."""
     annotation = inspect.signature(function).return_annotation
     name = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
-    record = name in vars(ls.types) or name in ls.__all__ or hasattr(annotation, "__dataclass_fields__")
-    named = re.match(r"(The|A|An|Another|Whether|How|Controls|Points|df/dx) ", doc)
+    record = name in vars(ls.types) or name in ls.__all__ or getattr(annotation, "__module__", "").startswith("lqrsim")
+    named = re.match(r"(The|A|An|Another|Whether|How|Controls|Points|df/dx) |.*[Rr]eturns its path", doc)
     return annotation in (None, "None", inspect.Signature.empty) or record or named is not None
 
 

@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 
 
 def test_it_hashes_the_bytes_of_its_parts() -> None:

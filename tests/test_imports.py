@@ -42,7 +42,7 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("fields", "schema", "hashing", "coordinates", "solution_parts", "value_functions"),
+        ("fields", "schema", "coordinates", "solution_parts", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
         ("plan",),
         ("solution",),
@@ -53,7 +53,6 @@ FLOORS_WITHIN = {
         ("sources",),
         ("fingerprint", "plain", "printer"),
         ("compiled_module", "symbolic"),
-        ("numba_functions",),
         ("user_functions",),
     ),
     "problem": (

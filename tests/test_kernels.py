@@ -78,7 +78,7 @@ from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.costs import LimitCost
 from lqrsim.problem.noise import numbers_of
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled

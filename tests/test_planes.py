@@ -19,7 +19,7 @@ from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.scenes.world import KINDS, PLANES
 from lqrsim.simulation.disturbances import Effect
-from lqrsim.view import cameras, gl, policy_plot, viewer
+from lqrsim.view import cameras, gl, plots, viewer
 from lqrsim.view.viewer_base import Viewer
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
@@ -242,7 +242,7 @@ def test_the_figures_show_the_cut(flown, tmp_path: Path) -> None:
     assert "z (m)" in labels
     assert "y (m)" not in labels
     figure = Figure()
-    policy_plot.draw(figure, solution, plant.scene.world, plant.robot.radius)
+    plots.draw_policy(figure, solution, plant.scene.world, plant.robot.radius)
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "z (m)")
     # The block's outline in it has the lower corners of the cut: half sizes 0.15 and 0.8 about (0, 0.2).

@@ -14,12 +14,12 @@ import lqrsim as ls
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.figure_parts import draw_projected, draw_tube
-from lqrsim.view.policy_plot import draw, strength
+from lqrsim.view.plots import draw_policy, strength
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario, tube: Tube | None = None) -> Figure:
     figure = Figure()
-    draw(figure, solution, scenario.scene.world, scenario.robot.radius, tube)
+    draw_policy(figure, solution, scenario.scene.world, scenario.robot.radius, tube)
     return figure
 
 

@@ -13,9 +13,9 @@ from lqrsim.cli import main
 from lqrsim.commands.options import ControllerName, PolicyName
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
-from lqrsim.reports.curves import COLOURS, LINES, MARKERS
+from lqrsim.reports.page import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
-from lqrsim.stress.manifest import read_manifest
+from lqrsim.stress.campaign_files import read_manifest
 from lqrsim.stress.policies import (
     CONTROLLERS,
     DEFAULT_POLICIES,

@@ -11,7 +11,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.verify import pixels
+from lqrsim.verify import checks
 from lqrsim.verify.ground_truth import check_plan
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
@@ -317,11 +317,11 @@ def test_views_that_disagree_are_told_apart() -> None:
     side = Camera("side", (0.0, -10.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 5.0)
     point = np.array([0.3, -0.2, 0.5])
     measured = np.array([[view.axes @ point for view in (top, side)]])
-    place, apart = pixels.triangulate((top, side), measured, "xyz")
+    place, apart = checks.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-12)
     measured[0, 0, 0] += 0.01
-    place, apart = pixels.triangulate((top, side), measured, "xyz")
+    place, apart = checks.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point + np.array([0.005, 0, 0])], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0.01, rtol=0, atol=1e-12)
 
@@ -338,13 +338,13 @@ def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -
     image[90:92, 90] = (20, 220, 10)
     # Where a fifth of it is outside of the picture, its middle is not the ball's, by less than that.
     near = 0.03 if centre[0] > radius else 0.5
-    np.testing.assert_allclose(pixels.marker_centre(image, radius), centre, rtol=0, atol=near)
+    np.testing.assert_allclose(checks.marker_centre(image, radius), centre, rtol=0, atol=near)
     image[:, 50:] = 0
     image[:, :50] = 0
-    assert np.isnan(pixels.marker_centre(image, radius)).all()
+    assert np.isnan(checks.marker_centre(image, radius)).all()
 
 
 def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
     views = [cameras.side(case.run)]
     with pytest.raises(ls.InputError, match="views: got side, want"):
-        pixels.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)
+        checks.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)

@@ -22,7 +22,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.view import viewer
 from lqrsim.view.decorative_geoms import PLAN_RGB
-from lqrsim.view.viewed_replanner import MovableGoal, model_with_goal
+from lqrsim.view.viewer import MovableGoal, model_with_goal
 from lqrsim.view.viewer_base import PUSHES
 
 PORT = 19700 + os.getpid() % 1000  # of our own, also where tests run side by side

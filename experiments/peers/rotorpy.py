@@ -29,8 +29,8 @@ import lqrsim as ls
 from lqrsim import rotations
 from lqrsim.control.controllers import Controller, ControllerRun
 from lqrsim.errors import Array
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 from peers.common import Unavailable
 
 

@@ -42,7 +42,7 @@ from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
 from lqrsim.kernels import records
 from lqrsim.machine import instruction_set
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 
 logger = logging.getLogger("lqrsim")
 

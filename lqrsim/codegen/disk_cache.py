@@ -18,8 +18,7 @@ from pathlib import Path
 import platformdirs
 
 from lqrsim.errors import InputError
-from lqrsim.results.archive import replacing
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import replacing, sha256
 
 LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"

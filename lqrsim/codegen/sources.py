@@ -19,7 +19,7 @@ from lqrsim import kernels
 from lqrsim.codegen.language import CONSTANTS, MATH, SubsetError
 from lqrsim.errors import InputError, check_kind, excerpt
 from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 
 # Words of the language, as `declarations.py` declares them.
 WORDS = (

@@ -13,8 +13,7 @@ from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Rare
 from lqrsim.commands.solving import List, Simulate, Solve
 from lqrsim.commands.stressing import Replay, Report, Stress
-from lqrsim.commands.verifying import Verify
-from lqrsim.commands.viewing import Render, View
+from lqrsim.commands.viewing import Render, Verify, View
 
 _ALL = (
     List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Certify, Break, FunnelCommand,

@@ -18,8 +18,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.view import gl
-from lqrsim.view.plots import plot_run
-from lqrsim.view.policy_plot import plot_policy
+from lqrsim.view.plots import plot_policy, plot_run
 
 TABLE = (
     f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"

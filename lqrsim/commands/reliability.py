@@ -237,7 +237,7 @@ class FunnelCommand(PolicyOptions):
         from lqrsim.simulation.disturbances import InitialStateError
         from lqrsim.stress.funnels import FunnelOptions, funnel
         from lqrsim.stress.policies import make_policy
-        from lqrsim.view.funnel_plot import plot_funnel
+        from lqrsim.view.plots import plot_funnel
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/funnel") / folder_name(scenario)

@@ -129,7 +129,7 @@ class Solve:
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
             from lqrsim.simulation.uncertainty_of import tube_under
-            from lqrsim.view.policy_plot import plot_policy
+            from lqrsim.view.plots import plot_policy
 
             tube, remark = tube_under(problem, solution, scenario.plant(), scenario.disturbances)
             if remark:

@@ -1,6 +1,9 @@
-"""Commands that render and view runs."""
+"""Commands that render and view runs.
+
+The command that verifies runs from pixels."""
 
 import contextlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -8,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, DesignSet, SolutionFile, optional
+from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario
-    from lqrsim.view.viewed_replanner import MovableGoal
+    from lqrsim.view.viewer import MovableGoal
     from lqrsim.view.viewer_base import Viewer
 
 
@@ -260,7 +263,7 @@ class View:
         from lqrsim.commands import console
         from lqrsim.control.replanner import Replanner
         from lqrsim.errors import InputError
-        from lqrsim.view.viewed_replanner import MovableGoal
+        from lqrsim.view.viewer import MovableGoal
 
         assert self.replan is not None
         every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
@@ -272,3 +275,51 @@ class View:
         except InputError as error:
             console.say(f"the goal cannot be moved: {error}")
             return replanner.live, None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Check a run against its rendered frames.
+
+    A run is rendered in calibrated fixed views. A video is decoded, and the robot's mark is located in its panes `top`
+    and `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
+
+      lqrsim verify runs/quadrotor/rollout.npz
+      lqrsim verify videos/quadrotor/video.mp4
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="RUN.npz|VIDEO.mp4")]
+    """A file from `lqrsim simulate`, or its video from `lqrsim render` with the cameras or insets top and side."""
+    run_file: Annotated[Path | None, optional("RUN.npz"), arg(name="run")] = None
+    """The run that the video shows. By default the run in its folder that the video names."""
+    trial: Annotated[int | None, optional("N")] = None
+    """Row of the rollout, from 0. By default 0, or the first that the video shows."""
+    solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
+    """Solution of the run, to check the recorded plan. By default solution.npz beside the run."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code: 1 if a test failed."""
+        from lqrsim.commands import as_json, console
+        from lqrsim.results import save_load
+        from lqrsim.results.rollout import Rollout
+        from lqrsim.results.solution import Solution
+        from lqrsim.verify.checks import run_beside, verify_run, verify_video
+        from lqrsim.verify.ground_truth import ran_policy_of
+
+        is_run = self.file.suffix.lower() == ".npz"
+        path = self.file if is_run else self.run_file or run_beside(self.file)
+        rollout, beside = save_load.load(path, Rollout), path.with_name("solution.npz")
+        solution = None
+        if self.solution or os.path.isfile(beside):
+            solution = save_load.load(self.solution or beside, Solution)
+            # The solution file beside a run may belong to another run; one that is given is used in any case.
+            solution = solution if self.solution or ran_policy_of(solution, rollout) else None
+        with console.progress("verifying", "frame") as progress:
+            if is_run:
+                found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+            else:
+                found = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
+        console.say(found.summary())
+        console.result(verification=as_json.of_verification(found))
+        return 0 if found.passed else 1

@@ -17,8 +17,8 @@ from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.kernels import policy_evaluation
 from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy

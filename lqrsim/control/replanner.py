@@ -26,9 +26,9 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.hashing import sha256
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.solvers.parallel import workers
 

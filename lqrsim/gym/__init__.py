@@ -18,9 +18,7 @@ try:
 except ModuleNotFoundError as error:
     raise ImportError(f"lqrsim.gym: {error}; run: pip install 'lqrsim[gym]'") from None
 
-from lqrsim.gym.environment import Environment
-from lqrsim.gym.expert import Expert
-from lqrsim.gym.vector import VectorEnvironment
+from lqrsim.gym.environment import Environment, Expert, VectorEnvironment
 from lqrsim.scenarios.packaged import Scenario
 
 __all__ = ["Environment", "Expert", "VectorEnvironment", "make_env", "make_vec"]

@@ -103,18 +103,12 @@ class CollisionGeoms(abc.ABC):
 
         Args:
           scene: the scene of a plant.
-
-        Returns:
-          Whether they are.
         """
 
     @abc.abstractmethod
     def travel(self, before: Array, after: Array) -> Array:
-        """How far any point moves at most on a straight line between states.
+        """How far in metres any point moves at most on a straight line between states.
 
         Args:
           before: (..., n). after: (..., n).
-
-        Returns:
-          (...), in metres.
         """

@@ -192,9 +192,6 @@ class CollisionSpheres:
         Args:
           dynamics: dynamics of the system whose states move the balls.
 
-        Returns:
-          The `SphereCenters`.
-
         Raises:
           InputError: the places do not fit the system.
         """
@@ -297,9 +294,6 @@ class CollisionSpheres:
         Args:
           dynamics: dynamics of the system whose states move the balls.
           states: (..., n).
-
-        Returns:
-          (..., K, 3), world coordinates in metres.
         """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         states = vectors_of("states", states, len(dynamics.state_coordinates))

@@ -96,9 +96,6 @@ class Constraint(abc.ABC):
         Args:
           dynamics: dynamics of the system.
 
-        Returns:
-          The ConstraintTerm that solvers use.
-
         Raises:
           InputError: it does not fit the system.
         """

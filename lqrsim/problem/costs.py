@@ -103,9 +103,6 @@ class Cost(abc.ABC):
         Args:
           dynamics: dynamics of the system.
 
-        Returns:
-          The CostTerm that solvers use.
-
         Raises:
           InputError: it does not fit the system.
         """

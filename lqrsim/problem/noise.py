@@ -142,9 +142,6 @@ class Noise:
         Args:
           strength: the number, at least 0; strengths of several calls multiply.
 
-        Returns:
-          Another Noise; this one does not change.
-
         Raises:
           InputError: the strength is negative or not finite.
         """
@@ -157,9 +154,6 @@ class Noise:
 
         Args:
           **values: name of a parameter -> its value.
-
-        Returns:
-          Another Noise; this one does not change.
 
         Raises:
           InputError: there is no such parameter, or the value is not finite.
@@ -175,9 +169,6 @@ class Noise:
 
         Args:
           dynamics: dynamics of the system, with its states and controls.
-
-        Returns:
-          The source to compile, and its data.
 
         Raises:
           InputError: the noise does not fit the system.
@@ -259,15 +250,12 @@ class Noise:
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
-        """M at given states and controls.
+        """The matrices M (K, n, k) at given states and controls, in the states' units.
 
         Args:
           dynamics: dynamics of the system, with its states and controls.
           states: (K, n).
           controls: (K, m).
-
-        Returns:
-          (K, n, k), in the states' units, for each.
 
         Raises:
           InputError: the noise, the states or the controls do not fit the system.

@@ -26,8 +26,8 @@ from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goa
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 
 TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
@@ -210,9 +210,6 @@ class Problem:
 
         Args:
           seconds: how much later, in seconds.
-
-        Returns:
-          Another Problem; this one does not change.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
         return other._bound_anew() if self.moving else other
@@ -300,9 +297,6 @@ class Problem:
 
         Args:
           which: "initial", "stage_cost" or "final_cost".
-
-        Returns:
-          The terms, one for each cost that was added.
         """
         return self._terms[check_name("which", which, self._terms)]
 

@@ -1,30 +1,174 @@
-"""The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
+"""The figures of a stress test: success and tracking error over strength, with bands.
 
+The videos of a report: the worst trial of each policy and sweep, repeated and rendered, as text for the page.
+
+The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
+
+import base64
 import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files as packaged
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 
-from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path
+from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_path
 from lqrsim.reports import tables
-from lqrsim.reports.curves import plot_errors, plot_success
-from lqrsim.reports.videos import base64_text, videos_of_worst
 from lqrsim.results.goal import tracking_unit
 from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.stress import analysis
+from lqrsim.stress.analysis import Success
 from lqrsim.stress.policies import DESIGNED, design_disturbances
-from lqrsim.stress.results import Results
+from lqrsim.stress.results import Results, replay
 from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.view import gl, style
+from lqrsim.view.style import RUNS
+
+SIZE = 5.2, 3.7
+# One for each policy; lines and markers distinguish them in grey.
+COLOURS = (*RUNS, "#e69f00", "#882255")
+LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P")
+
+
+def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
+    """Write a figure (png, pdf or svg) of each policy's success over strength, with a band; returns its path."""
+    with style.figure(path, size=SIZE) as figure:
+        axes = figure.add_subplot()
+        for number, (policy, points) in enumerate(curves.items()):
+            strengths = [point.cell.strength for point in points]
+            value, low, high = 100 * np.array([(p.band.value, p.band.low, p.band.high) for p in points]).T
+            _draw(axes, number, policy, strengths, (low, value, high))
+        axes.set(xlabel="strength", ylabel="trials that reached their goal (%)", ylim=(-3, 103))
+        axes.set_yticks(np.linspace(0, 100, 6))
+        _finish(figure, axes, curves)
+    return Path(path)
+
+
+def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.PathLike[str], *, label: str) -> Path:
+    """Write a figure of three quantiles over strength for each policy; logarithmic if they span decades.
+
+    Args:
+      curves: policy -> strength -> low, middle and high.
+      label: label of the vertical axis.
+    """
+    with style.figure(path, size=SIZE) as figure:
+        axes = figure.add_subplot()
+        disturbed = [band for of_strength in curves.values() for strength, band in of_strength.items() if strength > 0]
+        known = np.array([value for band in disturbed for value in band if np.isfinite(value) and value > 0])
+        decades = len(known) > 0 and known.max() > 100 * known.min()
+        for number, (policy, of_strength) in enumerate(curves.items()):
+            # Undisturbed errors are tiny, and would take up most of a logarithmic axis.
+            shown = {strength: band for strength, band in of_strength.items() if strength > 0 or not decades}
+            if shown:
+                _draw(axes, number, policy, list(shown), np.array(list(shown.values())).T)
+        if decades:
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
+        axes.set(xlabel="strength", ylabel=label)
+        _finish(figure, axes, curves)
+    return Path(path)
+
+
+def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: Sequence[Array] | Array) -> None:
+    low, value, high = band
+    colour = COLOURS[number % len(COLOURS)]
+    axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
+    # Curves may coincide: lower ones are wider, with larger markers.
+    wide = max(4 - number, 1)
+    axes.plot(
+        strengths, value, linestyle=LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],
+        markersize=3 + 1.3 * wide, linewidth=0.8 + 0.4 * wide, markerfacecolor="white", label=name, clip_on=False,
+    )  # fmt: skip
+
+
+def _finish(figure: Figure, axes: Axes, curves: Mapping[str, object]) -> None:
+    ticks = sorted({round(float(x), 12) for line in axes.lines for x in np.asarray(line.get_xdata())})
+    if len(ticks) <= 8:
+        axes.set_xticks(ticks)
+    axes.margins(x=0.02)
+    figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=min(len(curves), 4), handlelength=3)
+    rows = -(-len(curves) // 4)
+    figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * rows))
+
+
+LARGEST = 1_500_000  # bytes of a video
+SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
+FPS = 15
+
+
+def videos_of_worst(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
+    """A remark on all videos, and then each video."""
+    chosen = [
+        next((one for one in tables.worst_trials(table, group) if one.outcome != "error"), None)
+        for group in tables.policies_and_sweeps(table)
+    ]
+    chosen = [one for one in chosen if one is not None][:count]
+    problem = ""
+    if chosen:
+        try:
+            gl.bind()
+        except InputError as error:
+            problem = str(error)
+    if not chosen:
+        yield "No videos were requested." if count == 0 else "There is no trial to render."
+    elif problem:
+        yield f"There are none, for this machine cannot draw pictures: {problem}"
+    else:
+        yield (
+            "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
+            " Line: the plan; trace: the path, coloured by tracking error."
+        )
+    for one in chosen:
+        video = {
+            "label": _label(one),
+            "command": results.command_of("replay", "--cell", str(one.cell), "--trial", str(one.trial)),
+            "data": "",
+            "problem": problem,
+        }
+        yield video if problem else video | _video(results, one, folder)
+
+
+def _label(one: analysis.Trial) -> str:
+    what = f" with {one.obstacle}" if one.obstacle else ""
+    return (
+        f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}:"
+        f" {one.outcome}{what} after {one.ended:.2f} s, least clearance {one.clearance:.3f} m."
+    )
+
+
+def _video(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
+    """The video as text, or the reason for which there is none."""
+    from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
+
+    try:
+        rollout = replay(results, one.cell, one.trial)
+        title = f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}"
+        for width, height in SIZES:
+            path = render(rollout, folder / "video.mp4", titles=[title], size=(width, height), fps=FPS)
+            if path.stat().st_size <= LARGEST:
+                return {"data": base64_text(path), "width": width, "height": height}
+    except InputError as error:
+        return {"problem": str(error)}
+    return {"problem": f"it takes more than {LARGEST / 1e6:g} MB."}
+
+
+def base64_text(path: Path) -> str:
+    """A file in base64, for a page."""
+    return base64.b64encode(path.read_bytes()).decode("ascii")
+
 
 MOST_VIDEOS = 100  # a page with more is too large for a browser
 

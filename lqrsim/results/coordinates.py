@@ -170,13 +170,10 @@ class Coordinates:
         return points
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """Positions (..., 2 or 3) of points (..., 3) in the world, projected onto the plane.
+        """The positions (..., 2 or 3) of points (..., 3) in the world, projected onto the plane.
 
         Args:
           points: (..., 3), in metres.
-
-        Returns:
-          Positions (..., d).
 
         Raises:
           InputError: not numbers of such a shape.
@@ -194,9 +191,6 @@ class Coordinates:
         Args:
           vector: (..., n).
           near: (..., n); leading dimensions broadcast.
-
-        Returns:
-          (..., n).
 
         Raises:
           InputError: not numbers of such shapes.
@@ -219,9 +213,6 @@ class Coordinates:
         Args:
           vector: (..., n).
           near: (..., n); leading dimensions broadcast.
-
-        Returns:
-          (..., n).
         """
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
@@ -231,9 +222,6 @@ class Coordinates:
         Args:
           low: lower limits, a number or (n,).
           high: upper limits, a number or (n,).
-
-        Returns:
-          Coordinates with these limits.
 
         Raises:
           InputError: a limit is not a number, or the lower is not below the upper.
@@ -267,13 +255,10 @@ class Coordinates:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
-        """`vector` (..., n) clipped to the limits.
+        """The `vector` (..., n), clipped to the limits.
 
         Args:
           vector: (..., n).
-
-        Returns:
-          (..., n), within the limits.
         """
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
 

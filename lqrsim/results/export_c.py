@@ -90,9 +90,6 @@ def export_c(
       interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
       name: of the files and the functions: small letters, digits and underscores, a letter first.
 
-    Returns:
-      An ExportedC.
-
     Raises:
       InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
     """

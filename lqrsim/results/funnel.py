@@ -19,9 +19,9 @@ from lqrsim.errors import (
     shaped,
     vectors_of,
 )
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 
@@ -177,9 +177,6 @@ class Funnel:
           t: seconds since the start of the plan.
           about: (n,), the centre of the ellipsoid, in place of the plan's state.
 
-        Returns:
-          (...), True or False.
-
         Raises:
           InputError: as `deviation`.
         """
@@ -202,15 +199,12 @@ class Funnel:
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 
     def states_at(self, knot: int, points: npt.ArrayLike, level: float) -> Array:
-        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
+        """The states (..., n) in the ellipsoid of a level at a knot, of points (..., d) of the unit ball.
 
         Args:
           knot: number of the knot.
           points: (..., d).
           level: level of the ellipsoid.
-
-        Returns:
-          (..., n).
 
         Raises:
           InputError: there is no such knot, the points have another shape, or the ellipsoid is flat.

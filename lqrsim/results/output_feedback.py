@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, check_fields
-from lqrsim.results.hashing import sha256
 
 
 @dataclass(frozen=True, kw_only=True)

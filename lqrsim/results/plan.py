@@ -79,9 +79,6 @@ class Plan:
           steps: steps that are over, fewer than the plan has.
           horizon: "moving" or "shrinking".
 
-        Returns:
-          A plan of the same type.
-
         Raises:
           InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
         """

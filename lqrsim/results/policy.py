@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, check_fields
-from lqrsim.results.hashing import sha256
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
@@ -79,7 +79,7 @@ class AffinePolicy:
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
 
     def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
-        """The control (..., m) to apply in a measured state (..., n), `t` seconds after the start.
+        """The control (..., m), within its limits, for a measured state (..., n), `t` seconds after the start.
 
         Angles and rotation vectors may be in any representative. The result is clipped to the control limits. Between
         two knots the earlier law holds, as in the plan; `interpolate=True` blends the two, for controllers that run
@@ -89,9 +89,6 @@ class AffinePolicy:
           state: (..., n), measured; angles and rotation vectors in any representative.
           t: seconds since the start, 0 or more.
           interpolate: whether to blend the laws of two knots.
-
-        Returns:
-          Controls (..., m), within the control limits.
 
         Raises:
           InputError: `t` is negative or not finite, or the state is not finite or not of length n.

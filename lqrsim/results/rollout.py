@@ -254,13 +254,10 @@ class Rollout:
         return vectors_of("places", places, 3)
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """Places (..., 2 or 3) of points (..., 3) in the world.
+        """The places (..., 2 or 3) of points (..., 3) in the world.
 
         Args:
           points: (..., 3), in metres.
-
-        Returns:
-          Places (..., 2 or 3).
         """
         points = vectors_of("points", points, 3)
         return self.state_coordinates.of_world(points) if self.state_coordinates.position else points

@@ -50,9 +50,6 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
       result: a Solution, a Rollout, a policy, a Funnel or a FailureCertificate.
       path: FILE.npz.
 
-    Returns:
-      The path.
-
     Raises:
       InputError: the file cannot be written, or its content could not be read again.
     """
@@ -88,7 +85,7 @@ def load(path: str | os.PathLike[str]) -> Saved: ...
 @overload
 def load(path: str | os.PathLike[str], kind: type[_Kind]) -> _Kind: ...
 def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved:
-    """Read what `save` wrote. Loading never runs code.
+    """The result that `save` wrote. Loading never runs code.
 
         solution = ls.load("plan.npz", ls.Solution)
 
@@ -96,9 +93,6 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
       path: path of a file that `save` wrote.
       kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy`, `ls.Funnel`
         or `ls.stress.FailureCertificate`. By default, any.
-
-    Returns:
-      What was saved.
 
     Raises:
       InputError: the file is missing, damaged, of another version or of another kind.

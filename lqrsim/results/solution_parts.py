@@ -191,13 +191,10 @@ class Iteration:
     )
 
     def row(self, number: int) -> str:
-        """This iteration as a line of the table under `HEADER`.
+        """The line of this iteration in the table under `HEADER`.
 
         Args:
           number: number of the iteration, from 1.
-
-        Returns:
-          A line of text.
         """
         number = check_count("number", number, at_least=0)
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"

@@ -58,9 +58,6 @@ class Quadratic:
         Args:
           states: (T+1, n).
 
-        Returns:
-          (T+1,).
-
         Raises:
           InputError: other shapes.
         """

@@ -32,9 +32,6 @@ def get(name: str) -> Robot:
     Args:
       name: one of `names()`.
 
-    Returns:
-      The Robot.
-
     Raises:
       InputError: there is no such robot.
     """

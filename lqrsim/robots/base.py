@@ -66,9 +66,6 @@ class Robot(abc.ABC):
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
           near: (..., n), to which angles are taken nearest; None for any representative.
-
-        Returns:
-          (..., n).
         """
 
     @abc.abstractmethod

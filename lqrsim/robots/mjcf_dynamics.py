@@ -17,8 +17,8 @@ from lqrsim.errors import Array, InputError, check_count, check_name, check_numb
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics
 from lqrsim.scenes.scene import unlogged

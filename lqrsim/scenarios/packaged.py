@@ -57,9 +57,6 @@ class Scenario:
         Args:
           goal_radius: in metres, or None.
           goal_tolerance: a scaled error, or None.
-
-        Returns:
-          Options for `simulate`.
         """
         if goal_radius is None and goal_tolerance is None:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance

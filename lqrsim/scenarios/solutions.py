@@ -31,9 +31,6 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
       solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
       **options: of the solver; a `start` among them replaces the scenario's.
 
-    Returns:
-      The Solution, with the scenario's goal radius.
-
     Raises:
       InputError: as the solver does.
     """
@@ -83,9 +80,6 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     Args:
       scenario: the scenario in which it is to run.
       solution: a Solution, or the path of one.
-
-    Returns:
-      The solution, with the scenario's goal radius.
 
     Raises:
       InputError: it cannot be read, has another system, number of steps, control period or goal, or its plan is not

@@ -147,9 +147,6 @@ class World:
 
         Args:
           seconds: how much later; a negative number is earlier.
-
-        Returns:
-          Another World; this one where nothing moves.
         """
         seconds = check_number("seconds", seconds)
         moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]
@@ -221,13 +218,10 @@ class World:
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
 
     def distance(self, points: npt.ArrayLike) -> Array:
-        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any.
+        """The signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any.
 
         Args:
           points: (..., 3), or (..., 2) in a plane, in metres.
-
-        Returns:
-          (...), in metres; infinite without obstacles.
         """
         points = _places("points", points)
         flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
@@ -238,9 +232,6 @@ class World:
 
         Args:
           points: (..., 3), or (..., 2) in a plane, in metres.
-
-        Returns:
-          (...), indices of obstacles.
 
         Raises:
           InputError: there are no obstacles.

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import Iteration, Multipliers, Trajectory

@@ -17,8 +17,8 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState
+from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Certificate, Iteration, Status, Trajectory

@@ -22,15 +22,23 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
-from lqrsim.stress import cluster, executors
-from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.manifest import GIVEN, NAME, digest_of_solution, read_manifest, write_manifest
+from lqrsim.stress import executors
+from lqrsim.stress.campaign_files import (
+    GIVEN,
+    NAME,
+    Damaged,
+    digest_of_solution,
+    read_manifest,
+    sole_writer,
+    write,
+    write_manifest,
+)
 from lqrsim.stress.policies import (
     DESIGNED,
     POLICIES,
@@ -46,7 +54,6 @@ from lqrsim.stress.results import Results
 from lqrsim.stress.specification import Campaign as Campaign
 from lqrsim.stress.specification import Cell as Cell
 from lqrsim.stress.specification import Shard
-from lqrsim.stress.trial_tables import Damaged, write
 from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, versions
 
@@ -77,9 +84,6 @@ def run_campaign(
         that of the policy "ilqr", any other solution those of all other policies. It is stored in the folder.
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
       progress: called with the number of finished trials and of all trials: at the start, and after each shard.
-
-    Returns:
-      The Results.
 
     Raises:
       InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder
@@ -115,7 +119,7 @@ def run_resolved(
     _check_runnable(campaign, scenario, given)
     _check_folder(folder)
     with contextlib.ExitStack() as stack:
-        client = None if scheduler is None else stack.enter_context(cluster.connected(scheduler))
+        client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(sole_writer(folder))
         _write_or_check_manifest(campaign, scenario, folder, given)
         results = Results(folder, scenario=campaign.scenario)
@@ -130,7 +134,7 @@ def run_resolved(
         if progress is not None:
             progress(done, total)
         if client is not None:
-            work = cluster.run_on_cluster(job, unfinished, client, campaign.time_limit)
+            work = executors.run_on_cluster(job, unfinished, client, campaign.time_limit)
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:

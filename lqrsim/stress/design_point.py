@@ -92,9 +92,6 @@ def smallest_failure(
       seed: seed of all random numbers.
       progress: called with the number of finished rounds, that of all, and the distance so far as text.
 
-    Returns:
-      The DesignPoint: its numbers and its distance from the origin.
-
     Raises:
       InputError: an option is out of range, or none of the failures fails.
       NoFailure: none was given, and none was found.
@@ -236,7 +233,6 @@ def largest_effects(rollout: Rollout, trial: int = 0) -> list[LargestEffect]:
 
     The error of an applied control includes that by the actuators' limits.
     """
-
     last = int(rollout.counts[trial].sum()) - 1
     states, controls = rollout.state_coordinates, rollout.control_coordinates
     measured = states.difference(rollout.measured[trial], rollout.states[trial])

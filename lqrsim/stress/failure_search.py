@@ -31,16 +31,16 @@ from lqrsim.errors import (
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
+from lqrsim.results.archive import sha256
 from lqrsim.results.certificate import FailureCertificate
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.manifest import digest_of_solution
 from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, failure_probability
 from lqrsim.stress.policies import POLICIES, check_designed, make_policy
 from lqrsim.stress.specification import disturbances_as_json

@@ -93,9 +93,6 @@ def funnel(
       threads: as in `simulate`.
       progress: called with the number of finished knots, that of all, and what is being tried as text.
 
-    Returns:
-      A Funnel.
-
     Raises:
       InputError: as `simulate`; a disturbance changes the start of a run; an option is out of range; there is no
         cost-to-go and no shape; or an ellipsoid is flat.
@@ -243,7 +240,8 @@ def check_funnel(
     goal_tolerance: float | None = None,
     threads: int | None = None,
 ) -> tuple[FunnelCheck, ...]:
-    """Run new trials from states drawn uniformly inside a funnel, or in a shell outside, at each knot with a level.
+    """The results of new trials from states drawn uniformly inside a funnel, or in a shell outside, for each knot with
+    a level.
 
     Args:
       funnel: the funnel to check.
@@ -257,9 +255,6 @@ def check_funnel(
       goal_radius: as for `funnel`.
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.
-
-    Returns:
-      A FunnelCheck for each of these knots.
 
     Raises:
       InputError: as `funnel`; the seed is the funnel's; or the solution has another plan.
@@ -396,7 +391,6 @@ def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Ar
 
 def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
     """The level at which an angle is off by half a turn; beyond it the ellipsoid has some states twice."""
-
     space = solution.policy.state_coordinates
     groups = [[i] for i in space.angles] + [[i, i + 1, i + 2] for i in space.rotation_vectors]
     end = np.inf

@@ -176,7 +176,6 @@ class _Pilot:
     @staticmethod
     def _last(good: Callable[[float], bool], guess: float, largest: float, *, factor: float) -> float:
         """The largest good level, by steps of the factor and bisection; 0 if none is found."""
-
         low = high = guess
         if good(guess):
             while low < largest:

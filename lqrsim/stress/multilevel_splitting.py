@@ -96,9 +96,6 @@ def failure_probability(
       level: called with each level that the pilot run finds.
       progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
 
-    Returns:
-      The probability with its interval, and the failures.
-
     Raises:
       InputError: an option is out of range, or a score is NaN.
       NoFailure: none was found.
@@ -244,7 +241,6 @@ def _crank_nicolson_step(
     score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
     """Move each vector if it stays above the level. Returns vectors, scores and the share of accepted moves."""
-
     proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
     proposed_scores = score(proposed)
     accepted = proposed_scores > level

@@ -85,9 +85,6 @@ def outcomes(
       goal_radius: in metres, replaces the rollout's; see `simulate`.
       goal_tolerance: a scaled error, replaces the rollout's; see `simulate`.
 
-    Returns:
-      The Outcomes, one row per trial.
-
     Raises:
       InputError: the problem does not fit the rollout, or a goal option is out of range or does not fit its goal.
     """

@@ -12,17 +12,16 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
 from lqrsim.results import notebook, save_load
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.stress.analysis import alike
-from lqrsim.stress.manifest import GIVEN, cells_of, digest_of_solution, read_manifest
+from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE, rate
-from lqrsim.stress.trial_tables import Damaged, Table, read
 from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # that a summary lists
@@ -93,9 +92,6 @@ class Results:
         Args:
           cell: one of `cells`.
           partial: whether to accept a cell that is not finished.
-
-        Returns:
-          The Outcomes.
 
         Raises:
           InputError: a file is damaged, no trial has been run, or, without `partial`, one is missing.
@@ -207,9 +203,6 @@ class Results:
         Args:
           policy: its name.
 
-        Returns:
-          The Solution.
-
         Raises:
           InputError: its file is damaged.
         """
@@ -224,9 +217,6 @@ class Results:
 
         Args:
           cell: one of `cells`; None for all.
-
-        Returns:
-          An iterator of Shards.
         """
         trials, size = self.manifest["campaign"]["trials"], self.manifest["campaign"]["shard"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
@@ -245,9 +235,6 @@ class Results:
         Args:
           cell: one of them.
 
-        Returns:
-          The index, from 0.
-
         Raises:
           InputError: it is none of them.
         """
@@ -262,9 +249,6 @@ class Results:
 
         Args:
           shard: one of `shards`.
-
-        Returns:
-          The path.
         """
         check_kind("shard", shard, Shard, "a Shard of the campaign")
         check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
@@ -275,9 +259,6 @@ class Results:
 
         Args:
           shard: one of `shards`.
-
-        Returns:
-          Column -> values, one per trial.
         """
         return read(self.path(shard), shard, self.manifest["digest"])
 
@@ -305,9 +286,6 @@ class Results:
         Args:
           shard: one of `shards`.
 
-        Returns:
-          Column -> values, one per trial.
-
         Raises:
           InputError: the file is missing or damaged.
         """
@@ -332,9 +310,6 @@ class Results:
         Args:
           command: "report" or "replay".
           *options: further words of the command line.
-
-        Returns:
-          The command line.
 
         Raises:
           InputError: another command, or an option that is not text.
@@ -366,9 +341,6 @@ def replay(
       frames: whether to record for drawing.
       contacts: whether obstacles stop the robot.
 
-    Returns:
-      A Rollout of one trial.
-
     Raises:
       InputError: there is no such cell or trial, or the scenario is a function of yours, and `Results` was not given
         it.
@@ -395,7 +367,6 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     Raises:
       InputError: the row's file is missing or damaged.
     """
-
     was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"

@@ -102,9 +102,6 @@ def smooth_safest(
       goal_tolerance: as in `simulate`.
       threads: number of threads of the search and of the simulations.
 
-    Returns:
-      A SafestPlan.
-
     Raises:
       InputError: as `smooth` and `simulate`, or no candidate converges.
     """
@@ -139,7 +136,6 @@ def smooth_safest(
 
 def _same(one: Solution, other: Solution) -> bool:
     """Whether two plans are the same within SAME."""
-
     apart = one.policy.state_coordinates.difference(one.trajectory.states, other.trajectory.states)
     scale = np.maximum(np.ptp(other.trajectory.states, axis=0), 1e-9)
     return bool((np.abs(apart) <= SAME * scale).all())

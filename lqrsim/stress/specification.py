@@ -55,14 +55,11 @@ class Cell:
 
     @classmethod
     def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
-        """Find a cell by its number or by its text, policy,sweep,strength.
+        """The cell of a number or of a text, policy,sweep,strength.
 
         Args:
           text: the number, from 0, or the three parts separated by commas.
           cells: the cells to choose from.
-
-        Returns:
-          The Cell.
 
         Raises:
           InputError: there is no such cell.
@@ -192,9 +189,6 @@ class Campaign:
         Args:
           cell: one of the campaign's.
 
-        Returns:
-          The disturbances, scaled by the cell's strength.
-
         Raises:
           InputError: the cell belongs to another campaign.
         """
@@ -214,13 +208,10 @@ class Campaign:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """Make a campaign from the result of `as_json`. Resolve its scenario first: that may define disturbances.
+        """The campaign that `as_json` describes. Resolve its scenario first: that may define disturbances.
 
         Args:
           fields: the result of `as_json`.
-
-        Returns:
-          A Campaign equal to the one described.
 
         Raises:
           InputError: the data is damaged, or a disturbance is not known here.

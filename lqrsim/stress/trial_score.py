@@ -136,15 +136,12 @@ def collision_score(rollout: Rollout) -> Array:
 
 
 def miss_score(rollout: Rollout) -> Array:
-    """How far each trial ends outside its goal, or its `collision_score` if that is larger, (K,).
+    """How far each trial ends outside its goal, or its `collision_score` if that is larger, (K,); positive if it fails.
 
     In metres; for a goal without a position, the scaled error by which it is judged.
 
     Args:
       rollout: K trials.
-
-    Returns:
-      (K,); positive if the trial does not reach its goal.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
@@ -208,9 +205,6 @@ class TrialScore:
         Args:
           numbers: (K, size).
 
-        Returns:
-          (K,); positive is failure.
-
         Raises:
           InputError: the shape is wrong, or a score is NaN.
         """
@@ -233,9 +227,6 @@ class TrialScore:
         Args:
           numbers: (K, size).
           frames: whether to record for drawing.
-
-        Returns:
-          A Rollout of K trials.
         """
         vectors = check_array("numbers", numbers, (None, self.size))
         ends = np.cumsum((0, *self.sizes))
@@ -263,5 +254,4 @@ class TrialScore:
 
 def normal_tail(distance: float) -> float:
     """The probability that a standard normal number is larger."""
-
     return float(ndtr(-distance))

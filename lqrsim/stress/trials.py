@@ -15,10 +15,10 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
+from lqrsim.stress.campaign_files import Table, pack
 from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.policies import POLICY_KINDS, make_controller
 from lqrsim.stress.specification import Campaign, Cell, Shard
-from lqrsim.stress.trial_tables import Table, pack
 
 
 class Trials:

@@ -1,4 +1,4 @@
-from .funnel_plot import plot_funnel as plot_funnel
+from .plots import plot_funnel as plot_funnel
+from .plots import plot_policy as plot_policy
 from .plots import plot_run as plot_run
-from .policy_plot import plot_policy as plot_policy
 from .render import render_still as render_still

@@ -1,22 +1,22 @@
-"""Calibrated cameras: fixed, so that pixels measure positions.
+"""Cameras of panes: calibrated ones, an overview, a chase view, and the model's own.
 
-They are orthographic, as an engineering drawing is: a metre has the same number of pixels everywhere. The centre of a
-ball's pixels is therefore exactly its own centre, at any distance and anywhere in the picture, and the place of a
-camera along its line of sight does not matter.
+Calibrated cameras are fixed, so that pixels measure positions. They are orthographic, as an engineering drawing is: a
+metre has the same number of pixels everywhere. The centre of a ball's pixels is therefore exactly its own centre, at
+any distance and anywhere in the picture, and the place of a camera along its line of sight does not matter.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
 from lqrsim.results.rollout import Rollout
-
-if TYPE_CHECKING:
-    import mujoco
+from lqrsim.view.options import CALIBRATED, VIEWS
+from lqrsim.view.recorded_trial import RecordedTrial
 
 Vector = tuple[float, float, float]
 
@@ -44,7 +44,7 @@ class Camera:
         """(2, 3), unit vectors to the right and up in the picture: the directions that it measures."""
         return np.array([np.cross(self.forward, self.up), self.up])
 
-    def place(self, scene: "mujoco.MjvScene", aspect: float) -> None:
+    def place(self, scene: mujoco.MjvScene, aspect: float) -> None:
         """Set the cameras of a scene, after its update, to this view in a picture of aspect ratio width / height."""
         for camera in scene.camera:
             camera.pos, camera.forward, camera.up = self.position, self.forward, self.up
@@ -129,3 +129,147 @@ def _bounds(rollout: Rollout) -> tuple[Array, Array]:
 def _right(span: Array, aspect: float) -> Array:
     """The direction to the right in the picture: x or y, so that the longer sides coincide."""
     return np.array([1.0, 0.0, 0.0] if (span[0] >= span[1]) == (aspect >= 1) else [0.0, 1.0, 0.0])
+
+
+# The overview cameras of models are made for 16:9; in a narrower picture they would cut off both sides.
+OVERVIEW_ASPECT = 1.7
+OBLIQUE = np.array([0.30, 0.75, -0.60])  # direction of an overview in a scene without an overview camera
+FIELD_OF_VIEW = 40.0  # degrees, of cameras that are not the model's
+DISTANCE, HEIGHT = 11.0, 4.5  # of the chase camera, in radii of the robot
+TURN_SECONDS = 0.8  # s, over which the chase camera averages its direction
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """A view of one trial.
+
+    Attributes:
+      place: sets the cameras of a scene, after its update, for a time.
+      camera: the calibrated camera, if the view has one.
+    """
+
+    place: Callable[[mujoco.MjvScene, mujoco.MjData, float], None]
+    camera: Camera | None = None
+
+
+def camera_view(name: str, recorded: RecordedTrial, aspect: float) -> CameraView:
+    """The view of that name in a pane of this aspect ratio: one of VIEWS, or another camera of the model.
+
+    Raises:
+      InputError: there is no view of that name.
+    """
+    model, of_model = recorded.model, _model_cameras(recorded)
+    check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
+    if name in CALIBRATED:
+        camera = (top if name == "top" else side)(recorded.rollout, aspect)
+        return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
+    if name == "chase":
+        return _chase(recorded)
+    if name == "overview" and (aspect < OVERVIEW_ASPECT or name not in of_model):
+        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect)
+    view = mujoco.MjvCamera()
+    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
+    return CameraView(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
+
+
+def leaves_room_for_captions(name: str, recorded: RecordedTrial, aspect: float) -> bool:
+    """Whether a view is wide, and not fitted to its content, so that captions may cover a part."""
+    return (
+        aspect >= OVERVIEW_ASPECT and name not in CALIBRATED and (name == "chase" or name in _model_cameras(recorded))
+    )
+
+
+def _model_cameras(recorded: RecordedTrial) -> list[str]:
+    """The names of the model's cameras."""
+    names = (recorded.model.camera(number).name for number in range(recorded.model.ncam))
+    return [name for name in names if name]
+
+
+def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> CameraView:
+    """A view that contains the run and its surroundings, in the direction of a camera of the model."""
+    model, data = recorded.model, mujoco.MjData(recorded.model)
+    recorded.pose(data, 0.0)
+    forward, field_of_view = OBLIQUE / np.linalg.norm(OBLIQUE), FIELD_OF_VIEW
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if like is not None and model.cam_projection[like] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE.value:
+        axes, field_of_view = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
+        right, forward = axes[:, 0], -axes[:, 2]
+    right = right / np.linalg.norm(right)
+    up, points = np.cross(right, forward), _extent_points(recorded, data)
+    # As far back as it takes to have every point within both angles of view.
+    rise = np.tan(np.radians(field_of_view) / 2) * 0.96
+    middle = points.mean(axis=0)
+    back = 0.0
+    for _ in range(20):  # each centres the view of the one before
+        local = points - middle
+        x, y, z = local @ right, local @ up, local @ forward
+        back = float(np.max(np.maximum(np.abs(x) / (rise * aspect), np.abs(y) / rise) - z))
+        x, y = x / (z + back), y / (z + back)
+        shift = 0.5 * back * np.array([x.max() + x.min(), y.max() + y.min()])
+        middle = middle + shift[0] * right + shift[1] * up
+    eye = middle - back * forward
+    return CameraView(lambda scene, data, time: _set_perspective(scene, model, eye, forward, up, field_of_view))
+
+
+def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
+    """Points (k, 3) of the run, and corners of fixed geoms as far as they are near it."""
+    model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
+    if recorded.rollout.balls is not None:
+        run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
+    low, high = run.min(axis=0), run.max(axis=0)
+    margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    corners = [run]
+    for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
+        middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE.value:  # a plane has no box, and may be infinite
+            middle, half = np.zeros(3), np.where(model.geom_size[geom] > 0, model.geom_size[geom], margin) * [1, 1, 0]
+        seen = data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
+        corners.append(np.clip(seen, low - margin, high + margin))
+    return np.vstack(corners)
+
+
+def _chase(recorded: RecordedTrial) -> CameraView:
+    """From behind and above; it turns smoothly with the direction of the plan."""
+    times = np.linspace(0, recorded.end, max(int(20 * recorded.end), 2))
+    planned, driven = recorded.planned(times), recorded.driven(times)
+    motion = np.gradient(planned, times, axis=0)[:, :2]
+    # At rest, or straight up, the direction is that from the start of the plan to its end.
+    motion += 1e-3 * (planned[-1] - planned[0])[:2] + [1e-9, 0.0]
+    direction = _smooth(motion, times, TURN_SECONDS)
+    azimuth = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+    middle = _smooth(driven, times, 0.25 * TURN_SECONDS)
+    radius = recorded.rollout.radius
+
+    def place(scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
+        angle = np.interp(time, times, azimuth)
+        at = np.array([np.interp(time, times, column) for column in middle.T])
+        behind = np.array([np.cos(angle), np.sin(angle), 0.0])
+        eye = at - DISTANCE * radius * behind + [0, 0, HEIGHT * radius]
+        forward = at + 2 * radius * behind - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        _set_perspective(
+            scene, recorded.model, eye, forward, np.cross(right / np.linalg.norm(right), forward), FIELD_OF_VIEW
+        )
+
+    return CameraView(place)
+
+
+def _smooth(values: Array, times: Array, width: float) -> Array:
+    """Values (k, n) at even times, smoothed by a Gaussian of this standard deviation in seconds."""
+    weights = np.exp(-0.5 * ((times[:, None] - times) / width) ** 2)
+    return weights @ values / weights.sum(axis=1, keepdims=True)
+
+
+def _set_perspective(
+    scene: mujoco.MjvScene, model: mujoco.MjModel, eye: Array, forward: Array, up: Array, field_of_view: float
+) -> None:
+    """Set the cameras of a scene to a perspective from `eye`; the vertical field of view is in degrees."""
+    near = model.vis.map.znear * model.stat.extent
+    for camera in scene.camera:
+        camera.pos, camera.forward, camera.up, camera.orthographic = eye, forward, up, 0
+        camera.frustum_near, camera.frustum_far = near, model.vis.map.zfar * model.stat.extent
+        camera.frustum_top = near * np.tan(np.radians(field_of_view) / 2)
+        camera.frustum_bottom, camera.frustum_center = -camera.frustum_top, 0
+        camera.frustum_width = 0  # follows from the pane

@@ -7,7 +7,7 @@ import numpy as np
 
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.view import text_tiles
-from lqrsim.view.layout import Box
+from lqrsim.view.options import Box
 from lqrsim.view.overlays import Overlays, Scale
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Pixels

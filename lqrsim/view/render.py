@@ -17,8 +17,7 @@ from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
-from lqrsim.view.picture import QUALITIES, Picture, PictureOptions, open_picture
-from lqrsim.view.scene_renderer import MOST_ROBOTS
+from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, Picture, PictureOptions, open_picture
 from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25

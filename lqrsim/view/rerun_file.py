@@ -13,14 +13,13 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError, check_path
+from lqrsim.results.archive import sha256
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
-from lqrsim.view import drawn_tubes
 from lqrsim.view.decorative_geoms import PLAN_RGB
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, TUBE
+from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, TUBE, DrawnFunnel, of_funnel
 from lqrsim.view.recorded_trial import RecordedTrial
 
 TIMELINE = "time"
@@ -48,7 +47,7 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
     """
     path = check_path("path", path, "the path of a file")
     rerun, recorded = _package(path), RecordedTrial(rollout, trial)
-    drawn = None if funnel is None else drawn_tubes.of_funnel(recorded, funnel)
+    drawn = None if funnel is None else of_funnel(recorded, funnel)
     with replacing(path) as unfinished:
         name = f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}"
         stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
@@ -159,7 +158,7 @@ def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
         _send(rerun, stream, ["world", "force"], times, arrows)
 
 
-def _draw_funnel(rerun: Any, stream: Any, funnel: drawn_tubes.DrawnFunnel) -> None:
+def _draw_funnel(rerun: Any, stream: Any, funnel: DrawnFunnel) -> None:
     """Draw the certified and the interpolated ellipsoids, at all times."""
     for name, tube, colour in (("certified", funnel.certified, FUNNEL), ("interpolated", funnel.between, BETWEEN)):
         if tube is not None:

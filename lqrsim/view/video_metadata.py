@@ -12,7 +12,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_path, excerpt
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.cameras import Camera
 

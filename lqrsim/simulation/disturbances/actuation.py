@@ -118,9 +118,6 @@ class Saturation(Disturbance):
         Args:
           plant: the plant, with the robot's own limits.
 
-        Returns:
-          Two arrays (m,).
-
         Raises:
           InputError: the robot's own limits do not contain them.
         """
@@ -197,9 +194,6 @@ class ActuatorLoss(Disturbance):
 
         Args:
           strength: factor, 0 or more.
-
-        Returns:
-          An ActuatorLoss.
         """
         lost = min(1.0, times(self, 1 - self.remaining, strength))
         return replace(self, remaining=self.remaining if strength == 1 else 1 - lost)

@@ -71,13 +71,10 @@ class Disturbance(abc.ABC):
     """Base class of all disturbances."""
 
     def describe(self, plant: Plant) -> str:
-        """Describe the disturbance in words and units, for records. By default its repr.
+        """The disturbance in words and units, for records. By default its repr.
 
         Args:
           plant: what is run.
-
-        Returns:
-          A line of text.
         """
         return repr(self)
 
@@ -86,9 +83,6 @@ class Disturbance(abc.ABC):
 
         Args:
           strength: factor; 0 has no effect, 1 is the disturbance itself.
-
-        Returns:
-          A Disturbance.
 
         Raises:
           InputError: the class does not implement it, or the strength is out of range.
@@ -126,9 +120,6 @@ class Disturbance(abc.ABC):
           plant: what is run.
           plan: the plan that the policy follows.
           generators: K of them, one per trial.
-
-        Returns:
-          The Effect on the K trials.
 
         Raises:
           InputError: the disturbance does not fit the plant or the plan.
@@ -239,7 +230,6 @@ def with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates)
 
 def words(numbers: Numbers) -> str:
     """Numbers as text: 0.1, or (0.1, 0.2)."""
-
     values = np.atleast_1d(numbers)
     text = ", ".join(f"{value:g}" for value in values)
     return text if np.ndim(numbers) == 0 else f"({text})"

@@ -38,9 +38,6 @@ class Late(Disturbance):
 
         Args:
           strength: factor, 0 or more.
-
-        Returns:
-          A disturbance of the same kind.
         """
         return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
 
@@ -177,9 +174,6 @@ class Dropouts(Disturbance):
 
         Args:
           strength: factor, 0 or more.
-
-        Returns:
-          A disturbance of the same kind.
         """
         strength, loss = check_strength(self, strength), self.loss
         if not isinstance(loss, GilbertElliott):

@@ -303,7 +303,6 @@ def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
 
 def upward(plant: Plant, children: npt.NDArray[np.intp]) -> Array:
     """The world's upward direction in the axes of each body's parent, (bodies, 3), in the model's initial pose."""
-
     drawn = mujoco.MjData(plant.model)
     mujoco.mj_kinematics(plant.model, drawn)
     return drawn.xmat[plant.model.body_parentid[children]].reshape(-1, 3, 3)[:, 2]

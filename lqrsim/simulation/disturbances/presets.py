@@ -34,7 +34,7 @@ PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 
 
 def preset(name: str, plant: Plant) -> list[Disturbance]:
-    """Return a preset: disturbances that the plant can have, in a named strength. Each can be scaled by 2.
+    """The disturbances of a preset that the plant can have, in the order in which they act. Each can be scaled by 2.
 
     Left out are disturbances whose strength depends on the robot or the plan: latency and delay, which come in whole
     control periods, while the 6 to 7 ms of motion capture are less than half of one; pushes, whose time and direction
@@ -43,9 +43,6 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     Args:
       name: calm, light, moderate, strong or severe.
       plant: the plant that the disturbances act on.
-
-    Returns:
-      The disturbances, in the order in which they act.
 
     Raises:
       InputError: there is no such preset.

@@ -32,7 +32,7 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import LONGEST, InputError
 from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import Campaign, run_campaign
-from lqrsim.stress.manifest import digest_of_rows
+from lqrsim.stress.campaign_files import digest_of_rows
 from lqrsim.stress.results import Results
 from lqrsim.view.recorded_trial import RecordedTrial
 from robustness import mutations

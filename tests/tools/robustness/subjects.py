@@ -16,7 +16,7 @@ from typing import Any
 
 import lqrsim as ls
 from lqrsim import gym
-from lqrsim.stress.trial_tables import Damaged
+from lqrsim.stress.campaign_files import Damaged
 from robustness.of_gym import environments
 from robustness.of_policies import policies
 from robustness.of_problems import problems, results, solving

@@ -1,25 +1,160 @@
-"""The manifest of a campaign's folder, `manifest.json`: specification, versions and hashes, checked when it is read.
+"""The files of a campaign's folder: its lock, the tables of its trials, and its manifest.
 
-It has two hashes. `sha256` covers the whole file, so that an edited one is refused. `digest` covers everything that the
-rows depend on. Each shard has it, too, so that a manifest with new settings and a renewed hash does not fit the shards.
+A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written whole or
+not at all. Its metadata names the campaign, the cell and the trials, and has a hash of these and of the columns.
+
+`manifest.json` has specification, versions and hashes. `sha256` covers the whole file, so that an edited one is
+refused. `digest` covers everything that the rows depend on. Each shard has it, too, so that a manifest with new
+settings and a renewed hash does not fit the shards.
+
+The system releases the lock when the process dies, however it dies. The package filelock 4.2 passes the same tests with
+the same system calls, but it would replace only two functions. On a file system without locks its `FileLock` falls back
+to a file whose existence is the lock, which a killed process leaves behind; here such file systems are refused.
 """
 
+import contextlib
+import errno
+import io
 import json
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results import schema
-from lqrsim.results.archive import Other, blamed
-from lqrsim.results.hashing import sha256
+from lqrsim.results.archive import Other, blamed, sha256
+from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.stress.policies import POLICIES
-from lqrsim.stress.specification import Campaign, Cell
-from lqrsim.stress.trial_tables import write
+from lqrsim.stress.specification import Campaign, Cell, Shard
+
+_HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
+
+
+@contextlib.contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """Make the folder if it does not exist, and lock it during the block.
+
+    Raises:
+      InputError: another process has locked it, or the folder cannot be written or locked.
+    """
+    path = folder / "campaign.lock"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise InputError(f"folder: got {folder}, want one that can be written ({error.strerror})") from None
+    try:
+        try:
+            _lock(handle)
+        except OSError as error:
+            if error.errno in _HELD:
+                raise InputError(
+                    f"folder: got {folder}, which another process writes (see {path.name}), want one at a time"
+                ) from None
+            reason = error.strerror or error
+            raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
+        with contextlib.suppress(OSError):  # for people who look who has the lock
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
+        yield
+    finally:
+        os.close(handle)
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(handle: int) -> None:
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads: locked bytes cannot be read
+
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+else:
+    import fcntl
+
+    def _lock(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+Table = dict[str, npt.NDArray[np.generic]]
+_KEY = b"lqrsim shard"
+
+
+class Damaged(Exception):
+    """A file that differs from what was written."""
+
+
+def pack(table: Table, shard: Shard, campaign: str) -> bytes:
+    """Encode a table as a file; `campaign` is the digest of its campaign."""
+    about = _about(shard, campaign)
+    meta = json.dumps(about | {"sha256": _digest(table, about)}).encode()
+    arrow = pa.table({name: pa.array(column) for name, column in table.items()}).replace_schema_metadata({_KEY: meta})
+    file = io.BytesIO()
+    pq.write_table(arrow, file, write_page_checksum=True)
+    return file.getvalue()
+
+
+def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
+    """Decode a table. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
+    about = _about(shard, campaign)
+    try:
+        file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
+        if file.metadata.num_rows != shard.count:  # checked before memory is allocated for the rows
+            raise ValueError(f"{file.metadata.num_rows} rows")
+        arrow = file.read(use_threads=False)
+        meta = json.loads((arrow.schema.metadata or {})[_KEY])
+        table = {name: _column(arrow[name]) for name in arrow.column_names}
+        good = meta == about | {"sha256": _digest(table, about)}
+    except Exception as error:  # a parser may raise anything for damaged bytes
+        raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
+    if not good or any(len(column) != shard.count for column in table.values()):
+        raise Damaged("its contents have changed")
+    return table
+
+
+def write(contents: bytes, path: Path) -> None:
+    """Write a file to the disk, whole or not at all. Raises InputError if it cannot, as on a full disk."""
+    with replacing(path) as unfinished, unfinished.open("wb") as file:
+        file.write(contents)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read(path: Path, shard: Shard, campaign: str) -> Table:
+    """Read the table of a file. Raises Damaged if it has changed or cannot be read."""
+    try:
+        contents = path.read_bytes()
+    except OSError as error:
+        raise Damaged(f"it cannot be read ({error.strerror or error})") from None
+    return unpack(contents, shard, campaign)
+
+
+def _about(shard: Shard, campaign: str) -> dict[str, Any]:
+    return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
+
+
+def _column(column: pa.ChunkedArray) -> npt.NDArray[np.generic]:
+    if pa.types.is_string(column.type):
+        return np.array(column.to_pylist(), dtype=np.str_)
+    return column.to_numpy()
+
+
+def _digest(table: Table, about: Mapping[str, Any]) -> str:
+    parts: list[str | bytes] = [json.dumps(about)]
+    for name, column in table.items():
+        text = column.dtype.kind == "U"
+        kind = "text" if text else column.dtype.str
+        data = json.dumps(column.tolist()).encode() if text else np.ascontiguousarray(column).tobytes()
+        parts += [f"{name} {kind} {len(data)}:", data]
+    return sha256(*parts)
+
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash

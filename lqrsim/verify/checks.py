@@ -1,0 +1,315 @@
+"""Verification of runs: by drawing them, and from their videos."""
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import av
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from av.error import FFmpegError
+from mujoco import mjtGeom as Geom
+
+from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.results import save_load
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.verify import ground_truth
+from lqrsim.verify.ground_truth import Progress
+from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
+from lqrsim.view import cameras, gl, video_metadata
+from lqrsim.view.cameras import Camera, measuring
+from lqrsim.view.decorative_geoms import RIM
+from lqrsim.view.recorded_trial import place_in, robot_body
+from lqrsim.view.video_metadata import Pane, VideoMetadata
+
+SIZE = (640, 480)
+DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged ones
+# Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
+SYMMETRIC_KINDS = (
+    Geom.mjGEOM_SPHERE,
+    Geom.mjGEOM_CAPSULE,
+    Geom.mjGEOM_ELLIPSOID,
+    Geom.mjGEOM_CYLINDER,
+    Geom.mjGEOM_BOX,
+)
+
+
+def verify_run(
+    rollout: Rollout, trial: int = 0, *, solution: Solution | None = None, progress: Progress | None = None
+) -> Verification:
+    """Draw the frames of a rollout, read positions from the pixels, and compare them with its states.
+
+    Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
+    plane, and from both if it moves in space. The pictures are segmentations that show only a part of the robot that
+    can collide, like X-rays, in which obstacles hide nothing. For a robot without a position, the place of its last
+    ball is read.
+
+    Args:
+      rollout: rollout of `simulate`, with frames.
+      trial: row of the rollout.
+      solution: the solution that was run, to check the plan in the rollout.
+      progress: called after each frame with the numbers of frames that are done and of all frames.
+
+    Raises:
+      InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.
+    """
+    ground_truth.check_arguments(solution, progress)
+    model = ground_truth.drawable_model(rollout, trial)
+    body = robot_body(model, rollout.body)
+    if rollout.balls is not None and not rollout.state_coordinates.position:
+        body = rollout.balls.tracked[0]
+    geom = _tracked_geom(model, body)
+    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout.plane)]
+    times, rows = ground_truth.frames_at_states(rollout, trial)
+    measured: list[Array] = []
+    offsets: list[Array] = []
+    for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views):
+        measured.append(
+            np.array([view.measure(mask_centre(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
+        )
+        offsets.append(offset)
+        if progress:
+            progress(len(measured), len(rows))
+    places, apart = triangulate(views, measured, rollout.plane)
+    name = model.geom(geom).name or model.geom(geom).id
+    positions = Positions(
+        times,
+        seen=places - rollout.of_world(offsets),
+        actual=ground_truth.state_positions(rollout, trial, times),
+        planned=ground_truth.planned_positions(rollout, times),
+        apart=apart,
+    )
+    return compare(
+        ground_truth.describe(rollout, trial),
+        f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
+        " all else left out (X-ray)",
+        positions,
+        bound=DRAWN_BOUND * rollout.radius,
+        interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
+        others=(ground_truth.check_plan(rollout, solution),),
+    )
+
+
+def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
+    """The largest geom of the robot's body that can collide and has a symmetric silhouette."""
+    kinds = [kind.value for kind in SYMMETRIC_KINDS]
+    fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
+    fits &= (model.geom_contype | model.geom_conaffinity) != 0
+    if not fits.any():
+        raise InputError(
+            "rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box of the robot"
+        )
+    return int(np.argmax(np.where(fits, model.geom_rbound, -1)))
+
+
+def _silhouettes(
+    model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera]
+) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
+    """For each frame (nq,): masks (height, width) of the geom in each view, and its offset from the robot's place."""
+    gl.bind()
+    body = robot_body(model, rollout.body)
+    model.geom_group[:], model.geom_group[geom] = 1, 0
+    model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
+    data, options = mujoco.MjData(model), mujoco.MjvOption()
+    options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
+    with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
+        for frame in frames:
+            data.qpos = frame
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            masks = []
+            for view in views:
+                renderer.update_scene(data, scene_option=options)
+                view.place(renderer.scene, SIZE[0] / SIZE[1])
+                # The renderer's own segmentation, without looking up the only geom.
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
+                masks.append(renderer.render()[..., 0] > 0)
+            yield masks, data.geom_xpos[geom] - place_in(data, rollout, body)
+
+
+FEWEST_PIXELS = 20  # of the tracked object; the centre of fewer is too uncertain
+LEAST_SHARE = 0.5  # of the mark that must be visible; the rest may be outside the picture
+# Green minus the larger of red and blue: below EMPTY a pixel does not count, from FULL on it is all mark. Video blurs
+# the edge of the mark, and mixes the colours of overlays into its surroundings.
+EMPTY, FULL = 0.2, 0.9
+
+
+def mask_centre(mask: npt.NDArray[np.bool_]) -> Array:
+    """The mean pixel (2,) of a mask (height, width), column and row; NaN if it has too few"""
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.mean(), rows.mean()]) + 0.5 if len(rows) >= FEWEST_PIXELS else np.full(2, np.nan)
+
+
+def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:
+    """The centre (2,), column and row, of the green mark of this radius in pixels; NaN if it is hidden."""
+    red, green, blue = np.moveaxis(image.astype(np.int16), 2, 0)
+    share = ((green - np.maximum(red, blue)) / 255 - EMPTY) / (FULL - EMPTY)
+    rows, columns = np.nonzero(share > 0.5)
+    if not len(rows):
+        return np.full(2, np.nan)
+    # The median ignores stray pixels; then the mean is taken within the rim of the mark.
+    centre, reach = np.array([np.median(columns), np.median(rows)]) + 0.5, 0.9 * RIM * radius + 1
+    area = 0.0
+    for _ in range(3):
+        (left, up), (right, down) = np.maximum(centre - reach, 0).astype(int), (centre + reach + 1).astype(int)
+        part = np.clip(share[up:down, left:right], 0, 1)
+        x, y = np.arange(left, left + part.shape[1]) + 0.5, np.arange(up, up + part.shape[0]) + 0.5
+        weights = part * ((x - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 <= reach**2)
+        area = weights.sum()
+        if area < LEAST_SHARE * np.pi * radius**2:
+            return np.full(2, np.nan)
+        centre = np.array([weights.sum(axis=0) @ x, weights.sum(axis=1) @ y]) / area
+    return centre
+
+
+def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) -> tuple[Array, Array]:
+    """Positions (N, d) that best fit measurements (N, views, 2) of N frames, and the disagreement of the views, (N,).
+
+    Args:
+      plane: the axes of the positions: "xyz", or the two of a planar robot.
+
+    Raises:
+      InputError: the views do not measure all axes.
+    """
+    size, columns = len(plane), ["xyz".index(axis) for axis in plane]
+    axes = np.vstack([view.axes for view in views])[:, columns] if views else np.zeros((0, size))
+    if np.linalg.matrix_rank(axes) < size:
+        names = " and ".join(view.name for view in views) or "none"
+        raise InputError(f"views: got {names}, want {' and '.join(measuring(plane))} to measure positions")
+    values = np.asarray(measured, dtype=np.float64).reshape(-1, len(axes))
+    seen = np.linalg.norm(axes, axis=1) > 1e-6  # leaves out directions across the plane
+    axes, values = axes[seen], values[:, seen]
+    positions = values @ np.linalg.pinv(axes).T
+    # Two views that differ by d in a direction each have a residual of d / 2.
+    return positions, np.sqrt(2) * np.linalg.norm(values - positions @ axes.T, axis=1)
+
+
+VIDEO_BOUND = 1 / 35  # largest error, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
+RECORD_BOUND = 1 / 350  # largest distance between frames and states, in radii of the robot
+
+
+def run_beside(path: str | os.PathLike[str]) -> Path:
+    """The file, in the folder of a video, of the rollout that it shows. Raises InputError if there is none."""
+    metadata, folder = video_metadata.read(path), Path(path).parent
+    for found in sorted(folder.glob("*.npz")):
+        with contextlib.suppress(InputError):  # a solution, or what is damaged
+            if video_metadata.digest(save_load.load(found, Rollout)) in metadata.runs:
+                return found
+    raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
+
+
+def verify_video(
+    path: str | os.PathLike[str],
+    rollout: Rollout,
+    *,
+    trial: int | None = None,
+    solution: Solution | None = None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
+
+    Args:
+      path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
+        move in space both, whatever else is in the picture.
+      rollout: the run that the video shows.
+      trial: row of the rollout; by default the first that the video shows.
+      solution: as for `verify_run`.
+      progress: as for `verify_run`.
+
+    Raises:
+      InputError: the file is not lqrsim's, or has not the panes that it takes.
+    """
+    ground_truth.check_arguments(solution, progress)
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
+    trial = None if trial is None else check_count("trial", trial, at_least=0)
+    metadata, plane = video_metadata.read(path), rollout.plane
+    digest = video_metadata.digest(rollout)
+    run = metadata.runs.index(digest) if digest in metadata.runs else 0
+    panes = [pane for pane in metadata.panes if pane.run == run and pane.camera is not None]
+    trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
+    panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
+    views = [pane.camera for pane in panes if pane.camera is not None]
+    triangulate(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
+    model, radius = ground_truth.drawable_model(rollout, trial), metadata.markers[run]
+    measured: list[list[Array]] = []
+    off = 0.0  # seconds between when a frame is shown and when it should be, at most
+    for time, image in _decoded(path):
+        off = max(off, abs(time - len(measured) / float(metadata.rate)))
+        measured.append([_measure_marker(image, pane, view, radius) for pane, view in zip(panes, views, strict=True)])
+        if progress:
+            progress(len(measured), metadata.frames)
+    count = min(len(measured), metadata.frames)
+    times = metadata.times()[:count]
+    seen, apart = triangulate(views, measured[:count], plane)
+    positions = Positions(
+        times,
+        seen=seen,
+        actual=ground_truth.frame_positions(rollout, trial, model, times),
+        planned=ground_truth.planned_positions(rollout, times),
+        apart=apart,
+    )
+    areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
+    others = (
+        *_check_file(metadata, digest, len(measured), off, min(areas)),
+        ground_truth.check_record(rollout, trial, model, RECORD_BOUND * rollout.radius),
+        ground_truth.check_plan(rollout, solution),
+    )
+    named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
+    return compare(
+        f"{Path(path).name}, {ground_truth.describe(rollout, trial)}",
+        f"the green mark in its panes {named}",
+        positions,
+        bound=VIDEO_BOUND * rollout.radius,
+        interval=metadata.speed * (1 / float(metadata.rate)),
+        others=others,
+    )
+
+
+def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Criterion, ...]:
+    """Whether the video shows the run of that digest, with frames at their times and marks large enough.
+
+    Args:
+      frames: number of frames that were decoded.
+      off: largest error of the time of a frame, in seconds.
+      area: area of the smallest mark, in
+    """
+    return (
+        Criterion(
+            "run",
+            digest in metadata.runs,
+            f"the video shows {', '.join(metadata.runs)}, this run is {digest}",
+        ),
+        Criterion(
+            "frames",
+            frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
+            f"got {frames}, want the {metadata.frames} that were written; at most {1e3 * off:.1f} ms from their times",
+        ),
+        Criterion(
+            "mark",
+            area >= FEWEST_PIXELS,
+            f"{area:.0f} pixels in the pane where it is smallest, want {FEWEST_PIXELS} or more",
+        ),
+    )
+
+
+def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
+    """Each frame (height, width, 3), and the time at which a player shows it, in seconds."""
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                yield frame.time or 0.0, np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+    except (FFmpegError, OSError, IndexError) as error:
+        raise InputError(f"video: got {path}, want one that can be read ({error})") from None
+
+
+def _measure_marker(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
+    """The measurement (2,) of the mark of this radius in metres, in one view."""
+    part = image[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width]
+    if part.shape[:2] != (pane.height, pane.width):
+        raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want the size that lqrsim wrote")
+    return view.measure(marker_centre(part, radius * pane.height / view.height), (pane.width, pane.height))
