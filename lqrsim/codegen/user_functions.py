@@ -26,7 +26,8 @@ from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
-from lqrsim.errors import Array, InputError, check_name, excerpt
+from lqrsim.codegen.sources import Source, check_source
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.machine import instruction_set
 from lqrsim.results.archive import sha256
 
@@ -364,6 +365,79 @@ class UserFunction:
         if self.columns:
             return f"[{i // self.columns}][{i % self.columns}]"
         return f"[{i}]" if self.entries else ""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A part of a problem, made for one system: what gets compiled, and the numbers it reads.
+
+    Attributes:
+      source: text that defines the functions of its kind of term, or a Source, of a module of the package's.
+        `codegen/language.py` says what it may contain. N, M, W, sqrt, exp and the like are at hand, by their bare
+        names: `cos`, not `math.cos` or `np.cos`, which are refused; and the functions of `kernels/signed_distance.py`
+        and `kernels/rotation_ratios.py`.
+      data: (any,) float64; the source can index it, but not ask for its length.
+      functions: functions that the source calls with `call`; their addresses come first in its data.
+    """
+
+    source: str | Source
+    data: Array
+    functions: tuple[UserFunction, ...] = field(default=(), kw_only=True)
+
+    @property
+    def _defines(self) -> Mapping[str, int]:
+        """The functions that the source must define, each with its number of arguments."""
+        return {}
+
+    @cached_property
+    def code(self) -> Source:
+        """The source, checked. Raises InputError."""
+        return check_source(type(self).__name__, self.source, self._defines)
+
+    @property
+    def numbers(self) -> int:
+        """Number of entries in compiled code's data that belong to this."""
+        return len(self.functions) + len(self.data)
+
+    def __post_init__(self) -> None:
+        self._keep("data", check_array(f"{type(self).__name__}: data", self.data, (None,), infinite=True))
+        _ = self.code
+        wanted = "a tuple of UserFunction, as FunctionCost makes them"
+        self._keep("functions", check_items(f"{type(self).__name__}: functions", self.functions, UserFunction, wanted))
+
+    def _keep(self, field: str, value: object) -> None:
+        object.__setattr__(self, field, value)
+
+
+def numbers_of(term: Term) -> Array:
+    """The data of its source: the addresses of its functions, then its own numbers."""
+    return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
+
+
+def raise_again(functions: Sequence[UserFunction]) -> None:
+    """Raise the exception that one of the functions raised when compiled code called it, if one did."""
+    for function in functions:
+        if (error := function.raised) is not None:
+            function.forget()
+            raise error
+
+
+def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None:
+    """The names that a user's function depends on; None for all. Raises InputError for anything else."""
+    if names is None:
+        return None
+    if isinstance(names, str):
+        raise InputError(f"{who}: depends_on: got {excerpt(names)}, want a tuple of names: ({excerpt(names)},)")
+    return check_items(f"{who}: depends_on", names, str, f"a tuple of names of {of}")
+
+
+def axes_of(
+    who: str, depends_on: Sequence[str] | None, names: Sequence[str]
+) -> tuple[tuple[int, ...], tuple[tuple[int, str], ...]]:
+    """The indices of the names that a function depends on, and the others with theirs. Raises InputError."""
+    wanted = names if depends_on is None else depends_on
+    axes = tuple(sorted({names.index(check_name(f"{who}: depends_on", name, names)) for name in wanted}))
+    return axes, tuple((i, name) for i, name in enumerate(names) if i not in axes)
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import Source
-from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import Array
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.scene import Scene
@@ -14,34 +14,25 @@ from lqrsim.scenes.world import World
 
 
 @dataclass(frozen=True)
-class GeomDistances:
+class GeomDistances(Term):
     """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
 
+    The source defines `distances(x, data, out)`, which writes one number a row, and `distances_jacobian(x, data, out,
+    slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
+
     Attributes:
-      source: defines `distances(x, data, out)`, which writes one number a row, and `distances_jacobian(x, data, out,
-        slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
-      data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle; -1
         for the nearest of all.
       moved: number of states, from the first one on, that the distances depend on.
-      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
-    source: Source
-    data: Array
     parts: tuple[str, ...]
     obstacles: tuple[int, ...]
     moved: int
-    functions: tuple[UserFunction, ...]
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers of the data that compiled code is given are the distances'."""
-        return len(self.functions) + len(self.data)
 
     def filling(self, kernel: Source) -> Source:
         """A kernel of costs or constraints, with the distances as what it calls places."""
-        return kernel.filled(places=(self.source, "distances"), places_jacobian=(self.source, "distances_jacobian"))
+        return kernel.filled(places=(self.code, "distances"), places_jacobian=(self.code, "distances_jacobian"))
 
 
 class CollisionGeoms(abc.ABC):

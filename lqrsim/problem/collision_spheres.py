@@ -10,8 +10,18 @@ import numpy.typing as npt
 
 from lqrsim.codegen import distances, symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
-from lqrsim.codegen.sources import Source, check_source, source_of
-from lqrsim.codegen.user_functions import UserFunction, address_of, check_signature, level_of, name_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.user_functions import (
+    Term,
+    UserFunction,
+    axes_of,
+    check_depends_on,
+    check_signature,
+    level_of,
+    name_of,
+    numbers_of,
+    raise_again,
+)
 from lqrsim.errors import (
     Array,
     InputError,
@@ -21,7 +31,6 @@ from lqrsim.errors import (
     check_function,
     check_items,
     check_kind,
-    check_name,
     check_number,
     excerpt,
     vectors_of,
@@ -34,47 +43,32 @@ from lqrsim.scenes.world import SPACE, World
 
 
 @dataclass(frozen=True)
-class SphereCenters:
+class SphereCenters(Term):
     """Places of balls, made for one system: the source to compile, and its data.
 
+    The source defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
+    `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are not
+    zero, to zeros.
+
     Attributes:
-      source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
-        `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are
-        not zero, to zeros. As the source of a `costs.CostTerm`.
-      data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
       in_plane: whether the places are in the plane of the robot's position, with third coordinate 0, instead of in
         space.
-      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
-    source: str | Source
-    data: Array
     depends_on: tuple[int, ...]
     in_plane: bool = False
-    functions: tuple[UserFunction, ...] = ()
-
-    @functools.cached_property
-    def code(self) -> Source:
-        """The source, checked. Raises InputError."""
-        return check_source("SphereCenters", self.source, {"places": 3, "places_jacobian": 4})
-
-    def __post_init__(self) -> None:
-        _ = self.code
-        object.__setattr__(self, "data", check_array("SphereCenters: data", self.data, (None,), infinite=True))
-        given = check_items(
-            "SphereCenters: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states"
-        )
-        indices = tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given)
-        object.__setattr__(self, "depends_on", indices)
-        object.__setattr__(self, "in_plane", check_flag("SphereCenters: in_plane", self.in_plane))
-        functions = check_items("SphereCenters: functions", self.functions, UserFunction, "a tuple of UserFunction")
-        object.__setattr__(self, "functions", functions)
 
     @property
-    def numbers(self) -> int:
-        """Number of entries in compiled code's data that belong to the places."""
-        return len(self.functions) + len(self.data)
+    def _defines(self) -> Mapping[str, int]:
+        return {"places": 3, "places_jacobian": 4}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted = "a tuple of indices of states"
+        given = check_items("SphereCenters: depends_on", self.depends_on, (int, np.integer), wanted)
+        self._keep("depends_on", tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given))
+        self._keep("in_plane", check_flag("SphereCenters: in_plane", self.in_plane))
 
     def world_seen(self, world: World, space: Coordinates) -> World:
         """The obstacles in the coordinates of the places.
@@ -145,16 +139,10 @@ class CollisionSpheres:
             check_signature(jacobian, ("x", "p", "slopes"))
         self.function, self.jacobian = places, jacobian
         self._set_balls(radii, names, sites)
-        if isinstance(depends_on, str):
-            said = excerpt(depends_on)
-            raise InputError(f"CollisionSpheres: depends_on: got {said}, want a tuple of names: ({said},)")
-        self.depends_on = None
-        if depends_on is not None:
-            if self.level == "symbolic":
-                raise InputError(
-                    "CollisionSpheres: depends_on: got names for a symbolic function, want None: they are derived"
-                )
-            self.depends_on = check_items("CollisionSpheres: depends_on", depends_on, str, "a tuple of names of states")
+        self.depends_on = check_depends_on("CollisionSpheres", depends_on, "states")
+        if self.depends_on is not None and self.level == "symbolic":
+            wanted = "None: they are derived"
+            raise InputError(f"CollisionSpheres: depends_on: got names for a symbolic function, want {wanted}")
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
         """The attributes of each ball, checked."""
@@ -241,12 +229,10 @@ class CollisionSpheres:
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
         names, parameters = dynamics.state_coordinates.names, tuple(dynamics.parameters)
-        wanted = names if self.depends_on is None else self.depends_on
-        axes = tuple(sorted({names.index(check_name("CollisionSpheres: depends_on", name, names)) for name in wanted}))
+        axes, unused = axes_of("CollisionSpheres", self.depends_on, names)
         rest: dict[str, Any] = {"level": self.level, "states": len(names), "controls": 0, "parameters": parameters}
         rest |= {"offset": 1 if self.jacobian is None else 2, "with_control": False}
         size = self._size_of(dynamics)
-        unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
         values = size * len(self)
         functions = (
             UserFunction(
@@ -259,7 +245,7 @@ class CollisionSpheres:
             functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
         else:
             source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
-        return SphereCenters(source, dynamics.data, axes, size == 2, functions)
+        return SphereCenters(source, dynamics.data, axes, size == 2, functions=functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
         """The number of coordinates that a compiled or plain function returns for each ball, found by calling it."""
@@ -363,13 +349,8 @@ def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> N
     """Call a function of `kernels/sphere_centers.py`; exceptions of a user's function pass through."""
     filled = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
-    data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
-    getattr(module, name)(len(states), states, data, *outputs)
-    for function in places.functions:
-        if function.raised is not None:
-            error = function.raised
-            function.forget()
-            raise error
+    getattr(module, name)(len(states), states, numbers_of(places), *outputs)
+    raise_again(places.functions)
 
 
 def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:

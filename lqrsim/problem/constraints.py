@@ -4,7 +4,6 @@ To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Con
 """
 
 import abc
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -13,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.sources import Source, check_source, source_of
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.user_functions import Term, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
@@ -37,14 +36,13 @@ _Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
-class ConstraintTerm:
+class ConstraintTerm(Term):
     """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
 
+    The source defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
+    gradient)`, which *adds* its gradient (n+m,), states before controls.
+
     Attributes:
-      source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
-        gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.CostTerm`.
-        Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
-      data: (any,) float64.
       rows: number of entries at a step.
       describe: returns the name of a row for messages.
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
@@ -53,37 +51,29 @@ class ConstraintTerm:
       shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
         source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
         these numbers (shared,) and their derivatives (shared, n) in place of x and u.
-      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
-    source: str | Source
-    data: Array
     rows: int
     describe: Callable[[int], str]
     uses_control: bool = False
     equality: bool = False
     final_only: bool = False
     shared: int = 0
-    functions: tuple[UserFunction, ...] = ()
 
-    @functools.cached_property
-    def code(self) -> Source:
-        """The source, checked. Raises InputError."""
+    @property
+    def _defines(self) -> Mapping[str, int]:
         of_all = {"places": 3, "places_jacobian": 4} if self.shared else {}
-        return check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_all})
+        return {"value": 5, "slope": 6, **of_all}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "data", check_array("ConstraintTerm: data", self.data, (None,), infinite=True))
-        object.__setattr__(self, "rows", check_count("ConstraintTerm: rows", self.rows, at_least=0))
+        self._keep("rows", check_count("ConstraintTerm: rows", self.rows, at_least=0))
         check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
         for name in ("uses_control", "equality", "final_only"):
-            object.__setattr__(self, name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
+            self._keep(name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
-        object.__setattr__(self, "shared", check_count("ConstraintTerm: shared", self.shared, at_least=0))
-        _ = self.code
-        functions = check_items("ConstraintTerm: functions", self.functions, UserFunction, "a tuple of UserFunction")
-        object.__setattr__(self, "functions", functions)
+        self._keep("shared", check_count("ConstraintTerm: shared", self.shared, at_least=0))
+        super().__post_init__()
 
 
 class Constraint(abc.ABC):

@@ -4,7 +4,6 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.sources import Source, check_source, source_of
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.user_functions import (
+    Term,
+    UserFunction,
+    axes_of,
+    check_depends_on,
+    check_signature,
+    level_of,
+    name_of,
+)
 from lqrsim.errors import (
     Array,
     InputError,
@@ -38,54 +45,42 @@ FAR = 16.0  # over the sharpness of an ObstacleCost: from where on geoms cost no
 
 
 @dataclass(frozen=True)
-class CostTerm:
+class CostTerm(Term):
     """A cost term, made for one system: what gets compiled, and the numbers it reads.
 
+    The source defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
+    cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls.
+
     Attributes:
-      source: text that defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both
-        returning the cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before
-        controls. `codegen/language.py` says what it may contain. N, M, W, sqrt, exp and the like are at hand, by their
-        bare names: `cos`, not `math.cos` or `np.cos`, which are refused; and the functions of
-        `kernels/signed_distance.py` and `kernels/rotation_ratios.py`. Or a Source, of a module of the package's.
-      data: (any,) float64; the source can index it, but not ask for its length.
       nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
         sum of all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
       factor: index in `data` of a number that the whole term is proportional to, if it may be reduced in the first
         iterations; see `InitialPrior`. None where there is none.
-      functions: functions that the source calls with `call`; their addresses come first in its data.
       exact_hessian: whether the Hessian is complete. Where a part is left out on purpose, `check_derivatives` does not
         compare it with differences.
     """
 
-    source: str | Source
-    data: Array
     nonconvex_in: tuple[int, ...] | None = None
     uses_control: bool = False
     factor: int | None = None
-    functions: tuple[UserFunction, ...] = ()
     exact_hessian: bool = True
 
-    @functools.cached_property
-    def code(self) -> Source:
-        """The source, checked. Raises InputError."""
-        return check_source("CostTerm", self.source, {"value": 4, "derivatives": 6})
+    @property
+    def _defines(self) -> Mapping[str, int]:
+        return {"value": 4, "derivatives": 6}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "data", check_array("CostTerm: data", self.data, (None,), infinite=True))
-        _ = self.code
+        super().__post_init__()
         if self.nonconvex_in is not None:
             wanted = "a tuple of indices, or None"
             given = check_items("CostTerm: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
-            entries = tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given)
-            object.__setattr__(self, "nonconvex_in", entries)
+            self._keep("nonconvex_in", tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given))
         for name in ("uses_control", "exact_hessian"):
-            object.__setattr__(self, name, check_flag(f"CostTerm: {name}", getattr(self, name)))
+            self._keep(name, check_flag(f"CostTerm: {name}", getattr(self, name)))
         if self.factor is not None:
             last = len(self.data) - 1
-            object.__setattr__(self, "factor", check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
-        wanted = "a tuple of UserFunction, as FunctionCost makes them"
-        object.__setattr__(self, "functions", check_items("CostTerm: functions", self.functions, UserFunction, wanted))
+            self._keep("factor", check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
 
 
 class Cost(abc.ABC):
@@ -392,15 +387,10 @@ class FunctionCost(Cost):
             if level is not None:
                 raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
             self.level = "plain"
-        if isinstance(depends_on, str):
-            said = excerpt(depends_on)
-            raise InputError(f"FunctionCost: depends_on: got {said}, want a tuple of names: ({said},)")
-        self.depends_on = None
-        if depends_on is not None:
+        self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
+        if self.depends_on == ():  # a constant: nothing to minimise
             wanted = "a tuple of names of states and controls, at least one"
-            self.depends_on = check_items("FunctionCost: depends_on", depends_on, str, wanted)
-            if not self.depends_on:  # a constant: nothing to minimise
-                raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
+            raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
         self.parameters = symbolic.check_parameters(parameters)
         check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
@@ -416,11 +406,9 @@ class FunctionCost(Cost):
     def bind(self, dynamics: Dynamics) -> CostTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
-        wanted = names if self.depends_on is None else self.depends_on
-        axes = tuple(sorted({names.index(check_name("FunctionCost: depends_on", name, names)) for name in wanted}))
+        axes, unused = axes_of("FunctionCost", self.depends_on, names)
         rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
         rest["offset"] = 1 if self.derivatives is None else 2
-        unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
         functions = (UserFunction(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
             functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)

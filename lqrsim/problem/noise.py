@@ -15,13 +15,22 @@ import numpy.typing as npt
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of, text_source
-from lqrsim.codegen.user_functions import UserFunction, address_of, check_signature, level_of, name_of
+from lqrsim.codegen.user_functions import (
+    Term,
+    UserFunction,
+    axes_of,
+    check_depends_on,
+    check_signature,
+    level_of,
+    name_of,
+    numbers_of,
+    raise_again,
+)
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
     check_count,
-    check_items,
     check_kind,
     check_name,
     check_number,
@@ -35,26 +44,23 @@ MOST = 100  # independent normal numbers
 
 
 @dataclass(frozen=True)
-class NoiseTerm:
+class NoiseTerm(Term):
     """A noise, made for one system: the source to compile, and its data.
 
+    The source defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
+    `kernels/declarations.py`. The data are the parameters or the matrix, then the strength.
+
     Attributes:
-      source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
-        `kernels/declarations.py`.
-      data: (any,) the parameters or the matrix, then the strength.
       rows: the states that noise acts on at once. size: number of entries of w.
       active: the entries of (x, u), states before controls, that M depends on.
-      functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
     source: Source
-    data: Array
     rows: tuple[int, ...]
     size: int
     active: tuple[int, ...]
-    functions: tuple[UserFunction, ...] = ()
 
-    @property
+    @functools.cached_property
     def code(self) -> Source:
         """The source of `kernels/noise.py` with this noise."""
         rows, active = len(self.rows), len(self.active)
@@ -110,12 +116,9 @@ class Noise:
             self.level = level_of(function, level)
             check_signature(function, ("x", "u", "p"))
             self.size = check_count("Noise: size", size, at_most=MOST)
-            if depends_on is not None:
-                if self.level == "symbolic" or isinstance(depends_on, str):
-                    wanted = "none: it is found out" if self.level == "symbolic" else "a tuple of names"
-                    raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want {wanted}")
-                wanted = "a tuple of names of states and controls"
-                self.depends_on = check_items("Noise: depends_on", depends_on, str, wanted)
+            if depends_on is not None and self.level == "symbolic":
+                raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want none: it is found out")
+            self.depends_on = check_depends_on("Noise", depends_on, "states and controls")
         else:
             self.matrix = check_array("Noise: function", function, (None, None))
             if not self.matrix.size or self.matrix.shape[1] > MOST:
@@ -237,17 +240,16 @@ class Noise:
     def _bind_function(self, dynamics: Dynamics, numbers: Array) -> NoiseTerm:
         states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
         names = (*states, *controls)
-        wanted = names if self.depends_on is None else self.depends_on
-        active = tuple(sorted({names.index(check_name("Noise: depends_on", name, names)) for name in wanted}))
+        active, unused = axes_of("Noise", self.depends_on, names)
         n, m = len(states), len(controls)
         function = UserFunction(
             function=self.function, level=self.level, states=n, controls=m, parameters=tuple(self.parameters), offset=1,
             values=n * self.size, entries=states, columns=self.size,
-            unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
+            unused=unused,
         )  # fmt: skip
         given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
         source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
-        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
+        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=(function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
         """The matrices M (K, n, k) at given states and controls, in the states' units.
@@ -268,16 +270,7 @@ class Noise:
         compact = np.zeros((len(x), len(term.rows), self.size))
         module = module_of(term.code, "noise", N=n, M=m, W=n + m)
         module.matrices_of(len(x), in_c_order(x), in_c_order(u), numbers_of(term), compact)
-        for function in term.functions:
-            if function.raised is not None:
-                error = function.raised
-                function.forget()
-                raise error
+        raise_again(term.functions)
         found = np.zeros((len(x), n, self.size))
         found[:, list(term.rows)] = compact
         return found
-
-
-def numbers_of(term: NoiseTerm) -> Array:
-    """The data of its source: the addresses of its functions, then its own numbers."""
-    return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
