@@ -17,7 +17,7 @@ from PIL import Image
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.errors import InputError
-from lqrsim.gym.task import LARGEST
+from lqrsim.gym.episode import LARGEST
 from lqrsim.view import gl
 
 NAMES = {"lqrsim/DifferentialDrive-v0": "differential_drive", "lqrsim/Quadrotor-v0": "quadrotor"}

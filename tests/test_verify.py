@@ -12,7 +12,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.verify import checks
-from lqrsim.verify.ground_truth import check_plan
+from lqrsim.verify.checks import check_plan
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video_metadata import VideoMetadata

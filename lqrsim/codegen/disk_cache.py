@@ -23,7 +23,7 @@ from lqrsim.results.archive import replacing, sha256
 LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"
 _DURATIONS = "durations.json"
-_LONGEST_HEADER = 10_000  # bytes
+_LONGEST = 100_000  # bytes of a header, and of the durations
 _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
 
 
@@ -56,7 +56,7 @@ def load(name: str) -> bytes | None:
         header, _, contents = path.read_bytes().partition(b"\n")
     except OSError:
         return None
-    if _described(header).get("sha256") != sha256(contents):
+    if _object_of(header).get("sha256") != sha256(contents):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used now
@@ -86,16 +86,15 @@ def noted(name: str) -> float | None:
 
 def _durations() -> dict[str, object]:
     try:
-        found = json.loads((folder() / _DURATIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return _object_of((folder() / _DURATIONS).read_bytes())
+    except OSError:
         return {}
-    return found if isinstance(found, dict) else {}
 
 
-def _described(header: bytes) -> dict[str, object]:
-    """The header in an item's first line; empty if it is damaged."""
+def _object_of(text: bytes) -> dict[str, object]:
+    """The object of a JSON text, such as the header in an item's first line; empty if it is damaged."""
     try:
-        found = json.loads(header[:_LONGEST_HEADER])
+        found = json.loads(text[:_LONGEST])
     except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -108,7 +107,7 @@ def items() -> list[Item]:
         with contextlib.suppress(OSError):  # another process may have removed it
             status = path.stat()
             with path.open("rb") as file:
-                what = _described(file.readline(_LONGEST_HEADER)).get("what", "damaged; will be made again")
+                what = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
             found.append(Item(str(what), path, status.st_size, status.st_mtime))
     return sorted(found, key=lambda item: -item.used)
 
@@ -125,16 +124,11 @@ def clear() -> int:
 
 def _shrink() -> None:
     """Remove the least recently used items beyond `LIMIT`, and files that killed processes left."""
-    found = []
-    for path in _files(f"[!.]*{_SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process may have removed it
-            status = path.stat()
-            found.append((status.st_mtime, status.st_size, path))
     total = 0
-    for _, size, path in sorted(found, reverse=True):
-        total += size
+    for item in items():
+        total += item.size
         if total > LIMIT:
-            path.unlink(missing_ok=True)
+            item.path.unlink(missing_ok=True)
     for path in _unfinished(_ABANDONED):
         path.unlink(missing_ok=True)
 

@@ -140,19 +140,13 @@ def of_verification(found: "Verification") -> Object:
 def of_campaign(results: "Results") -> Object:
     """The outcomes of each cell of a campaign so far."""
     from lqrsim.results.goal import OUTCOMES
-    from lqrsim.stress.analysis import success
 
     cells = []
-    for cell in results.cells:
-        ends = results.tally(cell, partial=True)
+    for cell, ends, found in results.cell_successes():
         row: Object = {"policy": cell.policy, "sweep": cell.sweep, "strength": cell.strength, "trials": ends.total()}
-        if ends.total():
-            rate = success(cell, results.outcomes(cell, partial=True))
-            row |= {
-                "outcomes": {name: ends[name] for name in OUTCOMES},
-                "reached": rate.exact,
-                "deterministic": rate.alike,
-            }
+        if found is not None:
+            outcomes = {name: ends[name] for name in OUTCOMES}
+            row |= {"outcomes": outcomes, "reached": found.exact, "deterministic": found.alike}
         cells.append(row)
     return {
         "folder": results.folder,

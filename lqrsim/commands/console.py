@@ -27,7 +27,7 @@ _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
 
 
 class Runnable(Protocol):
-    """A command."""
+    """A command; `run` returns the exit code."""
 
     def run(self) -> int: ...
 

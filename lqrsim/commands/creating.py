@@ -35,7 +35,6 @@ class New:
     """Folder in which the robot's folder is made."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results.archive import excerpt_of
@@ -88,7 +87,6 @@ class Export:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.results.export_c import export_c

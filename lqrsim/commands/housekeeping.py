@@ -34,7 +34,6 @@ class Demo:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands.demo import demo
 
         return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
@@ -60,7 +59,6 @@ class Reproduce:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands.reproduce import reproduce
 
         return reproduce(self.results, out=self.out, quick=self.quick)
@@ -81,7 +79,6 @@ class Cache:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.codegen import disk_cache
         from lqrsim.commands import console
         from lqrsim.errors import InputError

@@ -69,7 +69,6 @@ class Rare(FailureOptions):
     """Number of failures to write."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import check_count
         from lqrsim.stress.multilevel_splitting import NoFailure
@@ -111,7 +110,6 @@ class Break(FailureOptions):
     """Largest number of rounds; the search ends earlier if less than 1 % is left to gain."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.stress.multilevel_splitting import NoFailure
 
@@ -153,7 +151,6 @@ class Certify:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.results.certificate import FailureCertificate
@@ -229,7 +226,6 @@ class FunnelCommand(PolicyOptions):
     """Output folder. By default runs/funnel/ and the name of the scenario."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import disturbance_set, folder_name, resolve

@@ -31,7 +31,6 @@ class List:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim import scenarios
         from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import resolve
@@ -91,7 +90,6 @@ class Solve:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.problem.clearance import Clearance
@@ -206,7 +204,6 @@ class Simulate:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load

@@ -69,7 +69,6 @@ class Stress:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
         from lqrsim.scenarios.solutions import given
@@ -134,7 +133,6 @@ class Replay:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.stress.results import Results, differences, replay
@@ -180,7 +178,6 @@ class Report:
     json: Json = False
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.reports.page import report

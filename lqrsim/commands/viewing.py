@@ -73,7 +73,6 @@ class Render:
     """In a still, show the robot also where it was at each multiple of this."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
@@ -179,7 +178,6 @@ class View:
     """Change of the robot's velocity per key press."""
 
     def run(self) -> int:
-        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError, check_count, check_number, check_seed
         from lqrsim.results import save_load
@@ -304,8 +302,7 @@ class Verify:
         from lqrsim.results import save_load
         from lqrsim.results.rollout import Rollout
         from lqrsim.results.solution import Solution
-        from lqrsim.verify.checks import run_beside, verify_run, verify_video
-        from lqrsim.verify.ground_truth import ran_policy_of
+        from lqrsim.verify.checks import ran_policy_of, run_beside, verify_run, verify_video
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or run_beside(self.file)

@@ -22,8 +22,7 @@ from lqrsim.errors import (
     shaped,
     vectors_of,
 )
-from lqrsim.gym.episode import Episode, Resettable
-from lqrsim.gym.task import Actions, Disturbances, Flags, Task, reset_options
+from lqrsim.gym.episode import Actions, Disturbances, Episode, Flags, Resettable, Task, reset_options
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.view.picture import LivePicture

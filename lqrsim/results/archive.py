@@ -152,8 +152,6 @@ class Archive:
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
             if file.read(1):  # reads to the end, where zipfile compares the check sum
                 raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want as many")
-        if array.dtype == bool and (array.view(np.uint8) > 1).any():
-            raise InputError(f"{excerpt(name)}: got a bool that is neither true nor false, want one of them")
         return array
 
 

@@ -6,7 +6,7 @@ failure.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -155,10 +155,7 @@ def comparisons(table: Table) -> list[Comparison]:
             if not (alike(table[cell]) and alike(table[second])):
                 compared.append(_compared(cell, second, table[cell], table[second]))
     adjusted = holm([one.pairs.p_value for one in compared])
-    return [
-        Comparison(one.first, one.second, one.pairs, one.success, one.rms, one.both, float(p))
-        for one, p in zip(compared, adjusted, strict=True)
-    ]
+    return [replace(one, adjusted=float(p)) for one, p in zip(compared, adjusted, strict=True)]
 
 
 def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes) -> Comparison:

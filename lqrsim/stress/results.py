@@ -17,11 +17,11 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, resolve
-from lqrsim.stress.analysis import alike
+from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
-from lqrsim.stress.statistics import CONFIDENCE, rate
+from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # that a summary lists
@@ -121,6 +121,12 @@ class Results:
             counts.update(table["outcome"].tolist())
         return counts
 
+    def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], Success | None]]:
+        """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
+        for cell in self.cells:
+            ends = self.tally(cell, partial=True)
+            yield cell, ends, success(cell, self.outcomes(cell, partial=True)) if ends else None
+
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
         width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
@@ -129,33 +135,27 @@ class Results:
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
-        for cell in self.cells:
-            ends = self.tally(cell, partial=True)
-            if not (total := ends.total()):
+        for cell, ends, found in self.cell_successes():
+            if found is None:
                 continue
-            sure = rate(ends["reached"], total)
-            among = f"{ends['reached']}/{total}"
-            share = f"{among:>13} {100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
-            if alike(self.outcomes(cell, partial=True)):
-                share = f"{among:>13} deterministic: 1 run"
+            sure, among = found.exact, f"{found.reached}/{found.trials}"
+            share = f"{100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
+            share = f"{among:>13} {'deterministic: 1 run' if found.alike else share}"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
-        lines += self.manifest["remarks"]
-        lines += self.plans()
-        return "\n".join(lines + self.came_to_nothing())
+        return "\n".join([*lines, *self.manifest["remarks"], *self.plans(), *self.came_to_nothing()])
 
     def _repr_html_(self) -> str:
         others = [name for name in OUTCOMES if name != "reached"]
         rows = [("sweep", "strength", "policy", "trials", "reached (%)", f"{100 * CONFIDENCE:g} % interval", *others)]
-        for cell in self.cells:
-            ends = self.tally(cell, partial=True)
+        for cell, ends, found in self.cell_successes():
             share, interval = "-", "-"
-            if total := ends.total():
-                sure = rate(ends["reached"], total)
+            if found is not None:
+                sure = found.exact
                 share, interval = f"{100 * sure.value:.1f}", f"{100 * sure.low:.1f} to {100 * sure.high:.1f}"
             counts = [str(ends[name]) for name in others]
-            rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(total), share, interval, *counts))
+            rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(ends.total()), share, interval, *counts))
         campaign, missing = self.manifest["campaign"], sum(count for _, _, count in self.missing)
         of = campaign["trials"] * len(self.cells)
         remarks = [f"not finished: {missing} of {of} trials are missing"] if missing else []

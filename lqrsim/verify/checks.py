@@ -1,8 +1,8 @@
-"""Verification of runs: by drawing them, and from their videos."""
+"""Verification of runs: by drawing them, and from their videos; and whether the parts of a record fit together."""
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import av
@@ -12,18 +12,99 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from mujoco import mjtGeom as Geom
 
-from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.errors import Array, InputError, check_count, check_function, check_kind
 from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.verify import ground_truth
-from lqrsim.verify.ground_truth import Progress
 from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.decorative_geoms import RIM
-from lqrsim.view.recorded_trial import place_in, robot_body
+from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 from lqrsim.view.video_metadata import Pane, VideoMetadata
+
+Progress = Callable[[int, int], object]
+
+
+def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
+    """Raises InputError unless these are a solution and a function, or None."""
+    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
+    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
+
+
+def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
+    """The model that was run. Raises InputError if there is no such trial, or it has no frames."""
+    model = model_of(rollout, trial)
+    if len(rollout.frame_times) < 2:
+        raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
+    return model
+
+
+def describe(rollout: Rollout, trial: int) -> str:
+    """Robot, scene, seed and trial, as text."""
+    return f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}, trial {rollout.first_trial + trial}"
+
+
+def frames_at_states(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
+    """The times of the states that have a frame, and the rows of these frames."""
+    rows = np.abs(rollout.frame_times - rollout.times[:, None]).argmin(axis=1)
+    good = np.abs(rollout.frame_times[rows] - rollout.times) < 1e-6 * rollout.plan.dt
+    good &= np.isfinite(rollout.frames[trial, rows]).all(axis=1) & np.isfinite(rollout.states[trial]).all(axis=1)
+    if good.sum() < 3:
+        raise InputError(f"rollout: got trial {trial} with {good.sum()} frames to draw, want 3 or more")
+    return rollout.times[good], rows[good]
+
+
+def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
+    """Positions (N, d) of the states nearest to these times."""
+    rows = np.abs(rollout.times - times[:, None]).argmin(axis=1)
+    return rollout.places(trial)[rows]
+
+
+def planned_positions(rollout: Rollout, times: Array) -> Array:
+    """Planned positions (N, d)."""
+    return np.stack([np.interp(times, rollout.times, column) for column in rollout.planned_places.T], axis=1)
+
+
+def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
+    """Positions (N, d) of the robot's body from the frames, which are denser than the states."""
+    good = np.isfinite(rollout.frames[trial]).all(axis=1)
+    data, body, places = mujoco.MjData(model), robot_body(model, rollout.body), []
+    for frame in rollout.frames[trial, good]:
+        data.qpos = frame
+        mujoco.mj_kinematics(model, data)
+        places.append(place_in(data, rollout, body).copy())
+    columns = rollout.of_world(places).T
+    return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
+
+
+def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
+    """Whether states and frames are one motion."""
+    times, _ = frames_at_states(rollout, trial)
+    found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
+    apart = np.linalg.norm(found - wanted, axis=1).max()
+    said = f"frames and states at most {1e3 * apart:.2f} mm apart, want {1e3 * bound:.2f} at most"
+    return Criterion("record", bool(apart <= bound), said)
+
+
+def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
+    """Whether the plan is that of the solution; not checked if another policy was run."""
+    if solution is None:
+        return Criterion("plan", None, "not checked without the solution")
+    same = np.array_equal(rollout.plan.states, solution.trajectory.states)
+    same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
+    if not same:
+        return Criterion("plan", False, "not that of the solution")
+    if not ran_policy_of(solution, rollout):
+        unknown = "whether the controller followed it is unknown, for it was not the solution's policy"
+        return Criterion("plan", None, f"that of the solution; {unknown}")
+    return Criterion("plan", True, "that of the solution, whose policy was run")
+
+
+def ran_policy_of(solution: Solution, rollout: Rollout) -> bool:
+    """Whether the solution's policy was run, with or without its gains."""
+    return rollout.policy_digest in [one.policy.digest for one in (solution, solution.open_loop())]
+
 
 SIZE = (640, 480)
 DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged ones
@@ -56,14 +137,14 @@ def verify_run(
     Raises:
       InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.
     """
-    ground_truth.check_arguments(solution, progress)
-    model = ground_truth.drawable_model(rollout, trial)
+    check_arguments(solution, progress)
+    model = drawable_model(rollout, trial)
     body = robot_body(model, rollout.body)
     if rollout.balls is not None and not rollout.state_coordinates.position:
         body = rollout.balls.tracked[0]
     geom = _tracked_geom(model, body)
     views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout.plane)]
-    times, rows = ground_truth.frames_at_states(rollout, trial)
+    times, rows = frames_at_states(rollout, trial)
     measured: list[Array] = []
     offsets: list[Array] = []
     for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views):
@@ -78,18 +159,18 @@ def verify_run(
     positions = Positions(
         times,
         seen=places - rollout.of_world(offsets),
-        actual=ground_truth.state_positions(rollout, trial, times),
-        planned=ground_truth.planned_positions(rollout, times),
+        actual=state_positions(rollout, trial, times),
+        planned=planned_positions(rollout, times),
         apart=apart,
     )
     return compare(
-        ground_truth.describe(rollout, trial),
+        describe(rollout, trial),
         f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
         positions,
         bound=DRAWN_BOUND * rollout.radius,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
-        others=(ground_truth.check_plan(rollout, solution),),
+        others=(check_plan(rollout, solution),),
     )
 
 
@@ -224,7 +305,7 @@ def verify_video(
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
-    ground_truth.check_arguments(solution, progress)
+    check_arguments(solution, progress)
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     trial = None if trial is None else check_count("trial", trial, at_least=0)
     metadata, plane = video_metadata.read(path), rollout.plane
@@ -235,7 +316,7 @@ def verify_video(
     panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
     views = [pane.camera for pane in panes if pane.camera is not None]
     triangulate(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
-    model, radius = ground_truth.drawable_model(rollout, trial), metadata.markers[run]
+    model, radius = drawable_model(rollout, trial), metadata.markers[run]
     measured: list[list[Array]] = []
     off = 0.0  # seconds between when a frame is shown and when it should be, at most
     for time, image in _decoded(path):
@@ -249,19 +330,19 @@ def verify_video(
     positions = Positions(
         times,
         seen=seen,
-        actual=ground_truth.frame_positions(rollout, trial, model, times),
-        planned=ground_truth.planned_positions(rollout, times),
+        actual=frame_positions(rollout, trial, model, times),
+        planned=planned_positions(rollout, times),
         apart=apart,
     )
     areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
     others = (
         *_check_file(metadata, digest, len(measured), off, min(areas)),
-        ground_truth.check_record(rollout, trial, model, RECORD_BOUND * rollout.radius),
-        ground_truth.check_plan(rollout, solution),
+        check_record(rollout, trial, model, RECORD_BOUND * rollout.radius),
+        check_plan(rollout, solution),
     )
     named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
     return compare(
-        f"{Path(path).name}, {ground_truth.describe(rollout, trial)}",
+        f"{Path(path).name}, {describe(rollout, trial)}",
         f"the green mark in its panes {named}",
         positions,
         bound=VIDEO_BOUND * rollout.radius,
