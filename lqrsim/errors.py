@@ -26,7 +26,7 @@ if outdated():
 Array = npt.NDArray[np.floating]
 
 _FLOAT64 = np.dtype(np.float64)
-_LARGE = 10**7  # entries from which on it is checked whether memory suffices for arrays of that size
+_LARGE = 10**7  # entries; for larger arrays the memory is checked first
 LONGEST = 1010  # characters of a message
 LARGEST_COUNT = 10**9  # of a count without a limit of its own: a longer loop takes more than a day
 
@@ -107,7 +107,7 @@ def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
     """Weights (size,), from one number for all or an array. Raises InputError unless they are finite and >= 0."""
     try:
         single = np.ndim(value) == 0  # pyright: ignore[reportArgumentType]
-    except Exception:  # lists of different lengths, of which `check_array` says so
+    except Exception:  # lists of different lengths, which `check_array` refuses
         single = False
     if single:
         return np.full(size, check_number(field, value, at_least=0.0))

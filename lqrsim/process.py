@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 WAKE = getattr(signal, "SIGURG", signal.SIGINT)  # unused otherwise, and ignored by default
 MOST_WAKES = 100
-GRACE = 2.0  # s after a signal in which a second one is ignored, so that it does not stop the tidying up
+GRACE = 2.0  # s after a signal; a second one in this time is ignored, so that it does not stop the tidying up
 
 
 class Unprintable(Exception):
@@ -149,10 +149,10 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block in which any exception, such as that of Ctrl-C, gets what there is until then as its `found`.
+    """A block in which an exception, such as that of Ctrl-C, gets the results so far as its `found`.
 
     Args:
-      make: returns it, or None if there is nothing. It is given what the block within has kept, or None.
+      make: returns it, or None if there is nothing. Its argument is what an inner block has kept, or None.
     """
     try:
         yield

@@ -255,7 +255,7 @@ class Call:
             place += part.size
 
     def _lay(self, layout: "_Layout", argument: Any, place: int) -> None:
-        """Write the words of an argument, from a place on."""
+        """Write the words of an argument, beginning at a place."""
         kind = layout.kind
         if layout.block is not None:
             self._words[place] = _address_of(argument, layout.block)

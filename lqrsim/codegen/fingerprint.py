@@ -1,4 +1,4 @@
-"""A hash of what a function does, without running it: the cache key of everything derived from the function.
+"""A hash of a function's code, without running it: the cache key of everything derived from the function.
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
 that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else

@@ -59,7 +59,7 @@ _OPERATORS: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
 
 @dataclass(frozen=True)
 class Value:
-    """The value of an expression: its type, LLVM's name of it or its parts, and the constant that it is, if it is."""
+    """The value of an expression: its type, its name in LLVM or its parts, and its number if it is constant."""
 
     type: Type
     name: str = ""

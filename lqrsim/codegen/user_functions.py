@@ -194,9 +194,9 @@ class UserFunction:
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
       unused: (index, name) of the entries of (x, u) that the value is stated not to depend on.
-      held: objects that must be kept alive, and the address, once there is one.
+      held: the object to keep alive and the address, once there is one.
       stopped: set it to end the solves that call back, in any thread.
-      entries: what each returned value is for, in messages; empty where a single number is returned.
+      entries: names of the returned values in messages; empty for a single number.
       columns: size of the rows in which the values are returned; 0 for a flat list.
       with_control: False for a `function(x, p)`.
       is_memory: whether the address is that of numbers, not of a function.
@@ -285,7 +285,7 @@ class UserFunction:
 
     @cached_property
     def called_back(self) -> tuple[Any, int]:
-        """A C function that calls this one through Python: what must be kept alive, and its address.
+        """A C function that calls this one through Python: the object to keep alive, and its address.
 
         It is `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
         """

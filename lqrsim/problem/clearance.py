@@ -20,7 +20,7 @@ class Clearance(Constraint):
 
     It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
     the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,
-    if only of a small weight: it tells the search which way round is better.
+    if only of a small weight: it guides the search around the obstacles.
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.

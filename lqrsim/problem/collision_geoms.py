@@ -98,7 +98,7 @@ class CollisionGeoms(abc.ABC):
 
     @abc.abstractmethod
     def travel(self, before: Array, after: Array) -> Array:
-        """How far in metres any point moves at most on a straight line between states.
+        """How far any point moves at most, in metres, on a straight line between states.
 
         Args:
           before: (..., n). after: (..., n).

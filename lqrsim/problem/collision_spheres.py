@@ -101,7 +101,7 @@ class CollisionSpheres:
         in a plane, and then they see the world as the position does: see `World.seen_by`. p has the dynamics'
         parameters as attributes.
       radii: (K,) of the balls, in metres.
-      names: names of the balls, by which messages call them; by default "ball 0", "ball 1", ....
+      names: names of the balls in messages; by default "ball 0", "ball 1", ....
       sites: names of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that
         the middle of each is where the formula has it.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
@@ -291,7 +291,7 @@ class CollisionSpheres:
 def check_outline(
     field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
 ) -> float:
-    """The radius that is kept clear of obstacles, checked: of balls, that of the largest; of geoms, 0.
+    """The radius that is kept clear of obstacles, checked. For balls it is that of the largest, for geoms 0.
 
     Raises:
       InputError: it is negative, these are no balls or geoms, or it is not one of the three.

@@ -125,7 +125,7 @@ class SymbolicConstraint(Constraint):
         must be nonnegative. All of them depend on u, or none does. They are solved for to one tolerance, so their units
         are best such that numbers about 1 matter.
       parameters: name -> value, as in `Dynamics`.
-      equality: whether the expressions must be zero; they are to 1e-6, or to `constraint_tolerance` if that is smaller.
+      equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
       at: "all" steps, or only the "final" one, where it must not depend on u.
     """
 

@@ -178,9 +178,9 @@ def check_derivatives(
 ) -> list[DerivativeCheck]:
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
-    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
-    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, because theirs
-    are central differences themselves.
+    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes. Those of
+    compiled and plain functions may be wrong. Costs without derivatives are left out, because theirs are central
+    differences themselves.
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
@@ -248,7 +248,7 @@ def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> I
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
     if dynamics.discrete:
-        return  # what is stated are central differences
+        return  # its derivatives are central differences already
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)
         joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))
@@ -262,7 +262,7 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
     n = len(dynamics.state_coordinates)
     for cost, term in _terms(problem):
         if len(term.functions) == 1 and term.exact_hessian:
-            continue  # without derivatives: what is stated are central differences
+            continue  # without derivatives of its own, it has central differences already
 
         def at(z: Array, term: CostTerm = term) -> tuple[float, Array, Array]:
             return evaluate(term, dynamics, z[:n], z[n:])
@@ -303,7 +303,7 @@ def _worst_entry(matrix: _Derivative, tolerance: float) -> DerivativeCheck:
 
 
 def _differences(function: Any, z: Array, step: float = 6e-6) -> tuple[Array, Array]:
-    """The Jacobian of a function of a vector by central differences, and what rounding may have done to each entry."""
+    """The Jacobian of a function by central differences, and a bound on the rounding error of each entry."""
     columns, noise = [], []
     for i in range(len(z)):
         h = step * max(1.0, abs(z[i]))

@@ -167,7 +167,7 @@ class Problem:
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
         """The rest of the problem after some steps, from a state that is given exactly.
 
-        It may begin within an obstacle, unlike a problem that is stated: there a plan is to find out of it.
+        Unlike a problem that is stated, it may begin within an obstacle: the plan then leads out of it.
 
         Args:
           state: (n,).
@@ -179,7 +179,7 @@ class Problem:
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
         start = FixedState(here)
-        if isinstance(self.initial, FixedState):  # a quarter of the time that making the cost anew takes
+        if isinstance(self.initial, FixedState):  # four times as fast as a new cost
             term = copy.copy(self._terms["initial"][0])
             object.__setattr__(term, "data", np.concatenate([here, term.data[len(here) :]]))
         else:
@@ -394,7 +394,7 @@ class Problem:
     def _inside(
         self, outlines: Sequence[ObstacleCost | Clearance], state: Array, time: float
     ) -> tuple[str, str] | None:
-        """Where a state, which may have NaNs, is inside an obstacle, and what to do about a start there."""
+        """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
         space = self.dynamics.state_coordinates
         for outline in outlines:
             if outline.geoms is not None:

@@ -272,7 +272,7 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
 
 
 def _reach(results: Results, scenario: Scenario) -> str:
-    """The distance from the goal, as text, within which a trial has reached it."""
+    """The distance, as text, within which a trial has reached its goal."""
     target = next(iter(results.trials.solutions.values())).target
     campaign = results.campaign
     radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)

@@ -234,7 +234,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove what killed processes have left: files of `replacing` that nobody has written to for a day."""
+    """Remove files of `replacing` that killed processes have left, after a day without a change."""
     oldest = time.time() - ABANDONED
     for path in folder.glob(f"{UNFINISHED}{'[0-9a-f]' * 16}*"):
         with contextlib.suppress(OSError):  # another process may have removed it

@@ -264,7 +264,7 @@ class Coordinates:
 
 
 def _letter(name: str) -> str:
-    """The axis that a name tells: the letter x, y or z in which it ends or that stands alone in it; `?` if none."""
+    """The axis in a name: the letter x, y or z at its end, or alone in it; `?` if none."""
     if name[-1:].lower() in tuple(SPACE):
         return name[-1].lower()
     alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))

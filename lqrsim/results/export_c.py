@@ -58,7 +58,7 @@ class ExportedC:
         check_fields(self)
 
     def summary(self) -> str:
-        """What was written, and how far the commands are off, in lines."""
+        """Lines on the files, and on the largest errors of the commands."""
         lines = [f"SHA-256 {self.sha256}, tables of {self.table_bytes:,} bytes", f"{OFF}:"]
         return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
 
@@ -359,7 +359,7 @@ def _rows(
     times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
     z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
     space, expected = _measured(law), values.get("expected", law.nominal)
-    # A filter takes what is measured for a motion, whose rates are larger by far.
+    # A filter takes a jump of the measurement for a motion at a much higher rate.
     spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
     for place, period in enumerate(times):
         t, k = float(period) * law.dt, min(int(period), law.steps - 1)

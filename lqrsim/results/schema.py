@@ -71,7 +71,7 @@ def optional(check: Check) -> Check:
 
 
 def listed(check: Check) -> Check:
-    """The check for a list, all of whose entries pass a check."""
+    """The check for a list whose entries all pass a check."""
 
     def each(field: str, value: Any) -> list[Any]:
         if not isinstance(value, list):
@@ -93,7 +93,7 @@ def row(*checks: Check) -> Check:
 
 
 def mapped(check: Check) -> Check:
-    """The check for an object with any names, all of whose values pass a check."""
+    """The check for an object with any names whose values all pass a check."""
 
     def each(field: str, value: Any) -> dict[str, Any]:
         _object(field, value)

@@ -172,7 +172,7 @@ class Solution(Plan):
         if radius is None and not target.places:
             radius = target.radius(None, None, None)
         lines = target.of_plan(radius)
-        return lines if self.success else lines[:1]  # what to do about a failure is its remedy
+        return lines if self.success else lines[:1]  # the remedy of a failure follows
 
     def _beyond_limits(self) -> list[str]:
         """A line for each control that is planned beyond its limits."""

@@ -25,10 +25,11 @@ class Robot(abc.ABC):
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
-      activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
+      activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
       radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
       balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
-        None by default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
+        None by default. The radius then is the robot's size in pictures, and the distance within which it has reached
+        its goal.
       geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
         None by default.
     """

@@ -125,7 +125,7 @@ def _carried(model: mujoco.MjModel) -> Array:
 
 
 def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
-    """How large each control can be, (m,): by its own limits, else by those of its force; 1 where there are none."""
+    """The largest size of each control, (m,): by its own limits, else by those of its force; 1 without limits."""
     found = np.ones(model.nu)
     for number in range(model.nu):
         gain, gear = abs(float(model.actuator_gainprm[number, 0])), abs(float(model.actuator_gear[number, 0]))

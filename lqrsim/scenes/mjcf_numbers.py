@@ -20,7 +20,7 @@ _BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # of the rest: none is negative
 
 @dataclass(frozen=True)
 class Number:
-    """A number of an MJCF: which one, of which body, joint, geom or actuator (of all if empty), and its value."""
+    """A number of an MJCF: its kind, its body, joint, geom or actuator (empty for all), and its value."""
 
     what: str
     part: str
@@ -33,7 +33,7 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     Only for elements that have a name and this number in the text: bodies that move, geoms that collide.
 
     Args:
-      xml: an MJCF in which all has a name. model: compiled from it.
+      xml: an MJCF whose elements all have names. model: compiled from it.
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}

@@ -8,7 +8,7 @@ from lqrsim.errors import Array
 
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's
 
-_NEAR = 1e-3  # m, from the floor, where something is on it
+_NEAR = 1e-3  # m; anything nearer to the floor stands on it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 
 

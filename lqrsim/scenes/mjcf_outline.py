@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim.capsules import Capsule
 from lqrsim.errors import Array
 
-# Relative to its radius: by how much a capsule may stick out of the balls that stand for it.
+# The largest part of a capsule outside its balls, relative to its radius.
 TOLERANCE = 0.25
 
 
@@ -19,7 +19,7 @@ class Outline:
     Attributes:
       bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) where, in the axes of these, in metres.
       radii: (B,) in metres. names: of the balls. sites: of the geoms whose middle they are in; None for the others.
-      missed: by how much a capsule sticks out of its balls at most, in metres.
+      missed: largest part of a capsule outside its balls, in metres.
     """
 
     bodies: Array

@@ -106,7 +106,7 @@ class MjcfPhysics:
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:
-    """Raises InputError for what the states do not have, or that makes them depend on each other."""
+    """Raises InputError for features with states of their own, or that make states depend on each other."""
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
         "equality": (

@@ -109,7 +109,7 @@ class World:
 
     @cached_property
     def moving(self) -> bool:
-        """Whether an obstacle of it moves."""
+        """Whether any obstacle moves."""
         return any(obstacle.velocity.any() for obstacle in self.obstacles)
 
     def displacements(self, times: npt.ArrayLike) -> Array:
@@ -158,7 +158,8 @@ class World:
         In space ("xyz") it is this one. A plane has its two axes as x and y, in their order; its third axis is across.
 
         With an offset it is this world cut there: distances are those in space, from the points of the plane. The robot
-        is a ball, obstacles beside the plane are beside it, and a floor is a wall. Without one, in a horizontal plane,
+        is a ball, obstacles beside the plane do not touch it, and a floor is a wall. Without one, in a horizontal
+        plane,
         it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to
         the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
         horizontal one that is the floor.

@@ -1,9 +1,9 @@
 """The definition of a collision: the first moment at which the robot of a trial touches an obstacle.
 
-It touches one if the signed distance of its position, minus its radius, is negative, or that of one of its balls or
-geoms; or if MuJoCo detects a contact of one of its geoms with it. Detection uses states without obstacle contacts, so
-that it is bit-identical whether an obstacle then stops the robot or not. It checks the knots, the parts of a control
-period that `Physics` has, and straight lines between them.
+It touches one if the signed distance of its position, or of one of its balls or geoms, minus the radius is negative; or
+if MuJoCo detects a contact. Detection uses states without obstacle contacts, so that it is bit-identical whether an
+obstacle then stops the robot or not. It checks the knots, the parts of a control period that `Physics` has, and
+straight lines between them.
 """
 
 import numpy as np

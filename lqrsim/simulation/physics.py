@@ -50,7 +50,7 @@ class Physics:
 
     Args:
       substeps: physics steps per control period.
-      contacts: whether obstacles may become solid; without, it takes a quarter less time.
+      contacts: whether obstacles may become solid; without them it takes a quarter less time.
       threads: number of threads; by default one per processor.
 
     Attributes:
@@ -87,7 +87,7 @@ class Physics:
         self._act[:] = states[:, states.shape[1] - self._act.shape[1] :]
 
     def prepare(self, *, altered: bool) -> None:
-        """Make obstacles passable, and update what depends on `altered` fields of the models."""
+        """Make obstacles passable, and update all fields that depend on the `altered` ones."""
         model = self.simulations.model
         if altered:
             # While obstacles are still solid: MuJoCo also determines here which bodies can collide at all.

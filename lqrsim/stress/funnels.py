@@ -390,7 +390,7 @@ def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Ar
 
 
 def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
-    """The level at which an angle is off by half a turn; beyond it the ellipsoid has some states twice."""
+    """The level at which an angle is off by half a turn; a larger ellipsoid contains some states twice."""
     space = solution.policy.state_coordinates
     groups = [[i] for i in space.angles] + [[i, i + 1, i + 2] for i in space.rotation_vectors]
     end = np.inf

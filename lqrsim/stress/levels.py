@@ -1,12 +1,12 @@
-"""The largest of nested levels at which trials succeed with a given rate, certified with a given confidence.
+"""The largest of nested levels at which trials succeed at a given rate, certified with a given confidence.
 
 A pilot search finds a candidate by steps and bisection, with the same random numbers at each level. Fresh trials then
 test fixed shares of that level, from the smallest up, each with the whole confidence, until one fails; the last level
 that passed is the result. The order is fixed before the fresh trials run, and a level is tested only if all smaller
-ones passed. So a wrong result requires that the first level whose rate is too low passes its test, which is as
-improbable as that test allows: the confidence need not be divided among the levels (the fixed-sequence procedure;
-Maurer, Hothorn & Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided
-bound of Clopper and Pearson is at least the rate.
+ones passed. So a result is wrong only if the first level with too low a rate passes its test, which is as improbable as
+that test allows. The confidence need not be divided among the levels (the fixed-sequence procedure; Maurer, Hothorn &
+Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided bound of Clopper and
+Pearson is at least the rate.
 """
 
 from collections.abc import Callable

@@ -214,8 +214,8 @@ def _silhouettes(
 
 
 FEWEST_PIXELS = 20  # of the tracked object; the centre of fewer is too uncertain
-LEAST_SHARE = 0.5  # of the mark that must be visible; the rest may be outside the picture
-# Green minus the larger of red and blue: below EMPTY a pixel does not count, from FULL on it is all mark. Video blurs
+LEAST_SHARE = 0.5  # share of the mark that must be visible; the rest may be outside the picture
+# Green minus the larger of red and blue: a pixel below EMPTY does not count, one above FULL counts fully. Video blurs
 # the edge of the mark, and mixes the colours of overlays into its surroundings.
 EMPTY, FULL = 0.2, 0.9
 
@@ -315,7 +315,7 @@ def verify_video(
     trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
     panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
     views = [pane.camera for pane in panes if pane.camera is not None]
-    triangulate(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
+    triangulate(views, np.zeros((0, len(views), 2)), plane)  # names missing views before the slow part
     model, radius = drawable_model(rollout, trial), metadata.markers[run]
     measured: list[list[Array]] = []
     off = 0.0  # seconds between when a frame is shown and when it should be, at most

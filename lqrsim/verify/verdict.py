@@ -75,7 +75,7 @@ def _slope(error: Array, velocity: Array) -> float:
 
 
 def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
-    """The frame from which on errors are velocity times a delay, and the delay; before it there are no errors."""
+    """The first frame whose error is velocity times a delay, and the delay; earlier frames have no errors."""
     products, squares = ((error * velocity).sum(axis=1), (velocity**2).sum(axis=1))
     tails = [np.cumsum(part[::-1])[::-1] for part in (products, squares)]
     gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # the reduction of the squares by a break there

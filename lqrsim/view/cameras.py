@@ -196,7 +196,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
     up, points = np.cross(right, forward), _extent_points(recorded, data)
-    # As far back as it takes to have every point within both angles of view.
+    # Far enough back to have every point within both angles of view.
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
     back = 0.0

@@ -24,7 +24,8 @@ class Ellipsoids:
     Attributes:
       centres: (k, d).
       covariances: (k, d, d).
-      end: half axis in metres from which on they were left out; None if all are there.
+      end: largest half axis in metres that is drawn; ellipsoids from the first larger one on are left out. None if all
+        are there.
     """
 
     centres: Array

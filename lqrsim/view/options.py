@@ -11,7 +11,7 @@ Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "cost_
 Quality = Literal["draft", "standard", "publication"]
 
 ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
-# Tubes about one plan hide each other: that of the cost, and a funnel, are for those who ask for them.
+# Tubes about one plan hide each other, so the tube of the cost and the funnel are not drawn by default.
 OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if name not in ("cost_tube", "funnel"))
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)

@@ -118,7 +118,7 @@ def _tube(
     label: str,
     opaque: Mapping[bool, float] = OPACITY,
 ) -> DrawnTube:
-    """Some of the ellipsoids at these knots, which overlap to about this opacity."""
+    """Some of the ellipsoids at these knots; where they overlap, the opacity is about the given one."""
     one = Ellipsoids(every.centres[among], every.covariances[among])
     chosen = one.spread(MOST_ELLIPSOIDS)
     apart = np.linalg.norm(np.diff(one.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
@@ -156,7 +156,7 @@ FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interp
 SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than they are
 SEGMENTS = 120  # of a line, at most
 DOTS = 30  # latest measured states that are drawn
-END_ON = 0.9  # cosine of the angle to the line of sight, from which on an arrow is not drawn
+END_ON = 0.9  # cosine of the angle to the line of sight; an arrow above it is not drawn
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def plot_run(
     is the chance of collision at each step.
 
     Args:
-      solution: whose plan the rollouts follow.
+      solution: its plan is the one that the rollouts follow.
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.

@@ -152,7 +152,7 @@ def robot_body(model: mujoco.MjModel, name: str) -> int:
 
 
 def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
-    """Place (3,) of the robot: the origin of its body, or for one without a position its last ball."""
+    """Place (3,) of the robot: the origin of its body; without a position, its last ball."""
     return place_of(data, robot, None if rollout.state_coordinates.position else rollout.balls)
 
 

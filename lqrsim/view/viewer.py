@@ -32,8 +32,8 @@ from lqrsim.view.browser import Browser
 from lqrsim.view.recorded_trial import model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
-LONGEST_RUN = 600.0  # s, after which a run restarts, for all of it is recorded
-RECENT = 100  # number of solves whose median the caption shows
+LONGEST_RUN = 600.0  # s, after which a run restarts: all of it is kept in memory
+RECENT = 100  # number of solves in the median of the caption
 GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the colour of the plan nor that of the trace
 GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
 

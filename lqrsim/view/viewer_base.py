@@ -22,7 +22,7 @@ TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # of the plan; the trace has twice as many
 LIFT = 0.008  # m, between the floor and the lines on it
 STRONGEST_DRAG = 2.0  # largest force of a drag, relative to the robot's weight
-GOAL_STEP = 0.1  # m, by which a key moves the goal
+GOAL_STEP = 0.1  # m, step of the goal for each key press
 MOST_DELAY = 0.2  # s of delay that a slow machine makes up for, at most
 # The direction of each key, seen from the camera: right, away, up.
 PUSHES = {
@@ -132,7 +132,7 @@ class Viewer(abc.ABC):
         return place
 
     def follow(self, plan: Trajectory, balls: BallRecord | None, *, begins: float = 0.0) -> None:
-        """Show this plan from now on, with its balls if the robot has no position; it begins at a time."""
+        """Show this plan, which begins at a given time, with its balls if the robot has no position."""
         self._times, self._places = begins + plan.times, plan.states[:, list(self.space.position)]
         if not self.space.position and balls is not None:
             self._places = balls.planned[:, -1]
