@@ -78,7 +78,7 @@ _seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDiction
 
 
 def note_helpers(function: Any) -> None:
-    """Remember which helpers are not compiled yet: they will be compiled with their globals of now."""
+    """Remember which helpers are not compiled yet: numba will compile them with their present globals."""
     if fingerprint(function) is not None:
         fresh = (helper for helper in _helpers(function) if not helper.overloads)
         _seen_fresh.update((helper, fingerprint(helper)) for helper in fresh)

@@ -12,7 +12,7 @@ from lqrsim.codegen.sources import PYTHON, Record, Scope, ScopedFunction, Source
 from lqrsim.errors import Array
 from lqrsim.kernels import records
 
-_LONG = 1 << 24  # assumed length of the memory at an address, in entries
+_LONG = 1 << 24  # entries; assumed length of the memory at an address
 
 # Called with each kernel, its Python function, and its arguments.
 Caller = Callable[[ScopedFunction, Callable[..., Any], tuple[Any, ...]], Any]

@@ -198,7 +198,7 @@ class Dynamics:
 
     @cached_property
     def disturbed(self) -> "Dynamics":
-        """The same, but that the disturbances are parameters, too; at their values it moves as this does."""
+        """The same dynamics with the disturbances as parameters, too; at their planned values it moves the same way."""
         if self.disturbances.keys() <= self.parameters.keys():
             return self
         other = copy.copy(self)

@@ -149,7 +149,7 @@ class Problem:
 
     @property
     def times(self) -> Array:
-        """When its knots are, (T+1,) in s: see `begin`."""
+        """The times of its knots, (T+1,) in s; see `begin`."""
         return self.begin + self.dt * np.arange(self.steps + 1)
 
     @property
@@ -191,7 +191,7 @@ class Problem:
         return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
-        """The same with other costs. It may begin within an obstacle if this does; see `from_state`.
+        """The same with other costs. Like this one, it may begin within an obstacle; see `from_state`.
 
         Args:
           stage_cost: the stage cost, or None for the present one.
@@ -215,7 +215,7 @@ class Problem:
         return other._bound_anew() if self.moving else other
 
     def _bound_anew(self) -> "Problem":
-        """The same problem, with everything updated that depends on the steps or on its beginning."""
+        """The same problem, bound anew wherever it depends on the steps or on the time at which it begins."""
         stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
         terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
         constraints = bind_all(self.constraints, self.dynamics, self.times)

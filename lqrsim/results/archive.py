@@ -179,7 +179,7 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterato
 
 @contextlib.contextmanager
 def blamed(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever is raised while `path` is read into one line about the file.
+    """Turn any exception from reading `path` into one line about the file.
 
     Parsers raise exceptions of all kinds for foreign bytes, so that everything is caught here, and only here.
     """

@@ -359,7 +359,7 @@ def _rows(
     times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
     z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
     space, expected = _measured(law), values.get("expected", law.nominal)
-    # A filter takes a jump of the measurement for a motion at a much higher rate.
+    # A filter takes the spread of its measurements for fast motion, so that it is smaller here.
     spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
     for place, period in enumerate(times):
         t, k = float(period) * law.dt, min(int(period), law.steps - 1)

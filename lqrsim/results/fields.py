@@ -9,7 +9,7 @@
         def __post_init__(self) -> None:
             check_fields(self)
 
-A letter is a size, the same in all of a record and in the records within it; `...` is any number of dimensions, `_` any
+A letter is a size: the same one throughout a record and the records in it; `...` is any number of dimensions, `_` any
 size. The letter of a tuple, or of `Coordinates`, is its length.
 """
 

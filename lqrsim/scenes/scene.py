@@ -1,4 +1,4 @@
-"""Scenes: MJCF in, a MuJoCo model and the obstacles that a robot must keep clear of out.
+"""Scenes: from an MJCF to a MuJoCo model and the obstacles that a robot must keep clear of.
 
 The one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and can
 collide is an obstacle.** Fixed to the world: no joint and no mocap between the geom and the world. Can collide:

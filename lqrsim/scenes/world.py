@@ -157,7 +157,7 @@ class World:
 
         In space ("xyz") it is this one. A plane has its two axes as x and y, in their order; its third axis is across.
 
-        With an offset it is this world cut there: distances are those in space, from the points of the plane. The robot
+        With an offset, this world is cut there: distances are in space, from the points of the plane. The robot
         is a ball, obstacles beside the plane do not touch it, and a floor is a wall. Without one, in a horizontal
         plane,
         it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to

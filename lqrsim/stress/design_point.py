@@ -36,7 +36,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.stress.multilevel_splitting import MOST, CountedScore, Progress, Score, failure_probability
 from lqrsim.stress.trial_score import normal_tail
 
-MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from none to 98 %
+MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from 0 to 98 %
 DISCOUNT = 0.95  # of the gradient of earlier rounds, in each round that comes nearer by more than MOVED
 MOVED = 0.01  # share of the distance
 

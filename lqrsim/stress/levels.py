@@ -129,7 +129,7 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
 def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
     """Run the test's own trials, which the pilot has not used. Returns how many fail, and how many were run.
 
-    It stops once more trials have failed than are allowed.
+    It stops as soon as too many trials have failed.
     """
     failed, done = 0, 0
     while done < test.trials and failed <= test.failures:

@@ -354,7 +354,7 @@ def replay(
 
 
 def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:
-    """The row of a trial in the campaign's tables. Raises InputError if its file is missing or damaged."""
+    """The row of a trial in the campaign's tables, by column. Raises InputError if its file is missing or damaged."""
     shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
     return {name: column[trial - shard.first] for name, column in results.table(shard).items()}
 

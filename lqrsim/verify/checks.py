@@ -88,7 +88,7 @@ def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: flo
 
 
 def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
-    """Whether the plan is that of the solution; not checked if another policy was run."""
+    """Whether the plan is the solution's; not checked if another policy was run."""
     if solution is None:
         return Criterion("plan", None, "not checked without the solution")
     same = np.array_equal(rollout.plan.states, solution.trajectory.states)

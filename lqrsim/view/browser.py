@@ -196,7 +196,7 @@ class Browser(Viewer):
         tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
         return (
             f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
-            f"  {tunnel}\nNo other machine reaches it; other users of this one do. Ctrl-C ends it."
+            f"  {tunnel}\nNo other machine can reach it; other users of this one can. Ctrl-C ends it."
         )
 
     def refresh(self) -> bool:

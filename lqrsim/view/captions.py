@@ -45,7 +45,7 @@ class Caption:
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
     def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
-        """The title, the disturbances as far as they leave most of the picture free, and the number of the others."""
+        """The title, as many disturbances as leave most of the picture free, and the number of the others."""
         tile = np.empty((0, 0, 4), dtype=np.uint8)
         for count in range(len(what), -1, -1):
             left = len(what) - count

@@ -28,7 +28,7 @@ def draw_obstacles(
 ) -> None:
     """Draw the obstacles around places (k, 2 or 3) of a robot of that radius.
 
-    A planar robot has its own plane. One in space is seen along the axis that is not in `plane`, two of its axes.
+    A planar robot has its own plane. A robot in space is seen along the third axis; `plane` has the two others.
     """
     if len(space.position) == 2:
         flat = world.seen_by(space.plane, space.offset)

@@ -131,7 +131,7 @@ class MeasurementBias(StateError):
 
 
 class InitialStateError(StateError):
-    """The robot does not begin in the first state of the plan.
+    """The robot begins off the first state of the plan.
 
     Args:
       std: standard deviation in the state's unit; one number, or one per state.
