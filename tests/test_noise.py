@@ -250,6 +250,17 @@ def test_what_is_refused(make, message):
         make()
 
 
+@settings(max_examples=8, deadline=None)
+@given(power=st.floats(-3, 306), solver=st.sampled_from([ls.smooth, ls.ilqr]))
+def test_noise_without_bounds_is_never_left_out_of_the_cost(power: float, solver: Any) -> None:
+    """A linear-quadratic plan costs sum_t tr(S_t+1 M M') / 2 more with constant noise M, however large that is."""
+    quiet, loud = solver(of(None)), solver(of(ls.Noise(10.0**power * np.eye(STATES))))
+    with np.errstate(over="ignore"):
+        wanted = quiet.cost + 0.5 * np.float64(10.0**power) ** 2 * np.trace(quiet.cost_to_go.hessian[1:].sum(axis=0))
+    assert loud.cost == (pytest.approx(wanted, rel=1e-6) if np.isfinite(wanted) else np.inf)
+    assert np.isfinite(loud.cost) or not loud.success
+
+
 def soft() -> ls.Problem:
     return problem_of(draw(np.random.default_rng(0)), fixed=False)
 

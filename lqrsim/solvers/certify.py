@@ -55,7 +55,10 @@ def certified(
     def none() -> CostToGo:
         return CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
 
-    work(declarations.CERTIFY, none() if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
+    if value is None and problem.noise_term is not None:  # what noise costs is weighed by the policy's own cost-to-go
+        work(declarations.EVALUATE, none(), numbers)
+    else:
+        work(declarations.CERTIFY, none() if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
