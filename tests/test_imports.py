@@ -42,7 +42,7 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("fields", "schema", "coordinates", "solution_parts", "value_functions"),
+        ("fields", "coordinates", "solution_parts", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
         ("plan",),
         ("solution",),

@@ -6,6 +6,7 @@ states, and whatever a parser raises becomes one line.
 
 import contextlib
 import hashlib
+import json
 import os
 import re
 import secrets
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import InputError, check_path, excerpt
-from lqrsim.results.schema import canonical, parse
+from lqrsim.results.fields import check_string
 
 
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
@@ -48,11 +49,48 @@ ABANDONED = 24 * 3600.0  # s after its last change; nothing takes so long to wri
 # The most that is read, in bytes, or relative to the size of the file.
 _LARGEST_TEXT = 1 << 26
 _LARGE, _TIMES = 1 << 30, 100
+_DEPTH = 6  # nested lists and objects in `anything`
 # NumPy's header of an array of numbers, or of a text; no other is parsed.
 _HEADER = re.compile(
     rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
     rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
 )
+
+
+def parse(text: str | bytes) -> Any:
+    """Parse a JSON text. Raises ValueError if it is none, is nested too deeply, or has a name twice in an object."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError("lists or objects too deep within each other") from None
+
+
+def canonical(value: Any) -> str:
+    """The canonical JSON text of a value: sorted names, no spaces. Raises TypeError or ValueError."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a name twice in one object")
+    return found
+
+
+def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
+    """Any JSON value, with a limit to nested lists and objects."""
+    if isinstance(value, str):
+        return check_string(field, value)
+    if isinstance(value, list | dict):
+        if depth == 0:
+            raise InputError(f"{field}: got more nested lists or objects, want at most {_DEPTH}")
+        if isinstance(value, list):
+            return [anything(f"{field}[{i}]", one, depth - 1) for i, one in enumerate(value)]
+        return {
+            check_string(f"{field}: a name", name): anything(f"{field}.{name}", one, depth - 1)
+            for name, one in value.items()
+        }
+    return value
 
 
 class Header(NamedTuple):

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin, overload
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
-from lqrsim.results.archive import Arrays, Header, digest, opened, write
+from lqrsim.results.archive import Arrays, Header, anything, canonical, digest, opened, parse, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
@@ -23,7 +23,6 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.schema import anything, canonical, parse
 from lqrsim.results.solution import Solution
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate

@@ -19,6 +19,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lqrsim.errors import InputError, excerpt
-from lqrsim.results import schema
-from lqrsim.results.archive import Other, blamed, sha256
+from lqrsim.results.archive import Other, blamed, canonical, parse, sha256
+from lqrsim.results.fields import Line, check_fields
 from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
-from lqrsim.stress.policies import POLICIES
 from lqrsim.stress.specification import Campaign, Cell, Shard
 
 _HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # another process has the lock; EDEADLK on Windows
@@ -160,33 +160,30 @@ FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST = 1 << 26  # bytes
 
-_HASH = schema.line
-_POLICY = schema.one_of(POLICIES)
-_STRENGTH = schema.number(at_least=0.0)
-_DISTURBANCE = schema.record({"kind": schema.line, "settings": schema.mapped(schema.anything)})
-_CAMPAIGN = schema.record(
-    {  # the fields of Campaign
-        "scenario": schema.line, "sweeps": schema.mapped(schema.listed(_DISTURBANCE)),
-        "strengths": schema.listed(_STRENGTH), "policies": schema.listed(_POLICY),
-        "trials": schema.count, "seed": schema.count,
-        **dict.fromkeys(
-            ("replan_every", "goal_radius", "goal_tolerance"), schema.optional(schema.number(above=0.0))
-        ),
-        "shard": schema.count, "time_limit": schema.number(above=0.0),
-        "design_disturbances": schema.optional(schema.listed(_DISTURBANCE)),
-    }
-)  # fmt: skip
-_MANIFEST = schema.record(
-    {
-        "format": schema.line, "version": schema.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
-        "start": schema.optional(_HASH), "solution": schema.optional(_HASH),
-        "code": schema.mapped(schema.optional(_HASH)),
-        "policies": schema.mapped(schema.record({"digest": _HASH, "sha256": _HASH})),
-        "cells": schema.listed(schema.row(_POLICY, schema.line, _STRENGTH)), "versions": schema.mapped(schema.line),
-        "digest": _HASH, "machine": schema.line, "left_out": schema.line,
-        "remarks": schema.listed(schema.line), "sha256": _HASH,
-    }
-)  # fmt: skip
+
+@dataclass(frozen=True)
+class _Manifest:
+    """The fields of the manifest; `Campaign` checks those of the campaign."""
+
+    format: Line
+    version: int
+    campaign: Mapping[str, object]
+    model: Line
+    problem: Line
+    start: Line | None
+    solution: Line | None
+    code: Mapping[str, Line | None]
+    policies: Mapping[str, Mapping[str, Line]]
+    cells: object
+    versions: Mapping[str, Line]
+    digest: Line
+    machine: Line
+    left_out: Line
+    remarks: tuple[Line, ...]
+    sha256: Line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
@@ -194,7 +191,7 @@ def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(schema.parse(json.dumps(manifest)))  # without sorting: the order of the sweeps is that of the cells
+    _check(parse(json.dumps(manifest)))  # without sorting: the order of the sweeps is that of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
 
 
@@ -206,7 +203,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     with blamed(path, "folder"):
         if path.stat().st_size > _LARGEST:
             raise InputError(f"size: got {path.stat().st_size:,} bytes, want at most {_LARGEST:,}")
-        manifest = schema.parse(path.read_text(encoding="utf-8"))
+        manifest = parse(path.read_text(encoding="utf-8"))
         if not isinstance(manifest, dict):
             raise InputError(f"manifest: got {excerpt(manifest)}, want an object")
         if (manifest.get("format"), manifest.get("version")) != (FORMAT, VERSION):
@@ -218,16 +215,29 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def _check(manifest: dict[str, Any]) -> None:
     """Raise InputError unless all fields are there, and the hashes fit."""
-    _MANIFEST("manifest", manifest)
+    _check_names("manifest", manifest, _Manifest)
+    _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got one that does not fit the content, want a file that has not been changed")
     campaign = manifest["campaign"]
-    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(campaign)):
+    _check_names("campaign", campaign, Campaign)
+    if canonical(manifest["cells"]) != canonical(_cells(campaign)):
         raise InputError("cells: got some that are not the campaign's, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
+    for policy, hashes in manifest["policies"].items():
+        if hashes.keys() != {"digest", "sha256"}:
+            raise InputError(f"policies: {policy}: got {excerpt(dict(hashes))}, want digest and sha256")
     if manifest["digest"] != digest_of_rows(manifest):
         raise InputError("digest: got one that does not fit the campaign, want a file that has not been changed")
+
+
+def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:
+    """Raise InputError unless an object of JSON has exactly the fields of a dataclass."""
+    names = [one.name for one in fields(kind)]
+    if wrong := sorted(found.keys() ^ set(names)):
+        got = f"{'' if wrong[0] in found else 'none of '}{excerpt(wrong[0])}"
+        raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")
 
 
 def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
@@ -243,7 +253,7 @@ def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    return sha256(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}))
+    return sha256(canonical({name: one for name, one in manifest.items() if name != "sha256"}))
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
@@ -253,7 +263,7 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
-    return sha256(schema.canonical(hashed))
+    return sha256(canonical(hashed))
 
 
 def digest_of_solution(solution: Solution) -> str:
