@@ -114,7 +114,7 @@ class Clearance(Constraint):
 
 
 def _bind_geoms(geoms: CollisionGeoms, dynamics: Dynamics, world: World, margins: Array) -> ConstraintTerm:
-    """The constraint at a simulator's distances, whose margins are (1 or T + 1, 1 or O)."""
+    """The constraint on a simulator's distances, with margins (1 or T + 1, 1 or O)."""
     found = geoms.bind(dynamics, world, float(margins.max()) + 2 * geoms.size)
     if -1 in found.obstacles and margins.shape[1] > 1:
         want = f"one number for a knot, as there are {len(world)} obstacles"

@@ -233,7 +233,7 @@ class Problem:
 
     @property
     def bytes_per_step(self) -> int:
-        """Memory that a solver takes for a step, at least, from one start: value functions, laws and trajectories."""
+        """The least memory that a solver takes for a step, from one start: value functions, laws and trajectories."""
         n, m = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates)
         return 8 * (3 * n * n + 3 * m * n + 10 * n + 7 * m)
 

@@ -270,8 +270,7 @@ class Funnel:
         inverse = np.full(self.shape.shape, np.nan)
         for knot in range(len(self.shape)):
             if not flat(self.shape[knot]):
-                size = np.sqrt(np.diagonal(self.shape[knot]))
-                inverse[knot] = np.linalg.inv(self.shape[knot] / np.outer(size, size)) / np.outer(size, size)
+                inverse[knot] = inverse_of(self.shape[knot])
         return inverse
 
     def _root(self, knot: int) -> Array:
@@ -288,6 +287,12 @@ def flat(shape: Array) -> bool:
     if not (np.isfinite(shape).all() and (size > 0).all()):
         return True
     return bool(np.linalg.eigvalsh(shape / np.outer(size, size))[0] < FLAT)
+
+
+def inverse_of(matrix: Array) -> Array:
+    """The inverse of a covariance or a Hessian (d, d) of an ellipsoid that is not flat, scaled against rounding."""
+    size = np.sqrt(np.diagonal(matrix))
+    return np.linalg.inv(matrix / np.outer(size, size)) / np.outer(size, size)
 
 
 def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:

@@ -28,10 +28,10 @@ class DifferentialDrive(Robot):
       InputError: a constant is not above 0.
     """
 
-    axle_length: float = 0.258  # m, between the wheels
-    radius: float = 0.17  # m, of the body
-    max_speed: float = 0.5  # m/s, of a wheel's rim, either way
-    wheel_radius: float = 0.036  # m; the height of the axle
+    axle_length: float = 0.258
+    radius: float = 0.17
+    max_speed: float = 0.5
+    wheel_radius: float = 0.036
 
     name = "differential_drive"
     body = "create"
@@ -54,13 +54,10 @@ class DifferentialDrive(Robot):
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        """At rest, wheels on a floor at height zero.
+        """The qpos (..., 9) and qvel (..., 8) at rest, wheels on a floor at height zero.
 
         Args:
           state: (..., 3).
-
-        Returns:
-          qpos (..., 9) and qvel (..., 8).
         """
         state = vectors_of("state", state, 3)
         qpos = np.zeros((*state.shape[:-1], 9))

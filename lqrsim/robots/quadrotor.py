@@ -33,14 +33,14 @@ class Quadrotor(Robot):
       InputError: a constant is out of range.
     """
 
-    mass: float = 0.5  # kg
-    inertia: float = 0.05  # kg m2, about each axis
-    arm: float = 0.17  # m, from the centre of mass to a rotor
-    torque_ratio: float = 0.025  # N m of a rotor's drag per N of its force; the paper's k_m
-    drag: float = 0.15  # N s/m, against the velocity; the paper's k_v
-    gravity: float = 9.8  # m/s2
-    max_force: float = 3.71  # N, of a rotor; the least is 0
-    radius: float = 0.3  # m, of the collision sphere
+    mass: float = 0.5
+    inertia: float = 0.05
+    arm: float = 0.17
+    torque_ratio: float = 0.025
+    drag: float = 0.15
+    gravity: float = 9.8
+    max_force: float = 3.71
+    radius: float = 0.3
 
     name = "quadrotor"
     body = "quadrotor"

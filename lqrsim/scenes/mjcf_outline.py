@@ -7,6 +7,7 @@ import numpy as np
 
 from lqrsim.capsules import Capsule
 from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_obstacles import solid_geoms
 
 # The largest part of a capsule outside its balls, relative to its radius.
 TOLERANCE = 0.25
@@ -35,11 +36,8 @@ def outline_of(model: mujoco.MjModel) -> Outline:
 
     Geoms that are only drawn count if nothing collides. The last ball is in the middle of a geom.
     """
-    moves = model.body_weldid[model.geom_bodyid] != 0
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    chosen = np.flatnonzero(moves & collides) if (moves & collides).any() else np.flatnonzero(moves)
     rows, names, sites, missed = list[tuple[int, Array, float]](), list[str](), list[str | None](), 0.0
-    for geom in chosen.tolist():
+    for geom in solid_geoms(model).tolist():
         body, middle, name = int(model.geom_bodyid[geom]), model.geom_pos[geom], model.geom(geom).name
         radius, places = float(model.geom_rbound[geom]), [middle]
         if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_CAPSULE):

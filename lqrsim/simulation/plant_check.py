@@ -27,7 +27,7 @@ from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 
-MOST_STEPS = 1_000_000  # physics steps in a check, which runs them one by one
+MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one
 PRINTED = 8  # pairs of geoms in contact
 
 

@@ -34,7 +34,7 @@ def simulate_from(
 ) -> Rollout:
     """Run the rest of a plan after `knot` periods, one trial from each of the states (K, n).
 
-    Until the knot the run is taken to have followed the plan, with measurements of the plan.
+    Until the knot, states and measurements are taken to be those of the plan.
 
     Args:
       plant, plan, controller: as in `simulate`.

@@ -37,7 +37,7 @@ from lqrsim.stress.multilevel_splitting import MOST, CountedScore, Progress, Sco
 from lqrsim.stress.trial_score import normal_tail
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from 0 to 98 %
-DISCOUNT = 0.95  # of the gradient of earlier rounds, in each round that comes nearer by more than MOVED
+DISCOUNT = 0.95  # factor of the gradient of earlier rounds, after each round that comes nearer by more than MOVED
 MOVED = 0.01  # share of the distance
 
 
@@ -202,7 +202,8 @@ def _gradients(score: Score, best: Array, pairs: int, spread: float, rng: np.ran
 
 
 def _remaining(halves: Array) -> float:
-    """Share of the distance to a plane that the noise of the gradient leaves to gain; NaN if the halves disagree."""
+    """Share of the distance to a plane that could still be gained without the noise of the gradient; NaN if the halves
+    disagree."""
     lengths = float(np.linalg.norm(halves[0]) * np.linalg.norm(halves[1]))
     agree = float(halves[0] @ halves[1]) / lengths if lengths > 0 else 0.0
     return 1 - float(np.sqrt(2 * agree / (1 + agree))) if agree > 0 else float("nan")

@@ -26,7 +26,7 @@ from lqrsim.errors import (
 from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.funnel import Funnel, flat
+from lqrsim.results.funnel import Funnel, flat, inverse_of
 from lqrsim.results.goal import Target, endings
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
@@ -377,8 +377,7 @@ def _inverse(curve: Array) -> Array:
     """Inverse of a Hessian (d, d); zero if it is not that of an ellipsoid."""
     if flat(curve):
         return np.zeros_like(curve)
-    size = np.sqrt(np.diagonal(curve))
-    inverse = np.linalg.inv(curve / np.outer(size, size)) / np.outer(size, size)
+    inverse = inverse_of(curve)
     return 0.5 * (inverse + inverse.T)
 
 

@@ -187,7 +187,7 @@ def _pilot_run(
     rng: np.random.Generator,
     on_level: Callable[[float], object] | None,
 ) -> tuple[Array, Array]:
-    """Find the levels, the last one 0, and the step size at each level but the last."""
+    """Find the levels, of which the last is 0, and the step size at all levels but the last."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     levels: list[float] = []
