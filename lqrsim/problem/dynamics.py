@@ -30,7 +30,7 @@ from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functi
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
-# Most operations of a formula whose second derivatives are derived, which takes up to about five seconds.
+# Most operations of a formula that is differentiated twice, which then takes about five seconds.
 LONGEST = 1500
 
 
@@ -442,7 +442,7 @@ class Dynamics:
 def _parameters_of(
     parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Parameters and disturbances, checked; disturbances that would gain nothing as constants become parameters."""
+    """Parameters and disturbances, checked; where constants gain nothing, disturbances become parameters."""
     own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
     twice = own.keys() & unknown.keys()
     if twice:

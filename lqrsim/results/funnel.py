@@ -134,7 +134,7 @@ class Funnel:
     def level(self, t: float) -> float:
         """The level `t` seconds after the start of the plan, linear between two knots.
 
-        It is certified at `knots` only. Before the first and after the last knot their levels hold.
+        It is certified at `knots` only. It is constant before the first and after the last knot.
 
         Args:
           t: seconds since the start of the plan.

@@ -61,7 +61,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
                 ) from None
             reason = error.strerror or error
             raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
-        with contextlib.suppress(OSError):  # for people who look who has the lock
+        with contextlib.suppress(OSError):  # shows people which process has the lock
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
         yield
