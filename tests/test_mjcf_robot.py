@@ -400,6 +400,35 @@ def test_what_it_cannot_touch_is_no_obstacle() -> None:
     assert ls.Plant(robot, robot.scene).obstacles == ("near",)
 
 
+PART = '<geom {name} size="0.1" pos="{number} 2 0"/><body pos="{number} 3 0"><joint/><geom size="0.1"/></body>'
+
+
+@settings(max_examples=10, deadline=None)
+@given(parts=st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=8))
+def test_what_has_no_name_gets_one_in_all_sections_and_included_files(
+    tmp_path_factory: pytest.TempPathFactory, parts: list[tuple[int, bool]]
+) -> None:
+    """The parts are spread over the file and those that it includes; some geoms have the name that is given first."""
+    folder, sections = tmp_path_factory.mktemp("parts"), [""] * 4
+    for number, (section, is_named) in enumerate(parts):
+        name = f'name="unnamed_geom_{number}"' if is_named else ""
+        sections[section] += PART.format(name=name, number=number)
+    for number, section in enumerate(sections[1:]):
+        text = f"<mujocoinclude><worldbody>{section}</worldbody></mujocoinclude>"
+        (folder / f"part_{number}.xml").write_text(text)
+    includes = "".join(f'<include file="part_{number}.xml"/>' for number in range(3))
+    first = f'<worldbody>{sections[0]}<body><joint name="j"/><geom size="0.1"/></body></worldbody>'
+    actuators = '<actuator><motor joint="j"/></actuator>'
+    (folder / "whole.xml").write_text(f"<mujoco>{first}{includes}{actuators}{actuators}</mujoco>")
+    robot, model = ls.MjcfRobot(folder / "whole.xml"), mujoco.MjModel.from_xml_path(str(folder / "whole.xml"))
+    ours = robot.scene.model
+    assert (ours.ngeom, ours.njnt, ours.nu) == (model.ngeom, model.njnt, model.nu)
+    names = {ours.geom(number).name for number in range(ours.ngeom)}
+    assert len(names) == ours.ngeom
+    assert "" not in names
+    np.testing.assert_array_equal(ours.geom_pos, model.geom_pos)
+
+
 def test_an_obstacle_that_is_half_of_a_pair_is_named() -> None:
     xml = mjcf_files.draw("cart", 0).xml.replace("<worldbody>", '<worldbody><geom name="post" size="0.1" pos="2 0 0"/>')
     pair = '<contact><pair geom1="post" geom2="unnamed_geom_0"/></contact></mujoco>'

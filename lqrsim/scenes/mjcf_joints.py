@@ -1,6 +1,7 @@
 """Joints, actuators and keyframes of an MJCF, for a robot's states and controls."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -68,7 +69,7 @@ def named(xml: str) -> str:
     root = ElementTree.fromstring(xml)
     taken = {element.get("name") for element in root.iter()}
 
-    def name(elements: list[ElementTree.Element], kind: str) -> None:
+    def name(elements: Iterable[ElementTree.Element], kind: str) -> None:
         count = 0
         for element in elements:
             if element.get("name") is None:
@@ -77,10 +78,10 @@ def named(xml: str) -> str:
                 element.set("name", f"{UNNAMED}{kind}_{count}")
                 count += 1
 
-    for world in root.iter("worldbody"):
-        name(list(world.iter("body")), "body")
-        name([one for one in world.iter() if one.tag in ("joint", "freejoint")], "joint")
-        name(list(world.iter("geom")), "geom")
+    # An MJCF has a section worldbody of its own and one of each file that it includes.
+    there = [one for world in root.iter("worldbody") for one in world.iter()]
+    for kind, tags in (("body", ("body",)), ("joint", ("joint", "freejoint")), ("geom", ("geom",))):
+        name((one for one in there if one.tag in tags), kind)
     name([one for section in root.iter("actuator") for one in section], "actuator")
     return ElementTree.tostring(root, encoding="unicode")
 
