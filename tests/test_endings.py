@@ -271,13 +271,16 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
     assert rollout.outcome == ("timed out",) * 2
     np.testing.assert_allclose(rollout.goal_distance, 1.9, atol=1e-3)
     for text in (str(solution), rollout.summary()):
-        assert "the plan ends 1.9 m from the goal" in text
-        assert "the plan MISSES the goal: it ends 1.6 m outside 0.3" in text
+        assert "the plan ends 1.9 m from the goal, which is reached within 0.3 m\n" in text
+        assert "the plan MISSES the goal; to mend that" in text
     assert rollout.tally() == "0 of 2 trials reached the goal"
     assert outcomes(rollout).goal == pytest.approx(rollout.goal_distance)
     near = ls.simulate(cage, short(0.2))
     assert near.outcome == ("reached",)
     assert "MISSES" not in near.summary()
+    # Where no radius is known, a tenth of the way decides, of which a robot that hovers goes nothing.
+    assert "MISSES the goal by more than 10% of the way" in str(replace(short(0.2), goal_radius=None))
+    assert "MISSES" not in str(replace(short(0.0), goal_radius=None))
     assert ls.simulate(cage, short(0.2), goal_radius=0.1).outcome == ("timed out",)
     with pytest.raises(InputError, match=r"^goal_tolerance: got 0\.1, want goal_radius, in metres"):
         ls.simulate(cage, solution, goal_tolerance=0.1)
@@ -611,7 +614,8 @@ def test_simulate_says_how_many_reached_the_goal_and_that_a_plan_misses_it(
     assert main(["simulate", path, "--trials", "3", "--goal-radius", "0.01"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "0 of 3 trials reached the goal"
-    assert any(line.startswith("  the plan MISSES the goal: it ends 0.0547 m outside 0.01; ") for line in lines)
+    assert "  the plan ends 0.0647 m from the goal, which is reached within 0.01 m" in lines
+    assert any(line.startswith("  the plan MISSES the goal; ") for line in lines)
     assert main(["simulate", path, "--goal-tolerance", "0.1"]) == 2
     assert "want goal_radius, in metres" in capsys.readouterr().err
 

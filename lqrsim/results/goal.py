@@ -129,17 +129,29 @@ class Target:
         return radius is not None and not float(self.distance(self.plan[-1])) <= radius
 
     def of_plan(self, radius: float | None) -> list[str]:
-        """Lines on the end of the plan: its distance from the goal, and another line if it misses."""
+        """Lines on the end of the plan: its distance from the goal, and another line if it misses.
+
+        Without a radius it misses if it ends farther from the goal than a tenth of the way from its start.
+        """
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
-        lines = [f"the plan ends {self.describe(away)}"]
-        if radius is not None and self.misses(radius):
-            lines.append(
-                f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}; to mend that,"
-                " raise the weights of the final cost or the number of steps"
-            )
+        within = "" if radius is None else f", which is reached within {radius:.3g}{' m' if self.places else ''}"
+        lines = [f"the plan ends {self.describe(away)}{within}{self._worst()}"]
+        if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
+            by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
+            mend = "raise the weights of the final cost or the number of steps"
+            lines.append(f"the plan MISSES the goal{by}; to mend that, {mend}")
         return lines
+
+    def _worst(self) -> str:
+        """Which state of the plan's end is farthest from a target without a position."""
+        if self.places:
+            return ""
+        end = self.plan[-1]
+        off = self.space.difference(end, np.where(np.isfinite(self.state), self.state, end))
+        worst = int(np.argmax(np.abs(off) / scale_of(self.plan)))
+        return f": {self.space.names[worst]} is {off[worst]:+.3g} {self.space.units[worst]} off"
 
 
 def endings(

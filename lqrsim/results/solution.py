@@ -149,11 +149,8 @@ class Solution(Plan):
         if self.violation > 1e-6:  # the tolerance by default
             lines[-1] += f"   violation: {self.violation:.1e}"
         if "noise" in self.options:
-            meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
-            if self.cost_to_go is None:
-                meant = "without noise: there is no cost-to-go"
-            elif not self.options.get("risk"):
-                meant = "an expectation"
+            risk = self.options.get("risk")
+            meant = f"log E exp(risk cost) / risk, risk {risk}" if risk else "an expectation"
             lines.append(f"  noise:     {self.options['noise']}; the cost is {meant}")
         if self.clearance is not None:
             knot = int(np.argmin(self.clearance))

@@ -154,6 +154,7 @@ class Results:
             if found is not None:
                 sure = found.exact
                 share, interval = f"{100 * sure.value:.1f}", f"{100 * sure.low:.1f} to {100 * sure.high:.1f}"
+                interval = "deterministic: 1 run" if found.alike else interval
             counts = [str(ends[name]) for name in others]
             rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(ends.total()), share, interval, *counts))
         campaign, missing = self.manifest["campaign"], sum(count for _, _, count in self.missing)
