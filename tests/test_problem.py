@@ -100,6 +100,12 @@ FIELDS: dict[str, Any] = {
         ({"control_limits": ((0, 0), (1, 1))}, "control_limits: got .*, want \\(lowest, highest\\), each a number"),
         ({"control_limits": 3.0}, "control_limits: got 3.0, want \\(lowest, highest\\)"),
         ({"constraints": ["far away"]}, "constraints: got .*, want a list of constraints"),
+        ({"constraints": [lambda x, u, p: x[0]]}, r"constraints: got .*for a function, \[SymbolicConstraint"),
+        ({"initial": [0.0, 0.0, 0.0]}, "initial: got .*, want a cost such as .*, or a FixedState"),
+        (
+            {"constraints": [ls.StateBounds(x=(0.5, 1.0)), ls.StateBounds({"x": (-1.0, 0.2), "y": (0, 1)})]},
+            "constraints: got x of at least 0.5 and at most 0.2, want bounds with room between them",
+        ),
     ],
 )
 def test_bad_problems_get_one_line(fields: dict, message: str) -> None:

@@ -307,6 +307,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
       InputError: they do not fit it, or each other.
     """
     goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
+    _check_bounds([one for one in constraints if isinstance(one, StateBounds)])
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
             term = constraint._bind_to_goal(dynamics, goals, steps)
@@ -314,6 +315,17 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
             term = constraint._bind_at(dynamics, times)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
+
+
+def _check_bounds(bounds: Sequence[StateBounds]) -> None:
+    """Raises InputError if several bounds of a state leave nothing between them."""
+    for name in {name for one in bounds for name in one.bounds}:
+        lows, highs = zip(*(one.bounds[name] for one in bounds if name in one.bounds), strict=True)
+        if not max(lows) < min(highs):
+            raise InputError(
+                f"constraints: got {name} of at least {max(lows):g} and at most {min(highs):g}, want bounds with room"
+                " between them"
+            )
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:

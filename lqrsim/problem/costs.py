@@ -130,7 +130,9 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
     if isinstance(cost, CostSum):
         return cost.terms
     if not isinstance(cost, Cost):
-        raise InputError(f"{field}: got {excerpt(cost)}, want a cost such as QuadraticCost(...) or a sum of costs")
+        or_given = ", or a FixedState" if field == "initial" else ""
+        wanted = f"a cost such as QuadraticCost(...) or a sum of costs{or_given}"
+        raise InputError(f"{field}: got {excerpt(cost)}, want {wanted}")
     return (cost,)
 
 

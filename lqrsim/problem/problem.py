@@ -121,7 +121,7 @@ class Problem:
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         object.__setattr__(self, "_terms", bound)
-        wanted = "a list of constraints, such as [Clearance(...)]"
+        wanted = "a list of constraints, such as [Clearance(...)] or, for a function, [SymbolicConstraint(function)]"
         object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
         terms = bind_all(self.constraints, self.dynamics, self.times)
         object.__setattr__(self, "_constraint_terms", terms)

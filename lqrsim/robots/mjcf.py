@@ -40,6 +40,7 @@ _SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touc
 _ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off its limits, the smaller one
 _REST = 1e-6  # m/s^2, by which something at rest may accelerate
 _PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
+_LISTED = 12  # names in a line of what is printed
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
 
@@ -335,14 +336,17 @@ class MjcfRobot(Robot):
     def __str__(self) -> str:
         space, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         held, names = self._held(self.at()), self.scene.world.names
-        told = ", ".join(f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True))
-        short = "" if held.held else f", {held.missed:.3g} short of it"
+        told = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
+        worst = int(np.argmax(np.abs(held.missed)))
+        turns = self.dynamics.state_coordinates.units[worst] == "rad"
+        short = f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {'N m' if turns else 'N'}"
+        short = "" if held.held else short
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self._timestep:g} s",
-            f"  states: {excerpt(', '.join(space.names))}",
-            f"  held at rest by: {told}{short}",
-            *(f"  {what} at rest: {excerpt(', '.join(found))}" for what, found in self._amiss().items() if found),
-            f"  obstacles: {excerpt(', '.join(names)) if names else 'none'}",
+            f"  states: {_listed(space.names)}",
+            f"  held at rest by: {_listed(told)}{short}",
+            *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
+            f"  obstacles: {_listed(names)}",
         ]
         return "\n".join(lines)
 
@@ -435,3 +439,9 @@ class MjcfRobot(Robot):
             else:
                 parts.append(own)
         return np.concatenate(parts, axis=-1), state[..., model.nv : 2 * model.nv].copy()
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names in a line, of many the first."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more if names else "none"

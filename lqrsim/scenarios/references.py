@@ -108,7 +108,10 @@ def _parts(reference: str) -> tuple[str, list[str]]:
 def _registered_function(name: str) -> Callable[..., object]:
     from lqrsim import scenarios
 
-    return getattr(scenarios, check_name("scenario", name, scenarios.names()))
+    try:
+        return getattr(scenarios, check_name("scenario", name, scenarios.names()))
+    except InputError as error:
+        raise InputError(f"{error}; or the path of an .xml file, or FILE.py:FUNCTION") from None
 
 
 def _own_function(target: str) -> Callable[..., object]:

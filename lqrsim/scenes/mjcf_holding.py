@@ -21,12 +21,12 @@ class Holding:
 
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
-      missed: N or N m, the largest force that a joint is short of.
+      missed: N or N m, (nv,), the force that each joint is short of; 0 for joints that follow others.
       held: whether they hold it.
     """
 
     controls: Array
-    missed: float
+    missed: Array
     held: bool
 
 
@@ -58,7 +58,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     rest = force(middle)
     columns = np.stack([force(middle + one) - rest for one in np.eye(model.nu)], axis=1)
     size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
-    carried = _carried(model)
+    kept, carried = _carried(model)
     columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
     scale = np.abs(columns).max(axis=0)
     scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
@@ -69,8 +69,10 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     bounds = np.where(tight, -1e-12, bounds[0]), np.where(tight, 1e-12, bounds[1])
     found = middle + lsq_linear(rows, aims, bounds).x / scale
     found = np.clip(found, low, high)
-    missed = float(np.abs(columns @ (found - middle) + rest - wanted).max(initial=0.0))
-    return Holding(found[actuators], missed, missed <= _HELD * size)
+    found[np.abs(found) * scale < 1e-12 * size] = 0.0  # rounding
+    missed = np.zeros(model.nv)
+    missed[kept] = wanted - rest - columns @ (found - middle)
+    return Holding(found[actuators], missed, bool((np.abs(missed) <= _HELD * size).all()))
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
@@ -115,13 +117,13 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     return place, float(np.abs(left).max(initial=0.0))
 
 
-def _carried(model: mujoco.MjModel) -> Array:
-    """The map from forces on all joints to those on the free ones, (free, nv), through couplings."""
+def _carried(model: mujoco.MjModel) -> tuple[npt.NDArray[np.intp], Array]:
+    """The free joints, and the map from forces on all joints to those on them, (free, nv), through couplings."""
     moves, coupled = np.eye(model.nv), couplings_of(model)
     for one in coupled:
         moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0
     kept = np.setdiff1d(np.arange(model.nv), [one.dof for one in coupled])
-    return moves[:, kept].T
+    return kept, moves[:, kept].T
 
 
 def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:

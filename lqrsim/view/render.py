@@ -198,5 +198,6 @@ def _gif_size(quality: Quality) -> tuple[int, int]:
 def _checked_path(path: str | os.PathLike[str], *suffixes: str) -> Path:
     path = check_path("path", path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}")
+        other = "; view.render_still makes pictures" if ".png" not in suffixes else ""
+        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}{other}")
     return path
