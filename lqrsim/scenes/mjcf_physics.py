@@ -126,7 +126,8 @@ def _check(model: mujoco.MjModel, name: str) -> None:
 def _equality(model: mujoco.MjModel, number: int) -> str:
     """An equality constraint in words: its element, its name, and what it constrains."""
     kind = mujoco.mjtEq(model.eq_type[number]).name.removeprefix("mjEQ_").lower()
-    objects = mujoco.mjtObj(model.eq_objtype[number])
+    couples = {"joint": mujoco.mjtObj.mjOBJ_JOINT, "tendon": mujoco.mjtObj.mjOBJ_TENDON}
+    objects = couples.get(kind, mujoco.mjtObj(model.eq_objtype[number]))
     ends = (mujoco.mj_id2name(model, objects, int(ids[number])) for ids in (model.eq_obj1id, model.eq_obj2id))
     name = model.equality(number).name
     return f"<{kind}>{f' {name!r}' if name else ''} of {' and '.join(repr(end) for end in ends if end)}"
