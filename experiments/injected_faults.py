@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.video import encoder
+from lqrsim.view.render import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata
 
 Pixels = npt.NDArray[np.uint8]

@@ -270,7 +270,7 @@ def check_items(
     return found
 
 
-def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, definite: bool = False) -> Array:
+def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) -> Array:
     """`value` as a symmetric positive-semidefinite (or definite) matrix; a vector is read as its diagonal.
 
     Raises:
@@ -279,7 +279,7 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 1:
         check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
-    matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (size, size))
+    matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (None, None))
     if matrix.shape[0] != matrix.shape[1] or not matrix.size:
         raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
     scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)

@@ -14,7 +14,7 @@ import lqrsim as ls
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
 from lqrsim.view.decorative_geoms import MARK_RGB, draw_mark, mark_radius
-from lqrsim.view.video import encoder
+from lqrsim.view.render import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")

@@ -17,7 +17,7 @@ import numpy as np
 from mkdocs.structure.files import File
 from PIL import Image, ImageSequence
 
-from lqrsim.view.video import encoder
+from lqrsim.view.render import encoder
 
 ROOT = Path(__file__).resolve().parents[2]
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)

@@ -18,6 +18,8 @@ from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.fields import Line, check_fields
 
+STEP = 6e-6  # of difference quotients, relative to numbers above 1
+
 
 def functions_of(problem: Problem) -> list[UserFunction]:
     """The numba and plain Python functions of a problem."""
@@ -302,11 +304,11 @@ def _worst_entry(matrix: _Derivative, tolerance: float) -> DerivativeCheck:
     )  # fmt: skip
 
 
-def _differences(function: Any, z: Array, step: float = 6e-6) -> tuple[Array, Array]:
+def _differences(function: Any, z: Array) -> tuple[Array, Array]:
     """The Jacobian of a function by central differences, and a bound on the rounding error of each entry."""
     columns, noise = [], []
     for i in range(len(z)):
-        h = step * max(1.0, abs(z[i]))
+        h = STEP * max(1.0, abs(z[i]))
         ahead, behind = z.copy(), z.copy()
         ahead[i] += h
         behind[i] -= h

@@ -39,6 +39,7 @@ from lqrsim.stress.trial_score import normal_tail
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from 0 to 98 %
 DISCOUNT = 0.95  # factor of the gradient of earlier rounds, after each round that comes nearer by more than MOVED
 MOVED = 0.01  # share of the distance
+GRID, REFINED = 16, 3  # points on a ray, and how often the grid is refined
 
 
 @dataclass(frozen=True)
@@ -163,12 +164,12 @@ def _directions(vectors: Array) -> Array:
     return vectors / np.where(lengths > 0, lengths, 1.0)
 
 
-def _ray_search(score: Score, directions: Array, lengths: Array, *, grid: int = 16, refined: int = 3) -> Array | None:
+def _ray_search(score: Score, directions: Array, lengths: Array) -> Array | None:
     """The nearest failure on rays of directions (k, d), each up to its length (k,); None if there is none."""
     low, high = np.zeros(len(directions)), lengths
     failing = np.full(len(directions), np.inf)
-    for _ in range(refined):
-        steps = low[:, None] + (high - low)[:, None] * np.arange(1, grid + 1) / grid
+    for _ in range(REFINED):
+        steps = low[:, None] + (high - low)[:, None] * np.arange(1, GRID + 1) / GRID
         vectors = steps[..., None] * directions[:, None]
         failed = (score(vectors.reshape(-1, directions.shape[1])) > 0).reshape(steps.shape)
         first = np.where(failed.any(axis=1), failed.argmax(axis=1), -1)
@@ -179,7 +180,7 @@ def _ray_search(score: Score, directions: Array, lengths: Array, *, grid: int = 
         if not len(rows):
             break
         place = steps[rows, first[rows]]
-        width = (high - low)[rows] / grid
+        width = (high - low)[rows] / GRID
         directions, failing = directions[rows], failing[rows]
         low, high = place - width, place
     if not np.isfinite(failing).any():
@@ -229,18 +230,18 @@ class LargestEffect:
     time: float
 
 
-def largest_effects(rollout: Rollout, trial: int = 0) -> list[LargestEffect]:
-    """The largest disturbances of a trial in physical units, until it ends. Those that are always zero are left out.
+def largest_effects(rollout: Rollout) -> list[LargestEffect]:
+    """The largest disturbances of the first trial in physical units, until it ends, without those that are always zero.
 
     The error of an applied control includes that by the actuators' limits.
     """
-    last = int(rollout.counts[trial].sum()) - 1
+    last = int(rollout.counts[0].sum()) - 1
     states, controls = rollout.state_coordinates, rollout.control_coordinates
-    measured = states.difference(rollout.measured[trial], rollout.states[trial])
-    disturbed = rollout.applied[trial] - rollout.commanded[trial]
+    measured = states.difference(rollout.measured[0], rollout.states[0])
+    disturbed = rollout.applied[0] - rollout.commanded[0]
     sizes_over_time: list[tuple[str, Array, str]] = [
-        ("force", np.linalg.norm(rollout.forces[trial], axis=1), "N"),
-        ("torque", np.linalg.norm(rollout.torques[trial], axis=1), "N m"),
+        ("force", np.linalg.norm(rollout.forces[0], axis=1), "N"),
+        ("torque", np.linalg.norm(rollout.torques[0], axis=1), "N m"),
         *(
             (f"error of {name}{kind}", np.abs(errors[:, i]), unit)
             for kind, space, errors in ((" as applied", controls, disturbed), (" as measured", states, measured))

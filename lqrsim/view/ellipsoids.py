@@ -68,10 +68,10 @@ class Ellipsoids:
         """Their projections onto a plane, whose axes are the rows of `onto` (2, d)."""
         return Ellipsoids(self.centres @ onto.T, onto @ self.covariances @ onto.T, self.end)
 
-    def outlines(self, points: int = 48) -> Array:
-        """Outlines (k, points, 2) of ellipses."""
+    def outlines(self) -> Array:
+        """Outlines (k, 48, 2) of ellipses."""
         half_axes, rotations = self.axes()
-        around = np.linspace(0, 2 * np.pi, points, endpoint=False)
+        around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
         circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
         return self.centres[:, None, :] + np.einsum("kij,kj,pj->kpi", rotations, half_axes, circle)
 
