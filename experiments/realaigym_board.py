@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from board.double_pendulum import Robot
 from board.law import SwingUp
-from board.trials import Trial, columns, simulate, trials
+from board.trials import MODEL, Trial, columns, of_parameters, simulate, trials
 from numpy.typing import NDArray
 from runner import FolderSettings, Result, opening, run, table
 from tqdm import tqdm
@@ -55,7 +55,7 @@ def main(config: Config) -> Result:
     result["boards"] = []
     for version in config.versions:
         for robot in config.robots:
-            chosen = few(trials(version), config.every)
+            chosen = few(trials(robot, version), config.every)
             if config.quick:
                 chosen = chosen[:: len(chosen) // 2]
             parts = [chosen[i : i + BATCH] for i in range(0, len(chosen), BATCH)]
@@ -68,7 +68,8 @@ def main(config: Config) -> Result:
                     done = list(tqdm(pool.map(outcomes, jobs), name, len(jobs), disable=None))
             succeeded = np.concatenate(done)
             board: dict[str, Any] = {"robot": robot, "version": version, "trials": len(chosen)}
-            result["boards"].append(board | {"columns": columns(chosen, succeeded)})
+            board |= {"columns": columns(chosen, succeeded), "parameters": of_parameters(chosen, succeeded)}
+            result["boards"].append(board)
     return result
 
 
@@ -89,21 +90,25 @@ def outcomes(job: Job) -> NDArray[np.bool_]:
 
 
 def report(result: Result) -> str:
-    rows = []
+    rows, parts = [], []
     for board in result["boards"]:
-        ours = board["columns"]
+        ours, name = board["columns"], f"{board['robot']}, version {board['version']}"
         best, whose = PUBLISHED[board["robot"], board["version"]]
-        shares = (ours.get(name) for name in ("model", "velocity noise", "torque noise", "response", "delay", "pushes"))
-        told = ["" if share is None else f"{100 * share:.1f}" for share in shares]
-        rows.append(
-            [f"{board['robot']}, version {board['version']}", *told, f"{ours['score']:.3f}", f"{best:.3f}", whose]
-        )
+        noise = "velocity noise", "torque noise", "response", "delay", "pushes"
+        shares = [_percent(ours.get(column)) for column in ("model", *noise)]
+        rows.append([name, *shares, f"{ours['score']:.3f}", f"{best:.3f}", whose])
+        parts.append([name, *(_percent(board["parameters"].get(parameter)) for parameter in MODEL)])
     head = (
         "board", "model (%)", "velocity noise (%)", "torque noise (%)", "response (%)", "delay (%)", "pushes (%)",
         "score", "best published", "of",
     )  # fmt: skip
     count = ", ".join(str(board["trials"]) for board in result["boards"])
-    return "\n\n".join(["## The robustness board of RealAIGym", f"Runs: {count}.", table(head, rows)])
+    of_model = table(('column "model", of its levels (%)', *MODEL), parts)
+    return "\n\n".join(["## The robustness board of RealAIGym", f"Runs: {count}.", table(head, rows), of_model])
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.1f}"
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 from board import double_pendulum, trials
-from board.double_pendulum import UNKNOWN, VERSIONS, advance, dynamics, off_upright, rate
+from board.double_pendulum import MODELS, UNKNOWN, Robot, advance, dynamics, off_upright, rate
 
 from lqrsim.errors import Array
 
@@ -19,27 +19,27 @@ MJCF = """
 </body></worldbody></mujoco>"""
 
 
-def of(version: int, **wrong: float) -> dict[str, Array]:
-    return {name: np.array([value]) for name, value in {**VERSIONS[version], **UNKNOWN, **wrong}.items()}
+def of(robot: Robot, version: int, **wrong: float) -> dict[str, Array]:
+    return {name: np.array([value]) for name, value in {**MODELS[robot, version], **UNKNOWN, **wrong}.items()}
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_it_moves_as_in_mujoco(version: int) -> None:
+@pytest.mark.parametrize(("robot", "version"), MODELS)
+def test_it_moves_as_in_mujoco(robot: Robot, version: int) -> None:
     """Accelerations at random states and torques, to 1e-9 of them; the inertias are about the joints there.
 
-    The longer lever of version 1 has less inertia than its mass at the end: MuJoCo takes no body of that kind, so it
-    gets a shorter one.
+    The longer lever of the acrobot of version 1 has less inertia than its mass at the end: MuJoCo takes no body of that
+    kind, so all get shorter ones.
     """
-    rng, short = np.random.default_rng(version), {"r1": 0.15, "r2": 0.2}
-    p = {**VERSIONS[version], **short, "b1": 0.03, "b2": 0.02}
+    rng, short = np.random.default_rng(version), {"r1": 0.15, "r2": 0.15}
+    p = {**MODELS[robot, version], **short, "b1": 0.03, "b2": 0.02}
     about = {"i1": p["I1"] - p["m1"] * p["r1"] ** 2, "i2": p["I2"] - p["m2"] * p["r2"] ** 2}
-    model = mujoco.MjModel.from_xml_string(MJCF.format(**p, **about).replace('"1 ', '"0.02 ').replace(' 1"', ' 0.02"'))
+    model = mujoco.MjModel.from_xml_string(MJCF.format(**p, **about).replace('"1 ', '"0.03 ').replace(' 1"', ' 0.03"'))
     data = mujoco.MjData(model)
     for _ in range(20):
         x, torques = rng.uniform(-3, 3, 4), rng.uniform(-6, 6, 2)
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = x[:2], x[2:], torques
         mujoco.mj_forward(model, data)
-        ours = rate(x[None], torques[None], of(version, **short, b1=0.03, b2=0.02))[0]
+        ours = rate(x[None], torques[None], of(robot, version, **short, b1=0.03, b2=0.02))[0]
         np.testing.assert_allclose(ours[2:], data.qacc, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(ours[:2], x[2:])
 
@@ -52,18 +52,20 @@ def test_the_plans_know_the_same_motion(robot: double_pendulum.Robot) -> None:
     for _ in range(10):
         x, torques = rng.uniform(-3, 3, 4), np.zeros(2)
         torques[motor] = rng.uniform(-6, 6)
-        ours = advance(x[None], torques[None], of(2), 0.02)[0]
+        ours = advance(x[None], torques[None], of(robot, 2), 0.02)[0]
         np.testing.assert_allclose(model.step(x, torques[[motor]], 0.02), ours, rtol=0, atol=1e-11)
 
 
 def test_runs_are_as_published() -> None:
     for version, count in ((1, 672), (2, 722)):
-        every = trials.trials(version)
+        every = trials.trials("acrobot", version)
         assert len(every) == count == 10 * 21 + 2 * 21 * 10 + 2 * 21 + 50 * (version == 2)
         assert [one.number for one in every] == list(range(count))
         assert max(one.late for one in every) == 20  # 40 ms
     levers = [one.parameters["r1"] for one in every if one.column == "m1r1"]
     np.testing.assert_allclose(levers, 0.2 * np.linspace(0.75, 1.25, 21))
+    levers = [one.parameters["r1"] for one in trials.trials("pendubot", 1) if one.column == "m1r1"]
+    np.testing.assert_allclose(levers, 0.3 * np.linspace(0.75, 1.25, 21))  # whose links are of other lengths
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -86,15 +88,16 @@ def test_upright_is_so_after_any_turns() -> None:
 
 def test_a_law_that_does_nothing_never_swings_up() -> None:
     """Nor does noise at its most help it; and a run does not depend on which others there are."""
-    every = trials.trials(1)
+    every = trials.trials("acrobot", 1)
     chosen = [every[0], [one for one in every if one.torque_noise][-1]]
     assert not trials.simulate(chosen, lambda measured: np.zeros(len(measured)), "acrobot", 1, 0).any()
 
 
 def test_a_level_of_noise_counts_by_most_of_its_runs() -> None:
-    every = trials.trials(1)
+    every = trials.trials("acrobot", 1)
     noise = [one for one in every if one.column == "torque noise"][:20]
     model = [one for one in every if one.column == "b1"][:4]
     good = np.array([True] * 6 + [False] * 4 + [True] * 5 + [False] * 5 + [True, False, False, False])
     found = trials.columns([*noise, *model], good)
     assert found == {"model": 0.25, "torque noise": 0.5, "score": 0.375}
+    assert trials.of_parameters([*noise, *model], good) == {"b1": 0.25}

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 import lqrsim as ls
-from board.double_pendulum import ACTUATED, LIMIT, UNKNOWN, UPRIGHT, VERSIONS, Robot, advance, dynamics
+from board.double_pendulum import ACTUATED, LIMIT, MODELS, UNKNOWN, UPRIGHT, Robot, advance, dynamics
 from board.trials import DT
 from lqrsim.errors import Array
 
@@ -42,7 +42,7 @@ class SwingUp:
         self._problems: dict[tuple[int, tuple[int, int]], ls.Problem] = {}
         self._solver = ls.prepare(self._problem(SHORTEST, (0, 0)))
         self._plans: list[Plan | None] = [None] * count
-        self._known = {name: np.full(count, value) for name, value in {**VERSIONS[version], **UNKNOWN}.items()}
+        self._known = {name: np.full(count, value) for name, value in {**MODELS[robot, version], **UNKNOWN}.items()}
         self._state, self._torque = np.zeros((count, 4)), np.zeros(count)
         self._gain, self._offset = np.zeros((count, 4)), np.zeros(count)
 
