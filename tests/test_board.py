@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from board import double_pendulum, trials
+from board import double_pendulum, performance, trials
 from board.double_pendulum import MODELS, UNKNOWN, Robot, advance, dynamics, off_upright, rate
 
 from lqrsim.errors import Array
@@ -101,3 +101,32 @@ def test_a_level_of_noise_counts_by_most_of_its_runs() -> None:
     found = trials.columns([*noise, *model], good)
     assert found == {"model": 0.25, "torque noise": 0.5, "score": 0.375}
     assert trials.of_parameters([*noise, *model], good) == {"b1": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("version", "criteria", "score"),
+    [  # time, energy, most torque, its integral, its cost, smoothness and velocity cost, as the board shows them
+        (1, (1.1, 9.81, 2.82, 1.27, 2.27, 0.057, 242.44), 0.869),
+        (1, (4.8, 53.75, 3.0, 12.28, 33.06, 0.136, 870.16), 0.594),
+        (2, (1.0, 8.08, 0, 0, 1.8, 0.01, 88.5), 0.655),
+        (2, (4.13, 9.53, 0, 0, 1.26, 0.007, 211.12), 0.526),
+    ],
+)
+def test_scores_are_the_published_ones(version: int, criteria: tuple[float, ...], score: float) -> None:
+    """Up to the digits that the board shows, of which those of the smoothness weigh most."""
+    digit = {1: 1e-3, 2: 0.0005 * np.pi / 0.1 / 5 + 5e-4}[version]
+    assert performance.score(np.array(criteria), version) == pytest.approx(score, abs=digit)
+
+
+def test_criteria_of_a_run_whose_integrals_are_known() -> None:
+    """The shoulder turns one and a half times in 5 s under 3 Nm, and stays upright: to a step in 5000.
+
+    It passes upright before, which does not count.
+    """
+    t, rate = trials.DT * np.arange(trials.STEPS), 3 * np.pi / 5
+    states, torques = np.zeros((trials.STEPS, 4)), np.full(trials.STEPS, -3.0)
+    states[:, 0], states[:, 2] = np.minimum(rate * t, 3 * np.pi), np.where(t < 5, rate, 0.0)
+    found = performance.criteria(states, torques, "pendubot", 1)
+    known = [5 - np.arccos(0.9) / rate, 3 * 3 * np.pi, 3, 30, 90, 0, 5 * rate**2]
+    np.testing.assert_allclose(found, known, rtol=5e-4, atol=1e-12)
+    assert performance.score(performance.criteria(0 * states, torques, "pendubot", 1), 1) == 0
