@@ -143,14 +143,15 @@ def run(
     if seconds is not None:
         steps = math.ceil(check_number("seconds", seconds, above=0.0, at_most=1e9) / dt - 1e-9)
     needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
-    node = _Node(domain)
+    node, commands = _Node(domain), _checked_topic(commands)
     inlet = _Inlet(node, _topics(odometry, joints), states, needed, names, reliable=lockstep)
-    outlet = node.writer(commands, "Float64MultiArray")
+    _wait(inlet.matched, patience, inlet.lacking)
+    outlet = node.writer(commands, "Float64MultiArray")  # who sees it can rely on its states being heard
     _wait(outlet.get_matched_subscriptions, patience, lambda: f"commands: got no reader of {commands}")
     if not isinstance(controller, LiveReplanner):  # which would begin to solve
         law.start(1).control(0, nominal[None])  # so that the first period does not load compiled code
     _wait(inlet.complete, patience, inlet.lacking)
-    run, sent, response, late = law.start(1), list[Array](), list[float](), list[float]()
+    running, sent, response, late = law.start(1), list[Array](), list[float](), list[float]()
     held, reason, begun = 0, "", time.monotonic()
     try:
         for step in range(steps):
@@ -164,8 +165,8 @@ def run(
             if (age := began - inlet.arrived) > longest:
                 reason = f"no state for {age:.3g} s, after {step} periods"
                 break
-            command = run.control(step, inlet.state[None])[0]
-            diverged = run.estimator_diverged()
+            command = running.control(step, inlet.state[None])[0]
+            diverged = running.estimator_diverged()
             if diverged or not np.isfinite(command).all():
                 reason = diverged.get(0, f"got {excerpt(command.tolist())} from the controller")
                 break
@@ -221,9 +222,9 @@ class SimulatedRobot:
         domain: int | None = None,
     ) -> None:
         policy = plan.policy if isinstance(plan, Plan) else check_kind("plan", plan, AffinePolicy, "a plan or a policy")
-        self._states, self._controls = policy.state_coordinates, policy.control_coordinates
+        self._controls = policy.control_coordinates
         self._patience = check_number("patience", patience, above=0.0, at_most=1e6)
-        self._names, node, topics = _renamed(self._states, names), _Node(domain), _topics(odometry, joints)
+        self._names, node, topics = _renamed(policy.state_coordinates, names), _Node(domain), _topics(odometry, joints)
         self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}
         self._inlet: _Reader | None = node.reader(commands, "Float64MultiArray")
         self._node: _Node | None = node
@@ -297,6 +298,12 @@ def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:
     return law, policy.dt, policy.steps, policy.nominal[0]
 
 
+def _checked_topic(topic: object) -> str:
+    if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic):
+        raise InputError(f"topic: got {excerpt(topic)}, want a name of ROS 2, such as /odom")
+    return topic
+
+
 def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
     found = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
     if not found:
@@ -324,7 +331,7 @@ class _Inlet:
         self, node: "_Node", topics: Mapping[str, str], states: Coordinates, needed: tuple[str, ...],
         names: Mapping[str, str] | None, *, reliable: bool,
     ) -> None:  # fmt: skip
-        self._node, self._wanted = node, dict(zip(_renamed(states, names), range(len(states)), strict=True))
+        self._wanted = dict(zip(_renamed(states, names), range(len(states)), strict=True))
         self._topics, self._lacking = topics, {name for name, i in self._wanted.items() if states.names[i] in needed}
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
@@ -332,7 +339,7 @@ class _Inlet:
                 f"odometry: got no {', '.join(sorted(self._lacking - known))} in it, want joints= or names="
             )
         self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
-        self._arrived = dict.fromkeys(topics, -math.inf)
+        self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
         self.state, self.refused = np.zeros(len(states)), (0, "")
 
     @property
@@ -346,6 +353,10 @@ class _Inlet:
         for reader in self._readers.values():
             while not reader.wait(SLICE) and time.monotonic() < end:
                 pass
+
+    def matched(self) -> bool:
+        """Whether each topic has somebody who writes it."""
+        return all(reader.writers() for reader in self._readers.values())
 
     def complete(self) -> bool:
         """Whether each state that is needed has arrived."""
@@ -362,14 +373,18 @@ class _Inlet:
             for message in reader.take():
                 try:
                     values = (_of_odometry if kind == "Odometry" else _of_joints)(message)
-                    if not np.isfinite(list(values.values())).all():
+                    used = values.keys() & self._wanted.keys()
+                    self._known[kind] |= used
+                    if missing := self._known[kind] - used:
+                        raise ValueError(f"a message without {', '.join(sorted(missing))}")
+                    if not np.isfinite([values[name] for name in used]).all():
                         raise ValueError("a number that is not finite")
                 except ValueError as error:
                     self.refused = self.refused[0] + 1, f"{self._topics[kind]}: got {error}"
                     continue
-                for name in values.keys() & self._wanted.keys():
+                for name in used:
                     self.state[self._wanted[name]] = values[name]
-                    self._lacking.discard(name)
+                self._lacking -= used
                 self._arrived[kind] = now
         return self.arrived == now
 
@@ -423,12 +438,13 @@ class _Node:
         return self._ros.DataWriter(self._participant, self._topic(topic, kind), qos=self._quality(True, kind))
 
     def _topic(self, topic: str, kind: str) -> Any:
-        if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic):
-            raise InputError(f"topic: got {excerpt(topic)}, want a name of ROS 2, such as /odom")
-        return self._ros.Topic(self._participant, f"rt{topic}", self._ros.messages[kind])
+        return self._ros.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
 
     def _quality(self, reliable: bool, kind: str) -> Any:
-        """Of states the newest counts; of commands each does. A writer that is reliable suits readers that are not."""
+        """Of states the newest counts; of commands each does. A writer that is reliable suits readers that are not.
+
+        The representation is that of ROS 2, the first version of CDR.
+        """
         ros, policy = self._ros, self._ros.Policy
         kept = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
         sure = policy.Reliability.Reliable(self.second) if reliable else policy.Reliability.BestEffort

@@ -280,7 +280,7 @@ def test_a_live_replanner_runs(topics: dict[str, Any], quadrotor: ls.Scenario, q
         ({"joints": None, "odometry": "/odom"}, "odometry: got no slider, slider_velocity in it"),
         ({"seconds": 0}, "seconds: got 0"),
         ({"domain": 500}, "domain: got 500"),
-        ({}, "commands: got no reader of /nobody_listens within 0.1 s, want the other program"),
+        ({}, "states: got no slider, slider_velocity from /j within 0.1 s, want the other program"),
     ],
 )
 def test_what_cannot_be_is_told_in_a_line(changed: dict[str, Any], message: str) -> None:
@@ -290,13 +290,35 @@ def test_what_cannot_be_is_told_in_a_line(changed: dict[str, Any], message: str)
     assert "\n" not in str(told.value)
 
 
-def test_states_that_do_not_come_are_named(topics: dict[str, Any]) -> None:
-    node = bridge._Node(None)
-    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"]}
+def test_what_is_not_there_is_named(topics: dict[str, Any]) -> None:
+    """A robot that does not listen, and one that is silent; neither gets a command."""
+    node, where = bridge._Node(None), {"joints": topics["odometry"], "commands": topics["commands"]}
+    silent = node.writer(where["joints"], "JointState")
+    with pytest.raises(ls.InputError, match=r"commands: got no reader of /test_.* within 0.5 s"):
+        bridge.run(policy(), safe=[0.0], patience=0.5, **where)
     listening = node.reader(where["commands"], "Float64MultiArray")
-    with pytest.raises(ls.InputError, match=r"states: got no slider, slider_velocity from /test_.* within 0.2 s"):
-        bridge.run(policy(), safe=[0.0], patience=0.2, **where)
-    assert not listening.take()  # nobody was controlled, and nothing published
+    with pytest.raises(ls.InputError, match=r"states: got no slider, slider_velocity from /test_.* within 0.5 s"):
+        bridge.run(policy(), safe=[0.0], patience=0.5, **where)
+    assert silent.get_matched_subscriptions() is not None
+    assert not listening.take()
+
+
+def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, Any]) -> None:
+    law = policy()
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[0.0], lockstep=True, **where))
+    node = bridge._Node(None)
+    outlet, inlet = node.writer(where["joints"], "JointState"), node.reader(where["commands"], "Float64MultiArray")
+    while not (inlet.writers() and outlet.get_matched_subscriptions()):
+        time.sleep(0.01)
+    for k in range(10):
+        values = {"slider": 0.1, "slider_velocity": 0.2} if k != 4 else {"another": 3.0, "another_velocity": 4.0}
+        outlet.write(node.joints(values, 0.0))
+        assert inlet.wait(60)
+        inlet.take()
+    thread.join(60)
+    assert ran[0].refused == (1, f"{where['joints']}: got a message without slider, slider_velocity")
+    assert ran[0].held == 1
 
 
 def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
