@@ -18,13 +18,13 @@ Published scores are of other people's runs of the board's own program, which dr
 """
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Any, Literal
 
 import numpy as np
 from board.double_pendulum import Robot
-from board.law import SwingUp
+from board.law import ROBUST, Aim, SwingUp
 from board.performance import CRITERIA, WEIGHTS, criteria, score
 from board.performance import run as perform
 from board.trials import MODEL, Trial, columns, of_parameters, simulate, trials
@@ -42,8 +42,8 @@ PUBLISHED = {
 PERFORMANCE = {("acrobot", 1): 0.869, ("pendubot", 1): 0.891, ("acrobot", 2): 0.655, ("pendubot", 2): 0.682}
 BATCH = 24  # trials that a process runs at once
 
-# Trials that run side by side, with the robot, the version of the board and the seed.
-Job = tuple[list[Trial], Robot, int, int]
+# Trials that run side by side, with the robot, the version of the board, the seed, and what plans are for.
+Job = tuple[list[Trial], Robot, int, int, Aim | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,8 @@ class Config(FolderSettings):
     """Which of them."""
     every: int = 1
     """Of so many levels one; and of so many pushed runs."""
+    effort: float | None = None
+    """Weight of the torque in the plans of robustness. By default each board's own."""
     seed: int = 0
     """Of the noise and the pushes."""
 
@@ -75,7 +77,8 @@ def main(config: Config) -> Result:
             if config.quick:
                 chosen = chosen[:: len(chosen) // 2]
             parts = [chosen[i : i + BATCH] for i in range(0, len(chosen), BATCH)]
-            jobs: list[Job] = [(part, robot, version, config.seed) for part in parts]
+            aim = None if config.effort is None else replace(ROBUST, effort=config.effort)
+            jobs: list[Job] = [(part, robot, version, config.seed, aim) for part in parts]
             if len(jobs) == 1:
                 done = [outcomes(jobs[0])]
             else:
@@ -101,8 +104,8 @@ def few(all_of_them: list[Trial], every: int) -> list[Trial]:
 
 def outcomes(job: Job) -> NDArray[np.bool_]:
     """Which of some trials succeed."""
-    chosen, robot, version, seed = job
-    return simulate(chosen, SwingUp(robot, version, len(chosen)), robot, version, seed)
+    chosen, robot, version, seed, aim = job
+    return simulate(chosen, SwingUp(robot, version, len(chosen), aim), robot, version, seed)
 
 
 def report(result: Result) -> str:
