@@ -265,3 +265,10 @@ def test_noise_in_the_plan() -> None:
     # Noise that is always the same changes the expectation and nothing else.
     np.testing.assert_allclose(names["calm"].trajectory.states, names["plain"].trajectory.states, atol=1e-3)
     assert names["calm"].cost > names["plain"].cost
+
+
+def test_a_filter_becomes_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_page("microcontrollers.md")
+    assert main(["export", "policy.npz", "--c", "firmware/filter"]) == 0
+    assert "#define POLICY_MEASURED 12\n" in (tmp_path / "firmware" / "filter" / "policy.h").read_text(encoding="utf-8")

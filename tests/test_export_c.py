@@ -5,12 +5,13 @@ import json
 import shutil
 import subprocess
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from export_c import QEMU, WARNINGS, CompiledLaw
+from export_c import QEMU, VARIANTS, WARNINGS, CompiledLaw, difference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +19,9 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.control.controllers import as_controller
 from lqrsim.errors import Array
+from lqrsim.scenarios.references import disturbance_set
+from lqrsim.stress.policies import make_controller
+from lqrsim.stress.statistics import rate
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
 needs_arm = pytest.mark.skipif(
@@ -346,6 +350,25 @@ def test_it_flies_as_python_does(drive_solution: ls.Solution, differential_drive
         assert compiled.outcome == python.outcome
         lost = (compiled.measured[:, 1:] == compiled.measured[:, :-1]).all(axis=2)
         assert lost.any()
+
+
+@needs_compiler
+@pytest.mark.parametrize("preset", ["light", "moderate"])
+def test_it_reaches_the_goal_as_often(
+    preset: str, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, tmp_path: Path
+) -> None:
+    """Within the 95 % interval of Python's rate, which is neither 0 nor 1 here; `experiments/export_c.py` has more."""
+    law, disturbances = make_controller("track", quadrotor, quadrotor_solution), disturbance_set(preset, quadrotor)
+    assert isinstance(law, ls.AffinePolicy)
+    flown = partial(ls.simulate, quadrotor.plant(), quadrotor_solution, disturbances=disturbances, trials=24)
+    python = rate(flown(controller=law).outcome.count("reached"), 24)
+    assert 0 < python.value < 1
+    for variant, options in VARIANTS.items():
+        (tmp_path / variant).mkdir()
+        compiled = flown(controller=CompiledLaw(law, tmp_path / variant, **options))
+        assert python.low <= compiled.outcome.count("reached") / 24 <= python.high
+        if variant == "double":
+            assert difference(compiled, law, quadrotor_solution) < 1e-12
 
 
 @needs_arm

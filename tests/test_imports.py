@@ -29,7 +29,7 @@ FLOORS = (
     ("scenarios", "templates"),
     ("stress",),
     ("view",),
-    ("gym",),
+    ("gym", "bridge"),
     ("verify",),
     ("reports",),
     ("commands",),
@@ -83,6 +83,7 @@ ALLOWED = {
     "tqdm": ("commands",),
     "gymnasium": ("gym",),
     "rerun": ("view",),
+    "cyclonedds": ("bridge",),
 }
 
 MODULES = {

@@ -1,8 +1,9 @@
 """The board's double pendulum: its published numbers, and its motion as formulas for plans and in NumPy for runs.
 
 Numbers and equations are those of the project's repository, github.com/dfki-ric-underactuated-lab/double_pendulum
-(`leaderboard/*/robustness_v1` and `_v2`, `model/plant.py`): version 1 has the design C.0 with model 3.0, version 2 the
-design C.1 with model 1.0, both without friction and motor inertia, which some of the runs add.
+(`leaderboard/*/robustness_v1` and `_v2`, `model/plant.py`). In version 1 the acrobot has the design C.0 with model 3.0
+and the pendubot the design A.0 with model 2.0; in version 2 both have the design C.1 with model 1.0. All are without
+friction and motor inertia, which some of the runs add.
 """
 
 from typing import Any, Literal
@@ -17,16 +18,22 @@ LIMIT, GRAVITY, GEAR = 6.0, 9.81, 6.0  # Nm of the one motor, m/s^2, of both mot
 ACTUATED = {"acrobot": 1, "pendubot": 0}  # the joint with a motor, by its index
 UPRIGHT = np.array([np.pi, 0.0, 0.0, 0.0])
 
-# kg m^2, kg and m; inertias are about the joints.
-VERSIONS: dict[int, dict[str, float]] = {
-    1: {
+_C1 = {
+    "I1": 0.031887199591513114, "I2": 0.05086984812807257, "m1": 0.5234602302310271, "m2": 0.6255677234174437,
+    "l1": 0.2, "r1": 0.2, "r2": 0.25569305436052964,
+}  # fmt: skip
+# By robot and version, in kg m^2, kg and m; inertias are about the joints.
+MODELS: dict[tuple[Robot, int], dict[str, float]] = {
+    ("acrobot", 1): {
         "I1": 0.02671076499939512, "I2": 0.053878129629650884, "m1": 0.6416937799349799, "m2": 0.563935954099688,
         "l1": 0.2, "r1": 0.2, "r2": 0.3212669909674605,
     },
-    2: {
-        "I1": 0.031887199591513114, "I2": 0.05086984812807257, "m1": 0.5234602302310271, "m2": 0.6255677234174437,
-        "l1": 0.2, "r1": 0.2, "r2": 0.25569305436052964,
+    ("pendubot", 1): {
+        "I1": 0.053470810264216295, "I2": 0.02392374528789766, "m1": 0.5593806151425046, "m2": 0.6043459469186889,
+        "l1": 0.3, "r1": 0.3, "r2": 0.18377686083653508,
     },
+    ("acrobot", 2): _C1,
+    ("pendubot", 2): _C1,
 }  # fmt: skip
 # What the plans know nothing of: damping in Nm s, friction in Nm, inertia of a motor in kg m^2.
 UNKNOWN = {"b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "Ir": 0.0}
@@ -36,7 +43,7 @@ def dynamics(robot: Robot, version: int) -> ls.Dynamics:
     """As the plans have it."""
     return ls.Dynamics(
         acrobot if robot == "acrobot" else pendubot, states={"q1": "rad", "q2": "rad", "v1": "rad/s", "v2": "rad/s"},
-        controls={"torque": "Nm"}, parameters=VERSIONS[version],
+        controls={"torque": "Nm"}, parameters=MODELS[robot, version],
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from board.double_pendulum import ACTUATED, LIMIT, UNKNOWN, VERSIONS, Robot, advance, off_upright
+from board.double_pendulum import ACTUATED, LIMIT, MODELS, UNKNOWN, Robot, advance, off_upright
 from lqrsim.errors import Array
 
 DT, SECONDS = 0.002, 10.0
@@ -45,9 +45,9 @@ class Trial:
     pushed: bool = False
 
 
-def trials(version: int) -> list[Trial]:
+def trials(robot: Robot, version: int) -> list[Trial]:
     """All of them."""
-    known, found = VERSIONS[version], list[Trial]()
+    known, found = MODELS[robot, version], list[Trial]()
 
     def add(column: str, level: float, **wrong: object) -> None:
         found.append(Trial(column=column, level=float(level), number=len(found), **wrong))  # pyright: ignore[reportArgumentType]
@@ -81,7 +81,7 @@ def simulate(chosen: list[Trial], law: Law, robot: Robot, version: int, seed: in
         [_pushes(rng) if one.pushed else np.zeros((STEPS, 2)) for one, rng in zip(chosen, rngs, strict=True)]
     )
     noises = np.array([rng.standard_normal((STEPS, 3)) for rng in rngs])
-    kinds = {**VERSIONS[version], **UNKNOWN}
+    kinds = {**MODELS[robot, version], **UNKNOWN}
     p = {name: np.array([{**kinds, **one.parameters}[name] for one in chosen]) for name in kinds}
     velocity_noise, torque_noise, response, late = (
         np.array([getattr(one, name) for one in chosen])
@@ -130,3 +130,9 @@ def columns(chosen: list[Trial], succeeded: NDArray[np.bool_]) -> dict[str, floa
         shares.setdefault(column, []).append(float(np.mean(good) > 0.5))
     means = {column: float(np.mean(one)) for column, one in shares.items()}
     return means | {"score": float(np.mean(list(means.values())))}
+
+
+def of_parameters(chosen: list[Trial], succeeded: NDArray[np.bool_]) -> dict[str, float]:
+    """The share of each parameter of the model, of which the column "model" is the mean."""
+    good = {name: [bool(k) for one, k in zip(chosen, succeeded, strict=True) if one.column == name] for name in MODEL}
+    return {name: float(np.mean(one)) for name, one in good.items() if one}

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
+from lqrsim.commands.bridging import Bridge
 from lqrsim.commands.creating import Export, New
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.reliability import Break, Certify, FunnelCommand, Rare
@@ -17,7 +18,7 @@ from lqrsim.commands.viewing import Render, Verify, View
 
 _ALL = (
     List, New, Solve, Simulate, Render, Verify, View, Demo, Stress, Replay, Report, Rare, Certify, Break, FunnelCommand,
-    Export, Reproduce, Cache,
+    Export, Bridge, Reproduce, Cache,
 )  # fmt: skip
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}
 # Name -> the first line of its help.

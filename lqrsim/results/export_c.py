@@ -173,30 +173,33 @@ class _Tables:
     def add(self, name: str, array: Array) -> None:
         """Add a table (T, rows) or (T, rows, columns), read by a macro: NAME(k, i, j).
 
-        The last rows that are the same in all steps, such as those of a filter's unknowns, are stored once.
+        Entries that are the same in all steps, such as those of a filter's unknowns, are stored once.
         """
         if not np.isfinite(array).all():
             raise InputError(f"policy: {name}: got NaN or infinity in it, want finite numbers")
-        changes = np.flatnonzero((array != array[0]).reshape(*array.shape[:2], -1).any(axis=(0, 2)))
-        first = int(changes[-1]) + 1 if len(changes) else 0  # of these rows
-        column, rows = "[j]" if array.ndim == 3 else "", array.shape[1]
-        read, parts = f"{name}[k][i]{column}", {name: array[:, :first], f"{name}_rest": array[0, first:]}
-        if first == 0:
-            read = f"{name}_rest[i]{column}"
-        elif first < rows:
-            read = f"(i < {first} ? {read} : {name}_rest[i - {first}]{column})"
-        if array.ndim == 3 and self._short:
+        short = self._short and array.ndim == 3
+        if short:
             unit = self._rounded(name, np.abs(array).max(axis=0) / LARGEST)
-            short = np.divide(array, unit, out=np.zeros_like(array), where=unit > 0).round().clip(-LARGEST, LARGEST)
+            numbers = np.divide(array, unit, out=np.zeros_like(array), where=unit > 0).round().clip(-LARGEST, LARGEST)
+            stored, kind = numbers * unit, "short"
             self.plain(f"{name}_unit", unit)
-            read, stored = f"((real){read} * {name}_unit[i][j])", short * unit
-            parts, kind = {name: short[:, :first], f"{name}_rest": short[0, first:]}, "short"
         else:
-            stored, kind = self._rounded(name, array), "real"
-        for part, numbers in parts.items():
-            if numbers.size:
-                self._write(part, numbers, kind)
-        self._lines.append(f"#define {name.upper()}({'k, i, j' if column else 'k, i'}) {read}\n")
+            stored = numbers = self._rounded(name, array)
+            kind = "real"
+        changes, at = (numbers != numbers[0]).any(axis=0), "[i][j]" if array.ndim == 3 else "[i]"
+        if changes.all():
+            read = f"{name}[k]{at}"
+            self._write(name, numbers, kind)
+        else:
+            read = f"{name}_fixed{at}"
+            self._write(f"{name}_fixed", numbers[0], kind)
+        if 0 < changes.sum() < changes.size:
+            read = f"({name}_at{at} < 0 ? {read} : {name}[k][{name}_at{at}])"
+            self._write(f"{name}_at", np.where(changes, np.cumsum(changes).reshape(changes.shape), 0) - 1, "short")
+            self._write(name, numbers[:, changes], kind)
+        if short:
+            read = f"((real){read} * {name}_unit[i][j])"
+        self._lines.append(f"#define {name.upper()}({'k, i, j' if array.ndim == 3 else 'k, i'}) {read}\n")
         if array.ndim == 3:
             off, largest = np.abs(stored - array).max(axis=0), np.abs(array).max(axis=0)
             self.rounding[name] = off.sum(axis=-1)

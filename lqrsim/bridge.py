@@ -1,0 +1,550 @@
+"""A controller and its robot as two programs that exchange messages of ROS 2, by DDS; needs the extra `ros`.
+
+    import lqrsim.bridge
+
+    ran = lqrsim.bridge.run(solution, odometry="/odom", commands="/rotors/commands", safe=[0, 0, 0, 0])
+
+`run` is the controller's side: it reads states, and publishes the commands of one control period after the other. Its
+messages have the names, types and bytes of ROS 2, so that nodes see them as any other; ROS 2 itself is not needed.
+`SimulatedRobot` is the robot's side for a try-out, with MuJoCo as the robot.
+
+States come from `nav_msgs/msg/Odometry`, from `sensor_msgs/msg/JointState`, or from both. Commands go out as
+`std_msgs/msg/Float64MultiArray`, in the order of the policy's controls and in their units, as the controllers of
+ros2_control take them. Frames are those of REP 103, which are ours: z up; the body's x forward, y to the left.
+"""
+
+import contextlib
+import functools
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim import rotations
+from lqrsim.control.controllers import Controller, Feedback, FunctionController, OutputFeedback
+from lqrsim.control.replanner import LiveReplanner
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_kind,
+    check_number,
+    excerpt,
+    vectors_of,
+)
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
+from lqrsim.results.plan import Plan
+from lqrsim.results.policy import AffinePolicy
+
+LATE = 3  # control periods without a state after which the controller stops
+SLICE = 0.05  # s, after which a wait looks for signals
+AXES = "xyz"
+# The states that an Odometry has, by name: velocities along the world's axes, rates along the body's.
+ODOMETRY = ("x", "y", "z", "vx", "vy", "vz", "rx", "ry", "rz", "wx", "wy", "wz", "heading")
+
+Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveReplanner
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bridged:
+    """What a run of a controller was, until the safe command.
+
+    Attributes:
+      completed: whether all periods were run.
+      reason: why not, in a line; empty if they were.
+      commands: (T, m), as published.
+      held: number of periods that had to do with the state of an earlier one.
+      refused: number of messages that were not used, for what is in them, and the last reason.
+      response: in s, (T,), from the beginning of each period, in lockstep from when its state had arrived, until its
+        command was published.
+      late: in s, (T,), by which each period began later than the clock had it; zeros in lockstep.
+    """
+
+    completed: bool
+    reason: str
+    commands: Array
+    held: int
+    refused: tuple[int, str]
+    response: Array
+    late: Array
+
+    def summary(self) -> str:
+        """Some lines on the run."""
+        lines = [f"{len(self.commands)} periods, {self.held} with the state held"]
+        lines += [f"stopped: {self.reason}"] if self.reason else []
+        lines += [f"{self.refused[0]} messages not used; the last: {self.refused[1]}"] if self.refused[0] else []
+        if len(self.commands):
+            lines.append(f"state to command: {_quantiles(self.response)}")
+            lines += [f"behind the clock: {_quantiles(self.late)}"] if self.late.any() else []
+        return "\n".join(lines)
+
+
+def run(
+    controller: Bridgeable,
+    *,
+    commands: str,
+    safe: npt.ArrayLike,
+    odometry: str | None = None,
+    joints: str | None = None,
+    names: Mapping[str, str] | None = None,
+    seconds: float | None = None,
+    lockstep: bool = False,
+    lost_after: float | None = None,
+    patience: float = 10.0,
+    domain: int | None = None,
+) -> Bridged:
+    """Control a robot by messages: in each control period of a monotonic clock, a command for the newest state.
+
+    The clock begins with the first state. If a period has no new state, the last one is held: a policy acts on it by
+    the law of the new period, and a filter predicts. After `lost_after` without a state the run stops. After the
+    horizon a policy holds its last law. Once a command was published, the safe one is published last, however the run
+    ends: by Ctrl-C and by an error, too.
+
+    Args:
+      controller: a plan, whose policy it is; a policy, with or without a filter; a Controller with a plan, such as an
+        OffsetFree; or a re-planner's live front, `with replanner.live() as live`.
+      commands: topic, such as "/rotors/commands".
+      safe: (m,), within the limits: what the robot is to do when nobody controls it any more.
+      odometry: topic. It has the states x, y, z, vx, vy, vz (along the world's axes), the rotation vector rx, ry, rz,
+        the rates wx, wy, wz (along the body's), and heading, the yaw.
+      joints: topic. It has the state NAME, and NAME_velocity, of each joint, as a robot from an MJCF has them.
+      names: state -> its name among these, for states that are called otherwise.
+      seconds: how long to run; by default the horizon.
+      lockstep: run a period for each state that arrives, and not by the clock: for simulations.
+      lost_after: in s, by default three control periods; in lockstep `patience`.
+      patience: in s, for the first state, and for the robot to be there at all.
+      domain: of DDS; by default ROS_DOMAIN_ID, or 0.
+
+    Returns:
+      What the run was.
+
+    Raises:
+      InputError: an argument is not as described, the robot is not there, or cyclonedds is not installed.
+    """
+    law, dt, steps, nominal = _law_of(controller)
+    states, controls = law.coordinates
+    safe = check_array("safe", safe, (len(controls),))
+    if (safe < controls.low).any() or (safe > controls.high).any():
+        raise InputError(f"safe: got {excerpt(safe.tolist())}, want it within {controls.low} and {controls.high}")
+    lockstep, patience = check_flag("lockstep", lockstep), check_number("patience", patience, above=0.0, at_most=1e6)
+    longest = patience if lockstep else LATE * dt
+    if lost_after is not None:
+        longest = check_number("lost_after", lost_after, above=0.0, at_most=1e6)
+    if seconds is not None:
+        steps = math.ceil(check_number("seconds", seconds, above=0.0, at_most=1e9) / dt - 1e-9)
+    needed = law.policy.measured_coordinates.names if isinstance(law, OutputFeedback) else states.names
+    node, commands = _Node(domain), _checked_topic(commands)
+    inlet = _Inlet(node, _topics(odometry, joints), states, needed, names, reliable=lockstep)
+    _wait(inlet.matched, patience, inlet.lacking)
+    outlet = node.writer(commands, "Float64MultiArray")  # who sees it can rely on its states being heard
+    _wait(outlet.get_matched_subscriptions, patience, lambda: f"commands: got no reader of {commands}")
+    if not isinstance(controller, LiveReplanner):  # which would begin to solve
+        law.start(1).control(0, nominal[None])  # so that the first period does not load compiled code
+    _wait(inlet.complete, patience, inlet.lacking)
+    running, sent, response, late = law.start(1), list[Array](), list[float](), list[float]()
+    held, reason, begun = 0, "", time.monotonic()
+    try:
+        for step in range(steps):
+            due = begun + step * dt
+            if not lockstep:
+                _sleep_until(due)
+            elif step:
+                inlet.wait(longest)
+            began = time.monotonic()
+            held += not inlet.take() and step > 0
+            if (age := began - inlet.arrived) > longest:
+                reason = f"no state for {age:.3g} s, after {step} periods"
+                break
+            command = running.control(step, inlet.state[None])[0]
+            diverged = running.estimator_diverged()
+            if diverged or not np.isfinite(command).all():
+                reason = diverged.get(0, f"got {excerpt(command.tolist())} from the controller")
+                break
+            outlet.write(node.numbers(command))
+            response.append(time.monotonic() - began)
+            late.append(0.0 if lockstep else began - due)
+            sent.append(command)
+    finally:
+        outlet.write(node.numbers(safe))
+        with contextlib.suppress(AttributeError):  # which cyclonedds 11.0 raises where a reader hangs or is gone
+            outlet.wait_for_acks(node.second)
+    return Bridged(
+        completed=not reason, reason=reason, commands=np.array(sent).reshape(len(sent), len(controls)), held=held,
+        refused=inlet.refused, response=np.array(response), late=np.array(late),
+    )  # fmt: skip
+
+
+class SimulatedRobot:
+    """A robot for `run`: in `simulate` it is the controller, whose controls come from the other program.
+
+        with lqrsim.bridge.SimulatedRobot(solution, odometry="/odom", commands="/rotors/commands") as robot:
+            rollout = ls.simulate(plant, solution, controller=robot)
+        print(robot.summary())
+
+    It publishes the measured state of each control period and waits for a command. What it runs is what a bridge in
+    lockstep makes of it; or, by a bridge with a clock, as fast as that clock.
+
+    Args:
+      plan: a plan or a policy, for the names of the states and controls.
+      commands: as in `run`.
+      odometry: likewise.
+      joints: likewise.
+      names: likewise.
+      patience: in s, for a command; and for the other program to be there at all.
+      domain: as in `run`.
+
+    Attributes:
+      round_trips: in s, from publishing each state to the arrival of its command.
+
+    Raises:
+      InputError: as in `run`.
+    """
+
+    def __init__(
+        self,
+        plan: Plan | AffinePolicy,
+        *,
+        commands: str,
+        odometry: str | None = None,
+        joints: str | None = None,
+        names: Mapping[str, str] | None = None,
+        patience: float = 10.0,
+        domain: int | None = None,
+    ) -> None:
+        policy = plan.policy if isinstance(plan, Plan) else check_kind("plan", plan, AffinePolicy, "a plan or a policy")
+        self._controls = policy.control_coordinates
+        self._patience = check_number("patience", patience, above=0.0, at_most=1e6)
+        self._names, node, topics = _renamed(policy.state_coordinates, names), _Node(domain), _topics(odometry, joints)
+        self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}
+        self._inlet: _Reader | None = node.reader(commands, "Float64MultiArray")
+        self._node: _Node | None = node
+        self._met, self.round_trips = False, list[float]()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Leave the domain."""
+        self._outlets, self._inlet, self._node = {}, None, None
+
+    def __call__(self, state: npt.ArrayLike, t: float) -> Array:
+        """The controls (m,) for a measured state (n,). Raises InputError if none, or others, arrive."""
+        node, inlet = self._node, self._inlet
+        if node is None or inlet is None:
+            raise InputError("SimulatedRobot: got a state after its end, want it within `with SimulatedRobot(...)`")
+        if not self._met:
+            everyone = [inlet.writers, *(one.get_matched_subscriptions for one in self._outlets.values())]
+            _wait(lambda: all(one() for one in everyone), self._patience, lambda: "got no controller")
+            self._met = True
+        values = dict(zip(self._names, vectors_of("state", state, len(self._names)).tolist(), strict=True))
+        messages = [
+            (out, (node.odometry if kind == "Odometry" else node.joints)) for kind, out in self._outlets.items()
+        ]
+        begun = time.monotonic()
+        for outlet, made in messages:
+            outlet.write(made(values, t))
+        _wait(lambda: inlet.wait(SLICE), self._patience, lambda: "got no command")
+        self.round_trips.append(time.monotonic() - begun)
+        (message,) = inlet.take()
+        return check_array("command", message.data, (len(self._controls),))
+
+    def summary(self) -> str:
+        """How long commands took, in a line."""
+        return f"state to command and back: {_quantiles(self.round_trips)}" if self.round_trips else "no command"
+
+
+def _quantiles(seconds: npt.ArrayLike) -> str:
+    middle, high, most = 1e3 * np.quantile(np.asarray(seconds), [0.5, 0.99, 1.0])
+    return f"median {middle:.3f} ms, 99 % {high:.3f} ms, most {most:.3f} ms"
+
+
+def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str]) -> None:
+    """Wait. Raises InputError with what is lacking when the patience ends."""
+    end = time.monotonic() + patience
+    while not until():
+        if time.monotonic() > end:
+            raise InputError(f"{lacking()} within {patience:g} s, want the other program, in the same domain")
+        time.sleep(1e-3)
+
+
+def _sleep_until(due: float) -> None:
+    while (left := due - time.monotonic()) > 0:
+        time.sleep(left)
+
+
+def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:
+    """The controller, its control period in s, the periods of its horizon, and the nominal state at its start (n,)."""
+    if isinstance(given, LiveReplanner):
+        policy, problem = given.active.plan.policy, given.problem
+        return FunctionController(given.step, problem.dynamics, policy.dt), policy.dt, problem.steps, policy.nominal[0]
+    if isinstance(given, OutputFeedbackPolicy):
+        return OutputFeedback(given), given.dt, given.steps, given.nominal[0, : len(given.state_coordinates)]
+    if isinstance(given, AffinePolicy):
+        return Feedback(given), given.dt, given.steps, given.nominal[0]
+    plan = given.plan if isinstance(given, Controller) else given
+    wanted = "a plan, a policy, a Controller with a plan, or a live re-planner"
+    policy = check_kind("controller", plan, Plan, wanted).policy
+    law = given if isinstance(given, Controller) else Feedback(policy)
+    return law, policy.dt, policy.steps, policy.nominal[0]
+
+
+def _checked_topic(topic: object) -> str:
+    if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic):
+        raise InputError(f"topic: got {excerpt(topic)}, want a name of ROS 2, such as /odom")
+    return topic
+
+
+def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
+    found = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
+    if not found:
+        raise InputError("odometry: got no topic of states, want one, or joints=")
+    return found
+
+
+def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
+    """What the states are called in messages."""
+    given = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
+    if unknown := set(given) - set(states.names):
+        raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
+    return tuple(given.get(name, name) for name in states.names)
+
+
+class _Inlet:
+    """The newest state from its topics.
+
+    Attributes:
+      state: (n,); what the controller does not measure is 0.
+      refused: as in `Bridged`.
+    """
+
+    def __init__(
+        self, node: "_Node", topics: Mapping[str, str], states: Coordinates, needed: tuple[str, ...],
+        names: Mapping[str, str] | None, *, reliable: bool,
+    ) -> None:  # fmt: skip
+        self._wanted = dict(zip(_renamed(states, names), range(len(states)), strict=True))
+        self._topics, self._lacking = topics, {name for name, i in self._wanted.items() if states.names[i] in needed}
+        known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
+        if self._lacking - known:
+            raise InputError(
+                f"odometry: got no {', '.join(sorted(self._lacking - known))} in it, want joints= or names="
+            )
+        self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
+        self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
+        self.state, self.refused = np.zeros(len(states)), (0, "")
+
+    @property
+    def arrived(self) -> float:
+        """When the state was taken in, on the clock: the oldest of its parts."""
+        return min(self._arrived.values())
+
+    def wait(self, seconds: float) -> None:
+        """Wait until each topic has something new, but no longer."""
+        end = time.monotonic() + seconds
+        for reader in self._readers.values():
+            while not reader.wait(SLICE) and time.monotonic() < end:
+                pass
+
+    def matched(self) -> bool:
+        """Whether each topic has somebody who writes it."""
+        return all(reader.writers() for reader in self._readers.values())
+
+    def complete(self) -> bool:
+        """Whether each state that is needed has arrived."""
+        self.take()
+        return not self._lacking
+
+    def lacking(self) -> str:
+        return f"states: got no {', '.join(sorted(self._lacking))} from {', '.join(self._topics.values())}"
+
+    def take(self) -> bool:
+        """Take in what is new. Returns whether all parts of the state are."""
+        now = time.monotonic()
+        for kind, reader in self._readers.items():
+            for message in reader.take():
+                try:
+                    values = (_of_odometry if kind == "Odometry" else _of_joints)(message)
+                    used = values.keys() & self._wanted.keys()
+                    self._known[kind] |= used
+                    if missing := self._known[kind] - used:
+                        raise ValueError(f"a message without {', '.join(sorted(missing))}")
+                    if not np.isfinite([values[name] for name in used]).all():
+                        raise ValueError("a number that is not finite")
+                except ValueError as error:
+                    self.refused = self.refused[0] + 1, f"{self._topics[kind]}: got {error}"
+                    continue
+                for name in used:
+                    self.state[self._wanted[name]] = values[name]
+                self._lacking -= used
+                self._arrived[kind] = now
+        return self.arrived == now
+
+
+def _of_odometry(message: Any) -> dict[str, float]:
+    """Its states. Raises ValueError if they are none."""
+    pose, twist = message.pose.pose, message.twist.twist
+    place, turned = pose.position, pose.orientation
+    quaternion = np.array([turned.w, turned.x, turned.y, turned.z])
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1) < 1e-2:
+        raise ValueError(f"an orientation that is no unit quaternion but of length {length:.3g}")
+    w, x, y, z = quaternion / length
+    rotation = rotations.rotation_vector(quaternion / length)
+    velocity = rotations.rotate(rotation, [getattr(twist.linear, axis) for axis in AXES])
+    rates = [getattr(twist.angular, axis) for axis in AXES]
+    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    numbers = [place.x, place.y, place.z, *velocity, *rotation, *rates, heading]
+    return dict(zip(ODOMETRY, map(float, numbers), strict=True))
+
+
+def _of_joints(message: Any) -> dict[str, float]:
+    """Its states, of the joints that it has. Raises ValueError if they are none."""
+    found: dict[str, float] = {}
+    for field, suffix in (("position", ""), ("velocity", "_velocity")):
+        numbers = getattr(message, field)
+        if len(numbers) not in (0, len(message.name)):
+            raise ValueError(f"{len(message.name)} joints with {len(numbers)} numbers as their {field}")
+        found |= {name + suffix: number for name, number in zip(message.name, numbers, strict=False)}
+    return found
+
+
+class _Node:
+    """Readers and writers of ROS 2's topics in one domain of DDS, and their messages."""
+
+    def __init__(self, domain: int | None) -> None:
+        self._ros = _ros()
+        if domain is None:
+            given = os.environ.get("ROS_DOMAIN_ID") or "0"
+            if not given.isdecimal():
+                raise InputError(f"ROS_DOMAIN_ID: got {excerpt(given)}, want a number")
+            domain = int(given)
+        self._participant = self._ros.DomainParticipant(check_count("domain", domain, at_least=0, at_most=232))
+        self.second = self._ros.duration(seconds=1)
+
+    def reader(self, topic: str, kind: str, *, reliable: bool = True) -> "_Reader":
+        quality = self._quality(reliable, kind)
+        return _Reader(self._ros, self._participant, self._topic(topic, kind), quality)
+
+    def writer(self, topic: str, kind: str) -> Any:
+        return self._ros.DataWriter(self._participant, self._topic(topic, kind), qos=self._quality(True, kind))
+
+    def _topic(self, topic: str, kind: str) -> Any:
+        return self._ros.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
+
+    def _quality(self, reliable: bool, kind: str) -> Any:
+        """Of states the newest counts; of commands each does. A writer that is reliable suits readers that are not.
+
+        The representation is that of ROS 2, the first version of CDR.
+        """
+        ros, policy = self._ros, self._ros.Policy
+        kept = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
+        sure = policy.Reliability.Reliable(self.second) if reliable else policy.Reliability.BestEffort
+        return ros.Qos(sure, kept, policy.DataRepresentation(use_cdrv0_representation=True))
+
+    def numbers(self, numbers: Array) -> Any:
+        make = self._ros.messages
+        layout = make["MultiArrayLayout"](dim=[], data_offset=0)
+        return make["Float64MultiArray"](layout=layout, data=[float(one) for one in numbers])
+
+    def odometry(self, values: Mapping[str, float], t: float) -> Any:
+        make, of = self._ros.messages, {name: values.get(name, 0.0) for name in ODOMETRY}
+        rotation = np.array([of["rx"], of["ry"], of["rz"] + of["heading"]])
+        w, x, y, z = rotations.quaternion(rotation).tolist()
+        linear = map(float, rotations.rotate(-rotation, [of["vx"], of["vy"], of["vz"]]))
+        place = make["Point"](x=of["x"], y=of["y"], z=of["z"])
+        pose = make["Pose"](position=place, orientation=make["Quaternion"](x=x, y=y, z=z, w=w))
+        moving = make["Twist"](
+            linear=make["Vector3"](**dict(zip(AXES, linear, strict=True))),
+            angular=make["Vector3"](x=of["wx"], y=of["wy"], z=of["wz"]),
+        )
+        return make["Odometry"](
+            header=self._header(t, "odom"), child_frame_id="base_link",
+            pose=make["PoseWithCovariance"](pose=pose, covariance=[0.0] * 36),
+            twist=make["TwistWithCovariance"](twist=moving, covariance=[0.0] * 36),
+        )  # fmt: skip
+
+    def joints(self, values: Mapping[str, float], t: float) -> Any:
+        names = [name for name in values if name.removesuffix("_velocity") not in values.keys() - {name}]
+        rates = [values.get(f"{name}_velocity", 0.0) for name in names]
+        places = [values[name] for name in names]
+        return self._ros.messages["JointState"](
+            header=self._header(t, ""), name=names, position=places, velocity=rates, effort=[]
+        )
+
+    def _header(self, t: float, frame: str) -> Any:
+        whole = math.floor(t)
+        stamp = self._ros.messages["Time"](sec=whole, nanosec=min(round((t - whole) * 1e9), 999_999_999))
+        return self._ros.messages["Header"](stamp=stamp, frame_id=frame)
+
+
+class _Reader:
+    """A reader of a topic that can be waited for."""
+
+    def __init__(self, ros: SimpleNamespace, participant: Any, topic: Any, quality: Any) -> None:
+        self._ros, self._reader = ros, ros.DataReader(participant, topic, qos=quality)
+        self._new, self._waits = ros.ReadCondition(self._reader, ros.NEW), ros.WaitSet(participant)
+        self._waits.attach(self._new)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a message, but no longer. Returns whether there is one."""
+        return self._waits.wait(self._ros.duration(seconds=seconds)) > 0
+
+    def take(self) -> list[Any]:
+        """The oldest message, if there is one."""
+        return self._reader.take(N=1)
+
+    def writers(self) -> list[Any]:
+        """Who writes it."""
+        return self._reader.get_matched_publications()
+
+
+@functools.cache
+def _ros() -> SimpleNamespace:
+    """What is used of cyclonedds, and the messages. Raises InputError if it is not installed."""
+    try:
+        from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.idl import make_idl_struct
+        from cyclonedds.idl.types import array, float64, int32, sequence, uint32
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+        from cyclonedds.util import duration
+    except ImportError as error:
+        raise InputError(f"lqrsim.bridge: got no cyclonedds ({error}), want pip install 'lqrsim[ros]'") from None
+    made: dict[str, Any] = {}
+
+    def message(package: str, name: str, /, **fields: Any) -> Any:
+        made[name] = make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
+        return made[name]
+
+    three = dict.fromkeys(AXES, float64)
+    stamp = message("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
+    header = message("std_msgs", "Header", stamp=stamp, frame_id=str)
+    point, vector = message("geometry_msgs", "Point", **three), message("geometry_msgs", "Vector3", **three)
+    quaternion = message("geometry_msgs", "Quaternion", **three, w=float64)
+    pose = message("geometry_msgs", "Pose", position=point, orientation=quaternion)
+    twist = message("geometry_msgs", "Twist", linear=vector, angular=vector)
+    covariance = array[float64, 36]
+    posed = message("geometry_msgs", "PoseWithCovariance", pose=pose, covariance=covariance)
+    twisted = message("geometry_msgs", "TwistWithCovariance", twist=twist, covariance=covariance)
+    message("nav_msgs", "Odometry", header=header, child_frame_id=str, pose=posed, twist=twisted)
+    many = sequence[float64]
+    message("sensor_msgs", "JointState", header=header, name=sequence[str], position=many, velocity=many, effort=many)
+    dimension = message("std_msgs", "MultiArrayDimension", label=str, size=uint32, stride=uint32)
+    layout = message("std_msgs", "MultiArrayLayout", dim=sequence[dimension], data_offset=uint32)
+    message("std_msgs", "Float64MultiArray", layout=layout, data=many)
+    return SimpleNamespace(
+        Policy=Policy, Qos=Qos, DomainParticipant=DomainParticipant, DataWriter=DataWriter,
+        DataReader=DataReader, ReadCondition=ReadCondition, WaitSet=WaitSet, Topic=Topic, duration=duration,
+        NEW=SampleState.NotRead | ViewState.Any | InstanceState.Any, messages=made,
+    )  # fmt: skip

@@ -1,0 +1,94 @@
+"""The command that controls a robot by messages of ROS 2, or is that robot."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from lqrsim.commands.options import Json, optional
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bridge:
+    """Run a policy on a robot, by messages of ROS 2; needs lqrsim[ros].
+
+    Reads states from an Odometry or a JointState and publishes a Float64MultiArray in each control period. The safe
+    command is published last: at the end, if states stay away, on an error and on Ctrl-C. docs/bridge.md has units,
+    frames, and what happens when. Exits with 1 if it had to stop early.
+
+      lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --safe 0 0 0 0
+      lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --robot  # in place of it
+    """
+
+    policy: Annotated[Positional[Path], arg(metavar="POLICY.npz")]
+    """A file from `lqrsim solve`, or a policy from `ls.save`: of ls.track, or of ls.OffsetFree with its filter."""
+    commands: Annotated[str, arg(metavar="TOPIC")]
+    """Topic of the commands, a std_msgs/msg/Float64MultiArray."""
+    odometry: Annotated[str | None, optional("TOPIC", "Topic of the states, a nav_msgs/msg/Odometry.")] = None
+    joints: Annotated[str | None, optional("TOPIC", "Topic of the states, a sensor_msgs/msg/JointState.")] = None
+    names: Annotated[tuple[str, ...], optional("STATE=NAME ...")] = ()
+    """What states are called in the messages, if otherwise: theta=heading."""
+    safe: Annotated[tuple[float, ...], optional("CONTROL ...")] = ()
+    """The command for a robot that nobody controls any more: one number for each control. There is no default."""
+    seconds: Annotated[float | None, optional("SECONDS", "How long to run. By default the plan's horizon.")] = None
+    lost_after: Annotated[
+        float | None, optional("SECONDS", "Stop after so long without a state. By default three control periods.")
+    ] = None
+    patience: Annotated[float, arg(metavar="SECONDS")] = 10.0
+    """How long to wait for the other program, and for the first state."""
+    lockstep: FlagCreatePairsOff[bool] = False
+    """Run a control period for each state that arrives, and not by the clock: for simulations."""
+    robot: FlagCreatePairsOff[bool] = False
+    """Be the robot: MuJoCo runs the solution's scenario with the commands that arrive."""
+    scenario: Annotated[str | None, optional("SCENARIO", "With --robot, as in `lqrsim simulate`.")] = None
+    domain: Annotated[int | None, optional("NUMBER", "Domain of DDS. By default ROS_DOMAIN_ID, or 0.")] = None
+    json: Json = False
+
+    def run(self) -> int:
+        """Run the command. Returns the exit code."""
+        from lqrsim import bridge
+        from lqrsim.commands import console
+        from lqrsim.errors import InputError
+        from lqrsim.results import save_load
+
+        pairs = [pair.partition("=") for pair in self.names]
+        if any(not (state and equals and name) for state, equals, name in pairs):
+            raise InputError(f"--names: got {' '.join(self.names)}, want pairs such as theta=heading")
+        names = {state: name for state, _, name in pairs}
+        topics: dict[str, Any] = {
+            "commands": self.commands, "odometry": self.odometry, "joints": self.joints, "names": names,
+            "patience": self.patience, "domain": self.domain,
+        }  # fmt: skip
+        if self.robot:
+            return self._be_robot(topics)
+        if not self.safe:
+            raise InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
+        policy: Any = save_load.load(self.policy)
+        ran = bridge.run(
+            policy, safe=self.safe, seconds=self.seconds, lost_after=self.lost_after, lockstep=self.lockstep, **topics
+        )
+        console.say(ran.summary())
+        numbers = {"held": ran.held, "refused": ran.refused[0], "response": ran.response, "late": ran.late}
+        console.result(periods=len(ran.commands), completed=ran.completed, reason=ran.reason, **numbers)
+        return 0 if ran.completed else 1
+
+    def _be_robot(self, topics: dict[str, Any]) -> int:
+        from lqrsim import bridge
+        from lqrsim.commands import console
+        from lqrsim.errors import InputError
+        from lqrsim.results import save_load
+        from lqrsim.results.solution import Solution
+        from lqrsim.scenarios.references import resolve
+        from lqrsim.simulation.closed_loop import simulate
+
+        solution = save_load.load(self.policy, Solution)
+        if not self.scenario and not solution.scenario:
+            raise InputError("--scenario: got none, and the solution names none, want the one to run with --robot")
+        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        with bridge.SimulatedRobot(solution, **topics) as robot:
+            rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough(None, None))
+        console.say(rollout.summary())
+        console.say(robot.summary())
+        console.result(outcome=rollout.outcome, round_trips=robot.round_trips)
+        return 0 if rollout.outcome == ("reached",) else 1

@@ -1,0 +1,329 @@
+"""A controller and a robot in two programs: messages as ROS 2 has them, and the same run as in one program.
+
+All of it is on the loopback interface; each test has topics of its own.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lqrsim as ls
+
+pytest.importorskip("cyclonedds", reason="needs the `ros` extra")
+
+from lqrsim import bridge
+
+LOOPBACK = """<CycloneDDS><Domain>
+  <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces></General>
+  <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer Address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+JOINT = ("slider", "slider_velocity")
+ODOMETRY: tuple[str, ...] = bridge.ODOMETRY[:12]
+
+
+@pytest.fixture(autouse=True)
+def on_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+@pytest.fixture
+def topics() -> dict[str, Any]:
+    name = f"/test_{uuid.uuid4().hex}"
+    return {"odometry": f"{name}/odom", "commands": f"{name}/commands"}
+
+
+def policy(steps: int = 10, dt: float = 0.05) -> ls.AffinePolicy:
+    """A law that differs from step to step."""
+    rng = np.random.default_rng(0)
+    controls = ls.Coordinates(names=("push",), units=("N",), low=(-5.0,), high=(5.0,))
+    return ls.AffinePolicy(
+        gain=rng.normal(size=(steps, 1, 2)), offset=rng.normal(size=(steps, 1)), nominal=np.zeros((steps, 2)), dt=dt,
+        state_coordinates=ls.Coordinates(names=JOINT, units=("m", "m/s")), control_coordinates=controls,
+    )  # fmt: skip
+
+
+@contextmanager
+def controlling(*arguments: object, json: bool = False) -> Iterator[subprocess.Popen[str]]:
+    """`lqrsim bridge` in a process of its own."""
+    command = [sys.executable, "-m", "lqrsim.cli", "bridge", *map(str, arguments), "--patience", "60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def meanwhile(call: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
+    """A thread that calls, and where what it returns will be."""
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(call()), daemon=True)
+    thread.start()
+    return thread, found
+
+
+@pytest.mark.parametrize("kind", ["Odometry", "JointState", "Float64MultiArray"])
+def test_messages_have_the_bytes_of_ros_2(kind: str) -> None:
+    """By the definitions of ROS 2 Humble and the serialisation of another library."""
+    rosbags = pytest.importorskip("rosbags.typesys")
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
+    node, rng = bridge._Node(None), np.random.default_rng(1)
+    match kind:
+        case "Odometry":
+            ours = node.odometry(dict(zip(ODOMETRY, rng.normal(size=12).tolist(), strict=True)), 3.25)
+        case "JointState":
+            ours = node.joints({"one": 1.5, "another": -2.5, "one_velocity": 0.5, "another_velocity": 0.25}, 7.125)
+        case _:
+            ours = node.numbers(rng.normal(size=5))
+    package = {"Odometry": "nav_msgs", "JointState": "sensor_msgs"}.get(kind, "std_msgs")
+    name = f"{package}/msg/{kind}"
+    assert ours.__idl__.idl_transformed_typename == f"{package}::msg::dds_::{kind}_"
+    theirs = store.deserialize_cdr(ours.serialize(), name)
+    assert bytes(store.serialize_cdr(theirs, name)) == ours.serialize()
+    match kind:
+        case "Odometry":
+            assert theirs.header.stamp.sec == 3
+            assert theirs.header.stamp.nanosec == 250_000_000
+            assert theirs.pose.pose.position.y == ours.pose.pose.position.y
+            assert theirs.twist.twist.angular.z == ours.twist.twist.angular.z
+        case "JointState":
+            assert (theirs.name, theirs.position.tolist()) == (["one", "another"], [1.5, -2.5])
+            assert theirs.velocity.tolist() == [0.5, 0.25]
+        case _:
+            assert theirs.data.tolist() == ours.data
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_odometry_is_read_in_its_frames(seed: int) -> None:
+    """Velocity along the body's axes, as REP 103 has it; rotations by SciPy, to rounding. And there and back."""
+    rng, node = np.random.default_rng(seed), bridge._Node(None)
+    values = dict(zip(ODOMETRY, rng.normal(size=12).tolist(), strict=True))
+    message = node.odometry(values, 0.0)
+    turned = Rotation.from_rotvec([values[name] for name in ("rx", "ry", "rz")])
+    pose, twist = message.pose.pose, message.twist.twist
+    quaternion = [getattr(pose.orientation, name) for name in "xyzw"]
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), turned.as_matrix(), atol=1e-14)
+    seen = turned.apply([getattr(twist.linear, name) for name in "xyz"])
+    np.testing.assert_allclose(seen, [values[name] for name in ("vx", "vy", "vz")], atol=1e-14)
+    again = bridge._of_odometry(message)
+    np.testing.assert_allclose([again[name] for name in values], list(values.values()), atol=1e-14)
+    yawed = bridge._of_odometry(node.odometry({"heading": 2.5}, 0.0))
+    assert yawed["heading"] == pytest.approx(2.5, abs=1e-15)
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_two_programs_run_as_one(
+    filtered: bool, topics: dict[str, Any], tmp_path: Path, differential_drive: ls.Scenario,
+    drive_solution: ls.Solution, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution,
+) -> None:  # fmt: skip
+    """In lockstep, under noise: the quadrotor to 1e-12, the drive to 1e-8, for wheels on a floor amplify rounding.
+
+    Messages round, for they have rotations as quaternions and velocities along the body's axes.
+    """
+    scenario, plan = (differential_drive, drive_solution) if filtered else (quadrotor, quadrotor_solution)
+    disturbances = [ls.disturbances.MeasurementNoise(1e-3), ls.disturbances.ForceNoise(0.05)]
+    controller: Any = None
+    if filtered:
+        disturbances.append(ls.disturbances.MeasurementDropouts(0.1))
+        stated = ls.uncertainty_of(scenario.plant(), disturbances)
+        controller = ls.OffsetFree(scenario.problem, plan, stated).policy
+    file = ls.save(plan if controller is None else controller, tmp_path / "policy.npz")
+    alone = ls.simulate(scenario.plant(), plan, controller=controller, disturbances=disturbances, seed=3)
+    safe = ["0"] * len(plan.policy.control_coordinates)
+    options = [word for name, topic in topics.items() for word in (f"--{name}", topic)]
+    with (
+        controlling(file, "--lockstep", "--safe", *safe, *options) as process,
+        bridge.SimulatedRobot(plan, **topics, patience=60) as robot,
+    ):
+        rollout = ls.simulate(scenario.plant(), plan, controller=robot, disturbances=disturbances, seed=3)
+        printed, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, printed
+    assert f"{plan.trajectory.steps} periods, " in printed
+    assert rollout.outcome == alone.outcome
+    close = 1e-8 if filtered else 1e-12
+    np.testing.assert_allclose(rollout.states, alone.states, rtol=0, atol=close)
+    np.testing.assert_allclose(rollout.commanded, alone.commanded, rtol=0, atol=close)
+    assert len(robot.round_trips) == plan.trajectory.steps
+    assert "99 %" in robot.summary()
+
+
+def test_by_the_clock_commands_are_those_of_the_law(topics: dict[str, Any]) -> None:
+    """Joints, each state once; the robot gets the command of each period, and the safe one last."""
+    law, states = policy(), np.random.default_rng(5).normal(size=(10, 2))
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[-1.5], lost_after=60.0, **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        got = [robot(states[0], 0.0)]
+        thread.join(60)
+        got += [message.data for _ in range(10) for message in robot._inlet.take()]  # pyright: ignore[reportOptionalMemberAccess]
+    assert ran[0].completed
+    assert ran[0].held == 9  # there was one state only, which the laws of all periods were for
+    np.testing.assert_allclose(ran[0].commands, [law(states[0], k * law.dt) for k in range(10)], rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(got, [*ran[0].commands, [-1.5]])
+    assert (ran[0].late >= 0).all()
+
+
+def test_it_stops_when_states_stay_away(topics: dict[str, Any]) -> None:
+    """The state is held until it is too old; then comes the safe command."""
+    law = policy(steps=1000, dt=0.02)
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[-1.5], **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        got = [robot([0.1, 0.2], 0.0).tolist()]
+        thread.join(60)
+        got += [message.data for _ in range(9) for message in robot._inlet.take()]  # pyright: ignore[reportOptionalMemberAccess]
+    assert not ran[0].completed
+    assert ran[0].reason.startswith("no state for 0.")
+    assert len(ran[0].commands) <= 4  # three periods, and the one in which the state arrived
+    np.testing.assert_array_equal(got, [*ran[0].commands.tolist(), [-1.5]])
+    assert "stopped: no state" in ran[0].summary()
+
+
+@pytest.mark.parametrize("spoilt", [[np.nan, 0.0], [np.inf, 0.0]])
+def test_what_is_no_state_is_not_used(spoilt: npt.ArrayLike, topics: dict[str, Any]) -> None:
+    law = policy()
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[0.0], lockstep=True, **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        got = [robot(state, 0.0) for state in ([0.1, 0.2], spoilt, *np.zeros((8, 2)))]
+        thread.join(60)
+    np.testing.assert_allclose(got[1], law([0.1, 0.2], law.dt), rtol=0, atol=1e-15)
+    assert ran[0].refused == (1, f"{topics['odometry']}: got a number that is not finite")
+    assert ran[0].held == 1
+
+
+def test_an_orientation_that_is_none_is_not_used() -> None:
+    message = bridge._Node(None).odometry({}, 0.0)
+    message.pose.pose.orientation.w = 0.0
+    with pytest.raises(ValueError, match="no unit quaternion but of length 0"):
+        bridge._of_odometry(message)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_ctrl_c_leaves_the_safe_command(topics: dict[str, Any], tmp_path: Path) -> None:
+    law, state = policy(steps=1000), np.array([0.1, 0.2])
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"]}
+    options = [word for name, topic in where.items() for word in (f"--{name}", topic)]
+    file = ls.save(law, tmp_path / "policy.npz")
+    with (
+        controlling(file, *options, "--lockstep", "--safe", -1.5) as process,
+        bridge.SimulatedRobot(law, **where, patience=60) as robot,
+    ):
+        for k in range(5):
+            np.testing.assert_allclose(robot(state, k * law.dt), law(state, k * law.dt), rtol=0, atol=1e-15)
+        process.send_signal(signal.SIGINT)
+        assert robot._inlet is not None
+        assert robot._inlet.wait(60)
+        (last,) = robot._inlet.take()
+        printed, _ = process.communicate(timeout=60)
+    assert last.data == [-1.5]
+    assert process.returncode == 130
+    assert "lqrsim: stopped" in printed
+
+
+def test_a_failing_controller_leaves_the_safe_command(topics: dict[str, Any]) -> None:
+    law = policy()
+    broken = replace(law, offset=np.where(np.arange(10)[:, None] == 3, np.nan, law.offset))
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(broken, safe=[-1.5], lockstep=True, **where))
+    with bridge.SimulatedRobot(law, **where) as robot:
+        got = [robot([0.1, 0.2], k * law.dt) for k in range(4)]
+        thread.join(60)
+    np.testing.assert_array_equal(got[3], [-1.5])
+    assert (ran[0].completed, ran[0].reason) == (False, "got [nan] from the controller")
+
+
+def test_a_live_replanner_runs(topics: dict[str, Any], quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Before the first solve is done it is the policy; the robot waits until one is."""
+    replanner = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.1, horizon="moving")
+    state, periods = quadrotor_solution.trajectory.states[0], 1500
+    with replanner.live() as live, bridge.SimulatedRobot(quadrotor_solution, **topics, patience=60) as robot:
+        options: dict[str, Any] = {"lockstep": True, "seconds": periods / 30, "patience": 60}
+        thread, ran = meanwhile(lambda: bridge.run(live, safe=[0.0] * 4, **topics, **options))
+        got = []
+        for k in range(periods):
+            got.append(robot(state, k / 30))
+            if not live.log.records:
+                time.sleep(0.04)
+        thread.join(60)
+    assert ran[0].completed
+    assert live.log.records
+    np.testing.assert_allclose(got[0], quadrotor_solution.policy(state, 0.0), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"controller": 3}, "controller: got"),
+        ({"controller": ls.lq}, "controller: got"),
+        ({"safe": [6.0]}, r"safe: got \[6.0\], want it within"),
+        ({"safe": [0.0, 0.0]}, "safe: got shape"),
+        ({"joints": None}, "odometry: got no topic of states"),
+        ({"joints": "joint states"}, "topic: got 'joint states', want a name of ROS 2"),
+        ({"joints": "/a//b"}, "topic: got"),
+        ({"commands": 3}, "topic: got 3"),
+        ({"names": {"theta": "heading"}}, r"names: got \['theta'\], want some of slider"),
+        ({"joints": None, "odometry": "/odom"}, "odometry: got no slider, slider_velocity in it"),
+        ({"seconds": 0}, "seconds: got 0"),
+        ({"domain": 500}, "domain: got 500"),
+        ({}, "states: got no slider, slider_velocity from /j within 0.1 s, want the other program"),
+    ],
+)
+def test_what_cannot_be_is_told_in_a_line(changed: dict[str, Any], message: str) -> None:
+    asked: dict[str, Any] = {"controller": policy(), "commands": "/nobody_listens", "safe": [0.0], "joints": "/j"}
+    with pytest.raises(ls.InputError, match=message) as told:
+        bridge.run(**{**asked, "patience": 0.1, **changed})
+    assert "\n" not in str(told.value)
+
+
+def test_what_is_not_there_is_named(topics: dict[str, Any]) -> None:
+    """A robot that does not listen, and one that is silent; neither gets a command."""
+    node, where = bridge._Node(None), {"joints": topics["odometry"], "commands": topics["commands"]}
+    silent = node.writer(where["joints"], "JointState")
+    with pytest.raises(ls.InputError, match=r"commands: got no reader of /test_.* within 0.5 s"):
+        bridge.run(policy(), safe=[0.0], patience=0.5, **where)
+    listening = node.reader(where["commands"], "Float64MultiArray")
+    with pytest.raises(ls.InputError, match=r"states: got no slider, slider_velocity from /test_.* within 0.5 s"):
+        bridge.run(policy(), safe=[0.0], patience=0.5, **where)
+    assert silent.get_matched_subscriptions() is not None
+    assert not listening.take()
+
+
+def test_a_message_without_a_joint_that_was_there_is_not_used(topics: dict[str, Any]) -> None:
+    law = policy()
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": 60.0}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[0.0], lockstep=True, **where))
+    node = bridge._Node(None)
+    outlet, inlet = node.writer(where["joints"], "JointState"), node.reader(where["commands"], "Float64MultiArray")
+    while not (inlet.writers() and outlet.get_matched_subscriptions()):
+        time.sleep(0.01)
+    for k in range(10):
+        values = {"slider": 0.1, "slider_velocity": 0.2} if k != 4 else {"another": 3.0, "another_velocity": 4.0}
+        outlet.write(node.joints(values, 0.0))
+        assert inlet.wait(60)
+        inlet.take()
+    thread.join(60)
+    assert ran[0].refused == (1, f"{where['joints']}: got a message without slider, slider_velocity")
+    assert ran[0].held == 1
+
+
+def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds.core", None)
+    bridge._ros.cache_clear()
+    with pytest.raises(ls.InputError, match=r"want pip install 'lqrsim\[ros\]'"):
+        bridge.run(policy(), commands="/c", safe=[0.0], joints="/j")
+    bridge._ros.cache_clear()
