@@ -31,6 +31,7 @@ from lqrsim.disturbances import (
     MeasurementLatency,
     MeasurementNoise,
     MotorLag,
+    Payload,
     Push,
     Saturation,
     ThrustMismatch,
@@ -64,6 +65,7 @@ OWN = {
         MeanWind((0.5, 0.2, 0.0)),
         Gusts(0.5, 0.5),
         Dryden("light"),
+        Payload(0.02, "quadrotor"),
     ],
     "arena": [
         WheelRadiusMismatch(0.01),
@@ -219,7 +221,7 @@ def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, fi
     apart = {"lowest": {"share"}, "highest": {"share"}, "factor": {"std"}}.get(field, set())
     values |= dict.fromkeys(apart)
     bad = [np.nan, np.inf, -np.inf, [np.nan] * 3, object()] + ([] if field in SIGNED else [-1.0, -1])
-    if not (name == "ActuatorLoss" and field == "actuator"):
+    if (name, field) not in {("ActuatorLoss", "actuator"), ("Payload", "body")}:
         bad.append("much")
     for value in bad:
         with pytest.raises(InputError) as caught:
@@ -305,6 +307,7 @@ def test_descriptions_are_in_words_and_units(plants):
         "wind of (0.5, 0.2, 0) m/s",
         "gusts, std 0.5 m/s, time constant 0.5 s",
         "light Dryden turbulence at 2 m, wind 7.72 m/s at 20 ft",
+        "a load of 0.02 kg on quadrotor",
     ]
     assert words["arena"][-3:] == [
         "wheel radius off by 1 % (std, cut at 3 std)",

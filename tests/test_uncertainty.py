@@ -32,6 +32,7 @@ from lqrsim.disturbances import (
     MeasurementDropouts,
     MeasurementLatency,
     MotorLag,
+    Payload,
     Push,
     Saturation,
     ThrustMismatch,
@@ -55,7 +56,7 @@ EXAMPLES = [
     MeasurementLatency(1), MeasurementDropouts(0.2), CommandDropouts(0.2), ControlNoise(0.02),
     ControlOffset(0.02), ControlDelay(1), MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
     ls.disturbances.MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
-    AxleMismatch(0.02),
+    AxleMismatch(0.02), Payload(0.02, "quadrotor"),
 ]  # fmt: skip
 IN_WORDS = [
     InertiaMismatch(0.1), MeasurementBias(0.005), Saturation(share=0.9),

@@ -294,8 +294,8 @@ class PlanModel:
     @cached_property
     def places(self) -> Array:
         """Where the unknown parameters are among the numbers."""
-        names, first = list(self.dynamics.parameters), len(self.dynamics.functions)
-        return np.array([first + names.index(name) for name in self.parameters], dtype=np.float64)
+        places = self.dynamics.places
+        return np.array([places[name] for name in self.parameters], dtype=np.float64)
 
     @cached_property
     def jacobian(self) -> Array:

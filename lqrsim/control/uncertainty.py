@@ -211,7 +211,7 @@ class Uncertainty:
 def possible_unknowns(dynamics: Dynamics) -> list[str]:
     """All that an Unknown can be of."""
     controls = dynamics.control_coordinates.names
-    own = dynamics.disturbed.parameters
+    own = dynamics.parameters | dynamics.disturbances
     return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
 
 

@@ -3,7 +3,8 @@
 States are tangent coordinates: for each degree of freedom a position (of a ball or free joint's rotation three numbers
 of a rotation vector), then the velocities, then the actuators' own states. `p` has the wrench on the robot's body, then
 addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
-each takes a slot, two `MjData` that are its own for as long as it needs them.
+each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads a slot has a model
+of its own, too.
 """
 
 from math import atan2, cos, nan, pi, sqrt
@@ -30,15 +31,17 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those is that the
 # controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of the
 # function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
-# mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and
-# places in qpos and qvel, three numbers each.
+# mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. LOADED, LOADS: how many bodies
+# may carry a load, and where the loads are, in kg; the numbers of these bodies and their own masses follow. TABLE: the
+# joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, TABLE = 22, 23, 24, 25, 26, 27
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29
 
 # Addresses that a slot has for each of its two MjData.
-SLOT, SIZE = 24, 12
+SLOT, SIZE = 28, 14
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
+OWN_MODEL, MASSES = 12, 13
 
 # The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
 # many are done, whether to stop, how many helpers there are, whether a signal came: then all steps are NaN.
@@ -151,8 +154,9 @@ def run(z, p, wrench, substeps, two, out):
     """Write the state after this number of physics steps."""
     write_to(z, p, two)
     begin(p, wrench, two)
+    write_loads(p, two)
     for _ in range(substeps):
-        call(p[STEP], at(p[MODEL]), at(two[DATA]))
+        call(p[STEP], at(two[OWN_MODEL]), at(two[DATA]))
     read_from(z, p, two, out)
 
 
@@ -161,7 +165,8 @@ def linearize_here(z, p, wrench, address, warm):
     one = at(address)
     write_to(z, p, one)
     begin(p, wrench, one)
-    call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(0), int32(1))
+    write_loads(p, one)
+    call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(0), int32(1))
     accelerations = at(one[QACC])
     for i in range(int(p[NV])):
         warm[i] = accelerations[i]
@@ -191,7 +196,7 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
             write_to(moved, p, two)
             start_from(p, two, warm)
         for _ in range(substeps - 1 if kept > 0 else substeps):
-            call(p[STEP], at(p[MODEL]), at(two[DATA]))
+            call(p[STEP], at(two[OWN_MODEL]), at(two[DATA]))
         read_from(z, p, two, ahead if side == 0 else behind)
     for i in range(N):
         jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
@@ -256,6 +261,13 @@ def begin(p, wrench, one):
         push[i] = wrench[WRENCH + i]
 
 
+def write_loads(p, one):
+    """Have bodies carry their loads at their centres of mass, in the model of the slot."""
+    count, first, masses = int(p[LOADED]), int(p[LOADS]), at(one[MASSES])
+    for k in range(count):
+        masses[int(p[first + count + k])] = p[first + 2 * count + k] + p[first + k]
+
+
 def start_from(p, one, guess):
     """Have the solver of the next step begin at these accelerations."""
     warm = at(one[WARM])
@@ -267,8 +279,8 @@ def step_from(z, p, one, two, guess, kept):
     """A physics step to `two`; it reuses the stages of `one` that the state and control share."""
     write_to(z, p, one)
     start_from(p, one, guess)
-    call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(kept), int32(1))
-    call(p[INTEGRATE], at(p[MODEL]), at(one[DATA]))
+    call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(kept), int32(1))
+    call(p[INTEGRATE], at(one[OWN_MODEL]), at(one[DATA]))
     nv = int(p[NV])
     write_to(z, p, two)
     for k in range(int(p[JOINTS])):
@@ -308,7 +320,7 @@ def read_from(near, p, one, out):
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
-        call(p[RESET], at(p[MODEL]), at(one[DATA]))  # so that nothing of it is left
+        call(p[RESET], at(one[OWN_MODEL]), at(one[DATA]))  # so that nothing of it is left
         for i in range(N):
             out[i] = nan
 

@@ -212,6 +212,11 @@ class Dynamics:
         """The parameters' values, in order."""
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
+    @property
+    def places(self) -> dict[str, int]:
+        """Where each parameter is among the numbers that compiled code takes."""
+        return {name: len(self.functions) + i for i, name in enumerate(self.parameters)}
+
     def _functions(self) -> tuple[UserFunction, ...]:
         """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there
         is one.

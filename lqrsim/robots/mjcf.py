@@ -145,8 +145,9 @@ class MjcfRobot(Robot):
         )  # fmt: skip
         reach = mjcf_joints.reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
-        many = not place if outline is None else check_flag(f"{who}: outline", outline)
-        self.balls = MjcfBalls(outline_of(model), self._balls_at) if many else None
+        found = outline_of(model)
+        many = not place and len(found.radii) > 0 if outline is None else check_flag(f"{who}: outline", outline)
+        self.balls = MjcfBalls(found, self._balls_at) if many else None
         self.geoms: MjcfGeoms = MjcfGeoms(self.scene)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _states(self) -> Iterator[tuple[str, str]]:

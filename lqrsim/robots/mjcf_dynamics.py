@@ -51,13 +51,14 @@ class MjcfDynamics(Dynamics):
         self._stated: dict[str, Any] = {"body": body, "obstacles": obstacles, "actuators": actuators}
         self.functions, self.level = (), "compiled"
         self.parameters: dict[str, float] = {}
-        self.disturbances = dict.fromkeys(WRENCH, 0.0)
         self.state_coordinates, self.control_coordinates = states, controls
         self._set_mjcf(xml, model)
 
     def _set_mjcf(self, xml: str, model: Any = None) -> None:
         self.xml, self.fixed = xml, sha256(xml, repr(self._stated))
-        self.physics = MjcfPhysics(xml, self._name, model=model, **self._stated)
+        self.physics = MjcfPhysics(xml, self._name, model=model, loaded=bool(self.parameters), **self._stated)
+        loads = [f"{self.physics.model.body(number).name}_load" for number in self.physics.carriers]
+        self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without MuJoCo's memory, which another process makes anew."""
@@ -85,10 +86,27 @@ class MjcfDynamics(Dynamics):
     def step_source(self) -> Source:
         return source_of(kernel)
 
+    @cached_property
+    def disturbed(self) -> "MjcfDynamics":
+        if self.parameters:
+            return self
+        other = copy.copy(self)
+        other.parameters = dict(self.disturbances)
+        other._set_mjcf(self.xml, self.physics.model)  # with models of its own, which carry the loads
+        return other
+
     @property
     def data(self) -> Array:
-        wrench = [self.parameters.get(name, self.disturbances[name]) for name in WRENCH]
-        return np.concatenate([wrench, self.physics.numbers[kernel.WRENCH + len(wrench) :]])
+        numbers, places = self.physics.numbers.copy(), self.places
+        for name, value in self.parameters.items():
+            numbers[places[name]] = value
+        return numbers
+
+    @property
+    def places(self) -> dict[str, int]:
+        loads = int(self.physics.numbers[kernel.LOADS])
+        where = [*range(kernel.WRENCH, kernel.WRENCH + len(WRENCH)), *range(loads, loads + len(self.physics.carriers))]
+        return {name: where[i] for i, name in enumerate(self.parameters)}
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -170,10 +188,11 @@ class MjcfDynamics(Dynamics):
     def solving(self, threads: int) -> Iterator[None]:
         """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
 
-        More threads than processors would wait for each other, and are not begun. After a signal that raises
+        More threads than processors would wait for each other, and are not begun; nor are any where bodies carry loads,
+        which helpers do not know. After a signal that raises
         KeyboardInterrupt all steps are NaN, so that it need not wait for the end of an iteration.
         """
-        threads = min(check_count("threads", threads), processors())
+        threads = min(check_count("threads", threads), 1 if self.parameters else processors())
         team, helpers = self.physics.team, list[threading.Thread]()
         with unlogged(), process.on_interrupt(partial(team.__setitem__, kernel.SIGNALLED, 1)):
             with _forming:

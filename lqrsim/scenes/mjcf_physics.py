@@ -37,9 +37,11 @@ class MjcfPhysics:
     Args:
       xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
+      loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
 
     Attributes:
-      model: MuJoCo's. numbers: what the kernel takes, with no wrench. team: the words that its threads share.
+      model: MuJoCo's. numbers: what the kernel takes, with no wrench and no loads. team: the words that its threads
+        share. carriers: ids of the bodies that can carry a load, those that move and have mass.
 
     Raises:
       InputError: joints and actuators do not describe its whole state.
@@ -54,12 +56,17 @@ class MjcfPhysics:
         body: int,
         actuators: tuple[int, ...],
         obstacles: tuple[int, ...],
+        loaded: bool = False,
     ) -> None:
         self.model = model_from_xml(xml, name) if model is None else copy.copy(model)
         _check(self.model, name)
         _prepare(self.model, obstacles)
         self._exact = _for_distances(self.model)
-        slots = 2 * processors()
+        heavy = (self.model.body_treeid >= 0) & (self.model.body_mass > 0)
+        self.carriers = tuple(np.flatnonzero(heavy).tolist())
+        # With loads each slot has a model of its own, which may be large; filters need one.
+        slots = 2 if loaded else 2 * processors()
+        self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
         self._data = [mujoco.MjData(self.model) for _ in range(2 * slots)]
         for data in self._data:
             # MuJoCo writes to a file and the console about the first of each: there are no first ones.
@@ -70,23 +77,25 @@ class MjcfPhysics:
         n, m = 2 * self.model.nv + self.model.na, len(actuators)
         self.team[kernel.TICKET] = n + m  # a job without columns left
         self._job = np.zeros(1 + n + m + 6 + n * (n + m))
-        self._table = np.array([self._addresses(data, body) for data in self._data], dtype=np.float64)
-        self.numbers = self._numbers(actuators)
+        own = [model for model in self._models for _ in range(2)]
+        addresses = [self._addresses(data, model, body) for data, model in zip(self._data, own, strict=True)]
+        self._table = np.array(addresses, dtype=np.float64)
+        self.numbers = self._numbers(actuators, self.carriers if loaded else ())
 
-    def _addresses(self, data: mujoco.MjData, body: int) -> list[float]:
+    def _addresses(self, data: mujoco.MjData, model: mujoco.MjModel, body: int) -> list[float]:
         row = np.zeros(kernel.SIZE)
         fields = {
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
             kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
             kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
-            kernel.GEOM_XMAT: data.geom_xmat,
+            kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass,
         }  # fmt: skip
         for place, array in fields.items():
             row[place] = array.ctypes.data
-        row[kernel.DATA] = data._address
+        row[kernel.DATA], row[kernel.OWN_MODEL] = data._address, model._address
         return row.tolist()
 
-    def _numbers(self, actuators: tuple[int, ...]) -> Array:
+    def _numbers(self, actuators: tuple[int, ...], carriers: tuple[int, ...]) -> Array:
         model, functions = self.model, _functions()
         joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
         part = _PARTS.get(mujoco.mjtIntegrator(model.opt.integrator))
@@ -101,8 +110,10 @@ class MjcfPhysics:
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
         numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
         numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
-        numbers[kernel.DISTANCE_MODEL] = self._exact._address
-        return np.concatenate([numbers, joints.ravel(), actuators])
+        numbers[kernel.DISTANCE_MODEL], numbers[kernel.LOADED] = self._exact._address, len(carriers)
+        numbers[kernel.LOADS] = kernel.TABLE + joints.size + len(actuators)
+        loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
+        return np.concatenate([numbers, joints.ravel(), actuators, *loads])
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:

@@ -19,6 +19,7 @@ from lqrsim.simulation.disturbances.mismatch import (
     FrictionMismatch,
     InertiaMismatch,
     MassMismatch,
+    Payload,
     ThrustMismatch,
     WheelRadiusMismatch,
 )
@@ -68,6 +69,7 @@ __all__ = [
     "MeasurementLatency",
     "MeasurementNoise",
     "MotorLag",
+    "Payload",
     "Push",
     "Saturation",
     "ThrustMismatch",

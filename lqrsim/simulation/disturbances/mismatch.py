@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown
-from lqrsim.errors import Array, InputError, check_number
+from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown, possible_unknowns
+from lqrsim.errors import Array, InputError, check_name, check_number, check_text
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.actuation import check_gains
 from lqrsim.simulation.disturbances.base import (
@@ -28,6 +28,7 @@ from lqrsim.simulation.disturbances.base import (
     check_strength,
     fit,
     left_out,
+    times,
     unknowns_of,
     words,
 )
@@ -115,7 +116,58 @@ class MassMismatch(Mismatch):
         simulations.expand("body_mass")[:, bodies(plant)] *= factors
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
+        dynamics, masses = plant.robot.dynamics, plant.model.body_mass
+        loads = {load_of(plant, number): float(masses[number]) for number in bodies(plant) if masses[number] > 0}
+        if loads.keys() <= dynamics.disturbances.keys():  # of a robot from an MJCF
+            return unknowns_of(self, plant, [Unknown(loads, float(self.spread(plant)[0]))])
         return parameter_unknown(self, plant, "mass")
+
+
+@dataclass(frozen=True)
+class Payload(Disturbance):
+    """A load that the plan does not know of, at the centre of mass of one body, such as a gripper that holds something.
+
+    The same in all trials. The body's inertia about its centre of mass does not change.
+
+    Args:
+      mass: of the load, in kg.
+      body: name of the body that carries it.
+    """
+
+    mass: float
+    body: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mass", check_number("Payload: mass", self.mass, at_least=0.0))
+        check_text("Payload: body", self.body, "the name of a body")
+
+    def check(self, plant: Plant) -> None:
+        self._number(plant)
+
+    def _number(self, plant: Plant) -> int:
+        known = {plant.model.body(number).name: int(number) for number in bodies(plant)}
+        return known[check_name("Payload: body", self.body, known)]
+
+    def describe(self, plant: Plant) -> str:
+        return f"a load of {self.mass:g} kg on {self.body}"
+
+    def scaled(self, strength: float) -> "Payload":
+        """The same with `strength` times the mass."""
+        return replace(self, mass=times(self, self.mass, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        number = self._number(plant)
+
+        def alter(simulations: batch.Batch) -> None:
+            simulations.expand("body_mass")[:, number] += self.mass
+
+        return Effect(alter=alter)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        load, whole = load_of(plant, self._number(plant)), "mass"
+        declared = possible_unknowns(plant.robot.dynamics)
+        alone = load not in declared and whole in declared and len(bodies(plant)) == 1
+        return unknowns_of(self, plant, [Unknown(whole if alone else load, self.mass)])
 
 
 class InertiaMismatch(Mismatch):
@@ -231,8 +283,14 @@ class FrictionMismatch(WheelMismatch):
 
 def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertainty:
     """The unknown of a mismatch that multiplies a parameter of the dynamics."""
-    nominal = abs(plant.robot.dynamics.disturbed.parameters.get(name, 1.0))
+    dynamics = plant.robot.dynamics
+    nominal = abs((dynamics.disturbances | dynamics.parameters).get(name, 1.0))
     return unknowns_of(mismatch, plant, [Unknown(name, nominal * float(mismatch.spread(plant)[0]))])
+
+
+def load_of(plant: Plant, body: int) -> str:
+    """The name that robots from an MJCF have for a load on that body."""
+    return f"{plant.model.body(body).name}_load"
 
 
 def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | None]) -> Uncertainty:

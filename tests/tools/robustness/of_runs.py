@@ -16,6 +16,7 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
     "ControlDelay": {"periods": 1}, "Dryden": {}, "Gusts": {}, "InitialStateError": {"std": (0.1, 0.1, 0.1)},
     "MeanWind": {"velocity": (1.0, 0.0, 0.0)}, "MeasurementDropouts": {"loss": 0.1},
     "MeasurementLatency": {"periods": 1}, "MotorLag": {"time_constant": 0.1},
+    "Payload": {"mass": 0.1, "body": "create"},
     "Push": {"impulse": (1.0, 0.0, 0.0), "at": 0.1}, "Saturation": {"share": 0.5},
     **{
         kind: {"std": 0.1}

@@ -1,0 +1,112 @@
+"""Loads on the bodies of a robot from an MJCF: as dynamics, as a disturbance, and as an unknown that a filter finds."""
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.disturbances import MassMismatch, Payload, Unknown
+from lqrsim.scenes.scene import scene_from_xml
+
+GRAVITY, LENGTH, OWN, ARMATURE = 9.81, 0.5, 0.4, 0.05  # m/s^2, m, kg, kg m^2
+
+# A beam on a hinge, that points along x; its hand's centre of mass is LENGTH from the hinge.
+BEAM = f"""
+<mujoco model="beam">
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <body name="beam">
+      <joint name="hinge" axis="0 -1 0" damping="0.5" armature="{ARMATURE}"/>
+      <inertial pos="0.2 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>
+      <body name="hand" pos="0.4 0 0">
+        <inertial pos="0.1 0 0" mass="{OWN}" diaginertia="0.001 0.001 0.001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="turn" joint="hinge" ctrlrange="-50 50" ctrllimited="true"/></actuator>
+</mujoco>"""
+INERTIA = ARMATURE + 0.02 + 0.2**2 + 0.001 + OWN * LENGTH**2  # about the hinge
+
+
+@cache
+def beam() -> ls.MjcfRobot:
+    return ls.MjcfRobot(scene_from_xml(BEAM, "beam"))
+
+
+def test_a_load_is_a_point_mass_at_the_centre_of_mass() -> None:
+    """As the same MJCF does with a body of such a mass welded there."""
+    robot, spec = beam(), mujoco.MjSpec.from_string(BEAM)
+    added = spec.body("hand").add_body(pos=[0.1, 0, 0], ipos=[0, 0, 0], mass=0.7, inertia=[1e-15] * 3)
+    added.explicitinertial = True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    state, control = robot.at(hinge=0.4, hinge_velocity=-1.2), np.array([3.0])
+    data.qpos[:], data.qvel[:], data.ctrl[:] = state[0], state[1], control
+    mujoco.mj_step(model, data, 2)
+    loaded = robot.dynamics.disturbed.with_parameters(hand_load=0.7)
+    np.testing.assert_allclose(
+        loaded.step(state, control, 0.02), [data.qpos[0], data.qvel[0]], rtol=0, atol=1e-13
+    )
+    # The dynamics without a load did not change, also in a memory that just had one.
+    bare = robot.dynamics.step(state, control, 0.02)
+    np.testing.assert_array_equal(robot.dynamics.disturbed.step(state, control, 0.02), bare)
+    np.testing.assert_array_equal(loaded.with_parameters(hand_load=0.0).step(state, control, 0.02), bare)
+    A, B, c = loaded.linearize(state, control, 0.02)
+    np.testing.assert_allclose(A @ state + B @ control + c, loaded.step(state, control, 0.02), rtol=0, atol=1e-12)
+    assert B[1, 0] < 0.9 * robot.dynamics.linearize(state, control, 0.02)[1][1, 0]  # it is more to move
+
+
+def held() -> tuple[ls.MjcfRobot, ls.Problem, ls.Solution]:
+    """A plan of 4 s that holds the beam level."""
+    robot = beam()
+    problem = robot.problem(robot.at(), robot.at(), steps=200, dt=0.02)
+    return robot, problem, ls.smooth(problem)
+
+
+def test_a_filter_finds_the_load_and_the_law_holds_it_with_its_static_torque() -> None:
+    """m g l by the law, where `track` sags by m g l over its gain, which its own policy says."""
+    robot, problem, solution = held()
+    plant, load = ls.Plant(robot, robot.scene), Payload(1.0, "hand")
+    alone = GRAVITY * (0.2 + OWN * LENGTH)
+    np.testing.assert_allclose(solution.trajectory.controls, alone, rtol=1e-6)
+    uncertainty = ls.uncertainty_of(plant, [load])
+    assert uncertainty.unknowns == (Unknown({"hand_load": 1.0}, 1.0),)
+    tolerate = {"rad": 0.05, "rad/s": 0.5}
+    law = ls.OffsetFree(problem, solution, uncertainty, tolerate=tolerate, record=True)
+    # A load speeds the level beam up by -m g l over its inertia, for the filter.
+    effect = law.model.effects[0, 1, law.model.parameters.index("hand_load")]
+    expected = -GRAVITY * LENGTH / (INERTIA + 0.5 * 0.01) * 0.01  # in a step; damping is implicit
+    once = expected + expected * (INERTIA / (INERTIA + 0.5 * 0.01))
+    np.testing.assert_allclose(effect, once, rtol=1e-3)  # the beam turns a little in two steps
+    run = ls.simulate(plant, solution, controller=law, disturbances=[load])
+    np.testing.assert_allclose(run.applied[0, -1] - alone, 1.0 * GRAVITY * LENGTH, rtol=1e-3)
+    np.testing.assert_allclose(run.controller_run.estimates[-2, 0, -1], 1.0, rtol=1e-3)
+    assert abs(run.states[0, -1, 0]) < 1e-4
+    tracking = ls.track(problem, solution, tolerate=tolerate)
+    sagged = ls.simulate(plant, solution, controller=tracking, disturbances=[load]).states[0]
+    sag, rate = -sagged[120]
+    assert abs(rate) < 1e-3
+    torque = -tracking.gain[120, 0, 0] * sag
+    wanted = GRAVITY * LENGTH * np.cos(sag) - alone * (1 - np.cos(sag))
+    np.testing.assert_allclose(torque, wanted, rtol=0.02)  # the gains change a little with time
+
+
+def test_a_mass_mismatch_is_one_unknown_with_the_bodies_masses_as_shares() -> None:
+    robot = beam()
+    plant = ls.Plant(robot, robot.scene)
+    (unknown,) = ls.uncertainty_of(plant, [MassMismatch(factor=1.2)]).unknowns
+    assert unknown.shares == {"beam_load": 1.0, "hand_load": OWN}
+    assert unknown.std == pytest.approx(0.2)
+
+
+def test_what_cannot_carry_a_load_is_refused_by_name() -> None:
+    robot = beam()
+    plant = ls.Plant(robot, robot.scene)
+    with pytest.raises(ls.InputError, match=r"^Payload: body: got 'foot', want one of: beam, hand"):
+        ls.uncertainty_of(plant, [Payload(1.0, "foot")])
+    with pytest.raises(ls.InputError, match=r"^Payload: mass: got -1"):
+        Payload(-1.0, "hand")
+    scenario = ls.scenarios.quadrotor()
+    assert ls.uncertainty_of(scenario.plant(), [Payload(0.1, "quadrotor")]).unknowns == (Unknown({"mass": 1.0}, 0.1),)
