@@ -3,10 +3,11 @@
     pip install 'lqrsim[sysid]'                     # what mujoco.sysid needs beside MuJoCo
     python experiments/fit_to_data.py
     python experiments/fit_to_data.py --quick       # fewer runs
+    python experiments/fit_to_data.py --models models --only Panda    # of robosuite, see experiments/mjcf/family.py
 
-A plant differs from its MJCF in masses and damping. The plan for the MJCF fails in it. `mujoco.sysid` fits the numbers
-to what that one run recorded, with noise; the plan for the fitted ones is run in the same plant, and so is one for the
-true ones.
+A plant differs from its MJCF in masses, damping, friction and motors. The plan for the MJCF fails in it. `mujoco.sysid`
+fits the numbers to what that one run recorded, with noise; the plan for the fitted ones is run in the same plant, and
+so is one for the true ones.
 """
 
 import contextlib
@@ -15,17 +16,21 @@ import io
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-from mjcf.files import CART_POLE
+from mjcf.family import FAMILY
+from mjcf.files import CART_POLE, REACHER
 from mjcf.packaged import quadrotor
 from runner import Settings, opening, run, table
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
 
+SHARES = 0.25, 0.5, 1.0  # of the run, that numbers are fitted to one after the other
 FACTOR = 10.0  # how many times as much, and as little, as in the MJCF a number may be
 
 
@@ -35,23 +40,23 @@ class Case:
 
     Attributes:
       name: of it. robot: as its MJCF has it. truth: the numbers that are others, by name. noise: standard deviation of
-        what is measured of each state, in its unit. problem: what it is to do, for dynamics.
+        what is measured of each state, in its unit. problem: what it is to do, with these numbers or others.
     """
 
     name: str
     robot: ls.MjcfRobot
     truth: Mapping[str, float]
     noise: tuple[float, ...]
-    problem: Callable[[ls.Dynamics], ls.Problem]
+    problem: Callable[[ls.MjcfRobot], ls.Problem]
 
 
 def cart_pole() -> Case:
     """Swings up its pole; cart, pole and bearings are heavier and stiffer than drawn."""
     robot = ls.MjcfRobot(scene_from_xml(CART_POLE.replace("<mujoco>", '<mujoco model="cart-pole">'), "cart-pole"))
 
-    def problem(dynamics: ls.Dynamics) -> ls.Problem:
+    def problem(robot: ls.MjcfRobot) -> ls.Problem:
         return ls.Problem(
-            dynamics=dynamics, dt=0.02, steps=150, initial=ls.FixedState(robot.at(pole=np.pi)),
+            dynamics=robot.dynamics, dt=0.02, steps=150, initial=ls.FixedState(robot.at(pole=np.pi)),
             stage_cost=ls.ControlCost([0.1]), final_cost=ls.QuadraticCost(np.full(4, 100.0), about=robot.at()),
             control_limits=(-1, 1),
         )  # fmt: skip
@@ -67,11 +72,38 @@ def loaded_quadrotor() -> Case:
     return Case(
         name="quadrotor", robot=robot, truth={"quadrotor_mass": 0.6, **drag},
         noise=(0.005,) * 3 + (0.005,) * 3 + (0.02,) * 3 + (0.02,) * 3,
-        problem=lambda dynamics: quadrotor(scenario, dynamics),
+        problem=lambda robot: quadrotor(scenario, robot.dynamics),
     )  # fmt: skip
 
 
-CASES: dict[str, Callable[[], Case]] = {"cart-pole": cart_pole, "quadrotor": loaded_quadrotor}
+def arm() -> Case:
+    """Three joints: what it holds, its friction and its damping are not on paper, nor how weak a motor is."""
+    robot = ls.MjcfRobot(scene_from_xml(REACHER, "reacher"))
+
+    def problem(robot: ls.MjcfRobot) -> ls.Problem:
+        start, goal = robot.at(shoulder=-0.8, elbow=1.6), robot.at(turn=1.5, shoulder=0.5, elbow=-0.6)
+        return robot.problem(start, goal, steps=75, dt=0.02, weights=np.repeat((1000.0, 100.0), 3))
+
+    truth = {
+        "hand_mass": 0.8, "turn_damping": 0.6, "shoulder_damping": 0.5, "elbow_damping": 0.45,
+        "turn_frictionloss": 0.5, "shoulder_frictionloss": 0.5, "elbow_frictionloss": 0.4, "elbow_motor_gear": 0.85,
+    }  # fmt: skip
+    return Case(name="arm", robot=robot, truth=truth, noise=(1e-3,) * 3 + (1e-2,) * 3, problem=problem)
+
+
+def panda(folder: Path | None = None) -> Case:
+    """The Panda of robosuite, with something in its hand, stiffer joints and a weak motor. Raises InputError."""
+    (task,) = (one.found_in(folder) for one in FAMILY if one.name == "Panda")
+    if task.path is None:
+        raise ls.InputError("--models: got no folder with robosuite, want one as experiments/mjcf/family.py says")
+    truth = {"right_hand_mass": 1.5, "link5_mass": 2.6, "torq_j4_gear": 0.9}
+    truth |= {f"joint{number}_damping": 0.4 if number < 6 else 0.05 for number in range(1, 8)}
+    return Case(
+        name="Panda", robot=task.robot(), truth=truth, noise=(1e-3,) * 7 + (1e-2,) * 7, problem=task.problem
+    )  # fmt: skip
+
+
+CASES: dict[str, Callable[[], Case]] = {"cart-pole": cart_pole, "quadrotor": loaded_quadrotor, "arm": arm}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +112,8 @@ class Config(Settings):
 
     only: tuple[str, ...] = ()
     """Names of robots; by default all."""
+    models: Path | None = None
+    """Folder with robosuite's files, for the Panda, too; `experiments/mjcf/family.py` says how to get them."""
     trials: int = 100
     """Runs of each policy, with noise."""
     seed: int = 0
@@ -103,7 +137,8 @@ def library() -> Any:
 def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tuple[float, float]]:
     """Fit numbers of the robot's MJCF to what was measured in the first trial of a run.
 
-    The trial begins where its plan does, and counts up to a collision.
+    The trial begins where its plan does, and counts up to a collision. The fit begins with a quarter of it: a whole
+    run of a wrong model is too far from what was recorded to lead to the right one.
 
     Args:
       names: of the numbers, as in `robot.dynamics.numbers`; where they are zero there is nothing to scale.
@@ -111,8 +146,29 @@ def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tup
     Returns:
       By name: the number, and half the width of its 95 % interval.
     """
-    sysid, model, dt = library(), robot.scene.model, run.plan.dt
+    sysid, dt = library(), run.plan.dt
     steps = int(min(run.plan.steps * dt, run.collided_at[0]) / dt)
+
+    def build(parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        # The plan's physics: a model that is still wrong is not to end in an obstacle, where no number matters.
+        values = {name: float(one.value[0]) for name, one in parameters.items()}
+        return robot.dynamics.with_parameters(**values).physics.model
+
+    assumed, parameters = robot.dynamics.numbers, sysid.ParameterDict()
+    for name in names:
+        parameters.add(sysid.Parameter(name, assumed[name], assumed[name] / FACTOR, assumed[name] * FACTOR))
+    for share in SHARES:
+        recorded = sequences(sysid, robot, run, max(1, round(share * steps)))
+        residual = sysid.build_residual_fn(models_sequences=[recorded], build_model=build)
+        with contextlib.redirect_stdout(io.StringIO()):  # its iterations
+            parameters, ended = sysid.optimize(parameters, residual, verbose=False)
+    _, widths = sysid.calculate_intervals(residual(parameters.as_vector(), parameters)[0], ended.jac)
+    return {name: (float(parameters[name].value[0]), float(width)) for name, width in zip(names, widths, strict=True)}
+
+
+def sequences(sysid: Any, robot: ls.MjcfRobot, run: ls.Rollout, steps: int) -> Any:
+    """So many control periods of the first trial, as the library takes them."""
+    model, dt = robot.scene.model, run.plan.dt
     measured = run.measured[0, : steps + 1].copy()
     angles = list(robot.dynamics.state_coordinates.angles)
     measured[:, angles] = np.unwrap(measured[:, angles], axis=0)  # they are those nearest the plan
@@ -125,7 +181,7 @@ def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tup
     signals = {
         name: where for name, where in (positions | velocities).items() if name.rsplit("_", maxsplit=1)[0] in known
     }  # fmt: skip
-    sequences = sysid.ModelSequences(
+    return sysid.ModelSequences(
         robot.name, mujoco.MjSpec.from_string(robot.scene.xml), "recorded",
         sysid.create_initial_state(model, *robot.configuration(run.plan.states[0])),
         sysid.TimeSeries.from_control_names(np.arange(len(controls)) * model.opt.timestep, controls, model),
@@ -135,26 +191,12 @@ def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tup
         allow_missing_sensors=True,
     )  # fmt: skip
 
-    def build(parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        # The plan's physics: a model that is still wrong is not to end in an obstacle, where no number matters.
-        values = {name: float(one.value[0]) for name, one in parameters.items()}
-        return robot.dynamics.with_parameters(**values).physics.model
-
-    assumed, parameters = robot.dynamics.numbers, sysid.ParameterDict()
-    for name in names:
-        parameters.add(sysid.Parameter(name, assumed[name], assumed[name] / FACTOR, assumed[name] * FACTOR))
-    residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build)
-    with contextlib.redirect_stdout(io.StringIO()):  # its iterations
-        found, ended = sysid.optimize(parameters, residual, verbose=False)
-    _, widths = sysid.calculate_intervals(residual(found.as_vector(), found)[0], ended.jac)
-    return {name: (float(found[name].value[0]), float(width)) for name, width in zip(names, widths, strict=True)}
-
 
 def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
     """Record, fit, solve with each of the models, and run all in the plant."""
     true = case.robot.with_parameters(**case.truth)
     plant, noise = ls.Plant(true, true.scene), [ls.disturbances.MeasurementNoise(case.noise)]
-    on_paper = ls.smooth(case.problem(case.robot.dynamics))
+    on_paper = ls.smooth(case.problem(case.robot))
     recorded = ls.simulate(plant, on_paper, disturbances=noise, seed=seed)
     fitted = fit(case.robot, recorded, list(case.truth))
     assumed = case.robot.dynamics.numbers
@@ -162,10 +204,10 @@ def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
         {"name": name, "on paper": assumed[name], "true": value, "fitted": fitted[name][0], "within": fitted[name][1]}
         for name, value in case.truth.items()
     ]
-    dynamics = case.robot.dynamics.with_parameters(**{name: value for name, (value, _) in fitted.items()})
+    like_it = case.robot.with_parameters(**{name: value for name, (value, _) in fitted.items()})
     plans = {
-        "on paper": on_paper, "fitted": ls.smooth(case.problem(dynamics)),
-        "true": ls.smooth(case.problem(true.dynamics)),
+        "on paper": on_paper, "fitted": ls.smooth(case.problem(like_it)),
+        "true": ls.smooth(case.problem(true)),
     }  # fmt: skip
     return {
         "name": case.name, "seconds": float(min(recorded.times[-1], recorded.collided_at[0])), "numbers": numbers,
@@ -189,10 +231,11 @@ def outcome(plant: ls.Plant, plan: ls.Solution, noise: list[Any], trials: int, s
 
 def main(config: Config) -> dict[str, Any]:
     library()
-    names = ["cart-pole"] if config.quick else [*CASES]
+    cases = CASES if config.models is None else CASES | {"Panda": partial(panda, config.models)}
+    names = ["cart-pole"] if config.quick and not config.only else [*cases]
     chosen = [name for name in names if not config.only or name in config.only]
     trials = min(config.trials, 10) if config.quick else config.trials
-    return opening(config) | {"cases": [of_case(CASES[name](), trials, config.seed) for name in chosen]}
+    return opening(config) | {"cases": [of_case(cases[name](), trials, config.seed) for name in chosen]}
 
 
 def report(result: dict[str, Any]) -> str:

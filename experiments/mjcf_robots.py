@@ -94,13 +94,14 @@ def row_of(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> d
 def sheet(config: Config, result: Result) -> None:
     """One sheet with all pictures."""
     folder, names, across = config.out / FIGURES, list(result["figures"]), 3
+    together = "mjcf_family.png" if config.family else "mjcf_robots.png"
     pictures = [Image.open(folder / name).convert("RGB").resize(TILE, Image.Resampling.LANCZOS) for name in names]
     rows = -(-len(pictures) // across)
     whole = Image.new("RGB", (across * TILE[0], rows * TILE[1]), "white")
     for number, picture in enumerate(pictures):
         whole.paste(picture, (number % across * TILE[0], number // across * TILE[1]))
-    whole.save(folder / "mjcf_robots.png", optimize=True)
-    result["figures"].append("mjcf_robots.png")
+    whole.save(folder / together, optimize=True)
+    result["figures"].append(together)
 
 
 def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> dict[str, Any]:

@@ -351,6 +351,24 @@ def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.long
+def test_an_arm_is_fitted_to_a_run_that_failed() -> None:
+    """Load, friction, damping and a motor; the plan for the fitted ones is followed as well as that for the true ones."""
+    script: Any = import_module("fit_to_data")
+    try:
+        script.library()
+    except ls.InputError as error:
+        pytest.skip(str(error))
+    (case,) = script.main(script.Config(quick=True, only=("arm",)))["cases"]
+    for one in case["numbers"]:
+        # The intervals are those of a linear model without the kinks of friction; no number is off by a twentieth.
+        assert abs(one["fitted"] - one["true"]) < 0.05 * one["true"]
+    on_paper, fitted, true = case["plans"]
+    assert on_paper["reached"] == 0
+    assert fitted["reached"] == true["reached"] == fitted["trials"] == 10
+    assert max(fitted["off"], true["off"]) < 0.05 * on_paper["off"]
+
+
+@pytest.mark.long
 def test_the_packaged_quadrotor_by_its_mjcf() -> None:
     """MuJoCo's steps lead to the optimum of the formulas: to 1e-6 of the cost is wanted, what is left is rounding."""
     script: Any = import_module("mjcf_packaged")

@@ -46,9 +46,7 @@ def test_a_load_is_a_point_mass_at_the_centre_of_mass() -> None:
     data.qpos[:], data.qvel[:], data.ctrl[:] = state[0], state[1], control
     mujoco.mj_step(model, data, 2)
     loaded = robot.dynamics.disturbed.with_parameters(hand_load=0.7)
-    np.testing.assert_allclose(
-        loaded.step(state, control, 0.02), [data.qpos[0], data.qvel[0]], rtol=0, atol=1e-13
-    )
+    np.testing.assert_allclose(loaded.step(state, control, 0.02), [data.qpos[0], data.qvel[0]], rtol=0, atol=1e-13)
     # The dynamics without a load did not change, also in a memory that just had one.
     bare = robot.dynamics.step(state, control, 0.02)
     np.testing.assert_array_equal(robot.dynamics.disturbed.step(state, control, 0.02), bare)

@@ -19,4 +19,14 @@ ARM = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler au
   </worldbody><actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/><motor joint="d"/><motor joint="e"/>
   <motor joint="f"/></actuator></mujoco>"""
 
+REACHER = """<mujoco model="reacher"><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
+  <default><joint axis="0 -1 0" damping="0.3" frictionloss="0.2" armature="0.02"/><geom contype="0" conaffinity="0"/>
+  </default><worldbody><body name="upper"><joint name="turn" axis="0 0 1"/><joint name="shoulder" range="-170 170"/>
+  <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1.2"/><body name="fore" pos="0.4 0 0">
+  <joint name="elbow" range="-150 150"/><geom type="capsule" fromto="0 0 0 0.35 0 0" size="0.025" mass="0.7"/>
+  <body name="hand" pos="0.4 0 0"><geom type="sphere" size="0.04" mass="0.3"/></body></body></body></worldbody>
+  <actuator><motor name="turn_motor" joint="turn" gear="1" ctrlrange="-25 25"/><motor name="shoulder_motor"
+  joint="shoulder" gear="1" ctrlrange="-40 40"/><motor name="elbow_motor" joint="elbow" gear="1" ctrlrange="-15 15"/>
+  </actuator></mujoco>"""
+
 FILES = {"cart-pole": CART_POLE, "box on the floor": BOX, "arm of six hinges": ARM}
