@@ -352,7 +352,7 @@ def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.long
 def test_an_arm_is_fitted_to_a_run_that_failed() -> None:
-    """Load, friction, damping and a motor; the plan for the fitted ones is followed as well as that for the true ones."""
+    """Load, friction, damping and a motor; the plan for the fitted ones is followed as well as for the true ones."""
     script: Any = import_module("fit_to_data")
     try:
         script.library()

@@ -3,8 +3,8 @@
 States are tangent coordinates: for each degree of freedom a position (of a ball or free joint's rotation three numbers
 of a rotation vector), then the velocities, then the actuators' own states. `p` has the wrench on the robot's body, then
 addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
-each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads a slot has a model
-of its own, too.
+each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads, a slot also has
+a model of its own.
 """
 
 from math import atan2, cos, nan, pi, sqrt

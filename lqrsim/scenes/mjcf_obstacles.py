@@ -25,11 +25,8 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     ground = _ground(model) if floors else set[int]()
     if not _sinks(model, body):
         ground = {geom for geom in ground if _touches(model, geom)}
-    return [
-        geom
-        for geom in candidates
-        if geom in touched and geom not in ground and int(model.geom_bodyid[geom]) not in base
-    ]
+    bodies = model.geom_bodyid.tolist()
+    return [geom for geom in candidates if geom in touched and geom not in ground and bodies[geom] not in base]
 
 
 def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:

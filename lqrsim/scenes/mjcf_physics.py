@@ -145,11 +145,11 @@ def _equality(model: mujoco.MjModel, number: int) -> str:
 
 
 def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
-    for geom in obstacles:
-        model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
-        if ((model.pair_geom1 == geom) | (model.pair_geom2 == geom)).any():
-            who = model.geom(geom).name
-            raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype and conaffinity")
+    listed = list(obstacles)
+    model.geom_contype[listed] = model.geom_conaffinity[listed] = 0
+    for geom in np.intersect1d(listed, [model.pair_geom1, model.pair_geom2])[:1]:
+        who = model.geom(int(geom)).name
+        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype and conaffinity")
     option, flags = model.opt, mujoco.mjtDisableBit
     option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)

@@ -253,6 +253,10 @@ def _check_elements(xml: str, what: str) -> None:
 
     It takes a NaN for the mass or density of a geom as if there were none.
     """
+    text = xml.lower()
+    rare = any(word in text for word in ("replicate", "hfield", "nan"))
+    if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
+        return  # files of thousands of geoms are not read once more
     reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
     try:
         reader.feed(xml)
@@ -365,8 +369,7 @@ def _flatten(path: Path) -> str:
 
     def expand(element: ElementTree.Element) -> None:
         children = list(element)
-        for child in children:
-            element.remove(child)
+        element[:] = []
         for child in children:
             if child.tag == "include":
                 element.extend(read(find(child.get("file", ""))))
