@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
+from PIL import Image
 from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
@@ -155,3 +156,42 @@ def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.P
         ls.verify_run(dataclasses.replace(run, balls=dataclasses.replace(run.balls, anchors=1e3 + run.balls.anchors)))
     with pytest.raises(ls.InputError, match=r"balls\.driven: got shape"):
         dataclasses.replace(run, balls=dataclasses.replace(run.balls, driven=run.balls.driven[:1]))
+
+
+def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(tmp_path: Path) -> None:
+    """Red is what is drawn of the arm, blue the hull that collides, larger; the ball that is followed is low."""
+    corners = "-1 -1 -1  1 -1 -1  0 1 -1  0 0 1"
+    path = tmp_path / "tall.xml"
+    path.write_text(f"""
+<mujoco model="tall">
+  <compiler autolimits="true"/>
+  <asset>
+    <mesh name="hull" vertex="{corners}" scale=".12 .12 .12"/><mesh name="drawn" vertex="{corners}" scale=".1 .1 .1"/>
+  </asset>
+  <worldbody><camera name="own" pos="0 0 9"/><light pos="0 0 3"/>
+    <body name="mast">
+      <joint name="turn" axis="0 0 1" range="-90 90" damping="1"/>
+      <geom type="mesh" mesh="drawn" pos="0.3 0 1.5" rgba="1 0 0 1" contype="0" conaffinity="0"/>
+      <geom type="mesh" mesh="hull" pos="0.3 0 1.5" rgba="0 0 1 1"/>
+      <geom type="cylinder" fromto="0 0 0 0.3 0 1.5" size="0.02" rgba="1 0 0 1" contype="0" conaffinity="0"/>
+      <geom type="sphere" size="0.05" pos="0.3 0 0" rgba="1 0 0 1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="turn" ctrlrange="-5 5"/></actuator>
+</mujoco>""")
+    robot = ls.MjcfRobot(path)
+    problem = robot.problem(robot.at(), robot.at(turn=1.0), steps=20, dt=0.02)
+    run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=1))
+    still = tmp_path / "still.png"
+    ls.view.render_still(run, still, size=(480, 270), every=run.times[-1] / 4, overlays=())
+    colours = np.asarray(Image.open(still).convert("RGB")).astype(int)
+    red = (colours[..., 0] > 100) & (colours[..., 1:].max(axis=2) < 60)
+    blue = (colours[..., 2] > 100) & (colours[..., :2].max(axis=2) < 60)
+    rows, columns = np.nonzero(red)
+    assert np.ptp(rows) > 150  # a large part of the picture
+    assert rows.min() > 0
+    assert rows.max() < 269
+    assert columns.min() > 0
+    assert columns.max() < 479
+    assert not blue.any()
+    assert colours[5, 5].min() > 150

@@ -134,6 +134,7 @@ def _right(span: Array, aspect: float) -> Array:
 # The overview cameras of models are made for 16:9; in a narrower picture they would cut off both sides.
 OVERVIEW_ASPECT = 1.7
 OBLIQUE = np.array([0.30, 0.75, -0.60])  # direction of an overview in a scene without an overview camera
+POSES = 9  # of an arm, that an overview contains
 FIELD_OF_VIEW = 40.0  # degrees, of cameras that are not the model's
 DISTANCE, HEIGHT = 11.0, 4.5  # of the chase camera, in radii of the robot
 TURN_SECONDS = 0.8  # s, over which the chase camera averages its direction
@@ -214,11 +215,11 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
 def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
     """Points (k, 3) of the run, and corners of fixed geoms as far as they are near it."""
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
-    if recorded.rollout.balls is not None:
-        run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    if recorded.rollout.balls is not None:  # of an arm the links reach farther than what the run follows
+        run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3), *_outer_points(recorded, data, signs)])
     low, high = run.min(axis=0), run.max(axis=0)
     margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = [run]
     for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
         middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
@@ -227,6 +228,18 @@ def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
         seen = data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
         corners.append(np.clip(seen, low - margin, high + margin))
     return np.vstack(corners)
+
+
+def _outer_points(recorded: RecordedTrial, data: mujoco.MjData, signs: Array) -> list[Array]:
+    """Corners of the boxes about the moving geoms at some times of the run; poses the data at its beginning."""
+    model, corners = recorded.model, list[Array]()
+    moving = np.flatnonzero((model.body_weldid[model.geom_bodyid] != 0) & (model.geom_group < 3))
+    for time in np.linspace(recorded.end, 0, POSES):
+        recorded.pose(data, float(time))
+        for geom in moving.tolist():
+            middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            corners.append(data.geom_xpos[geom] + (middle + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T)
+    return corners
 
 
 def _chase(recorded: RecordedTrial) -> CameraView:

@@ -130,7 +130,8 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         raise InputError(f"state_coordinates.position: got none, want {wanted}")
     if rollout.balls is not None and not rollout.state_coordinates.position:
         _ = rollout.balls.tracked  # which raises if no site is named
-    model = model_from_xml(rollout.model, "rollout.model")
+    model = model_from_xml(with_sky(rollout.model), "rollout.model")
+    hide_hulls(model)
     robot_body(model, rollout.body)
     if rollout.balls is not None and (rollout.balls.anchors[:, 0] >= model.nbody).any():
         raise InputError(
@@ -141,6 +142,27 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
             f"rollout.frames: got {rollout.frames.shape[-1]} numbers a frame, want {model.nq}, as the model has"
         )
     return model
+
+
+def with_sky(xml: str) -> str:
+    """The MJCF with a light sky where it has none, in place of a black one."""
+    if "skybox" in xml or "</mujoco>" not in xml:
+        return xml
+    sky = (
+        '<texture name="" type="skybox" builtin="gradient" rgb1=".93 .96 1" rgb2=".7 .78 .86" width="64" height="384"/>'
+    )
+    end = xml.rindex("</mujoco>")
+    return f"{xml[:end]}<asset>{sky}</asset>{xml[end:]}"
+
+
+def hide_hulls(model: mujoco.MjModel) -> None:
+    """Do not draw colliding meshes of bodies that have others, for drawing alone: they are at the same place."""
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < 3)].tolist())
+    for geom in np.flatnonzero(is_mesh & collides).tolist():
+        if int(model.geom_bodyid[geom]) in drawn:
+            model.geom_rgba[geom, 3] = 0
 
 
 def robot_body(model: mujoco.MjModel, name: str) -> int:
