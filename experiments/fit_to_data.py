@@ -30,7 +30,7 @@ from runner import Settings, opening, run, table
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
 
-SHARES = 0.25, 0.5, 1.0  # of the run, that numbers are fitted to one after the other
+SHARES = 0.25, 0.5  # of the run, that numbers are fitted to one after the other, before the whole
 FACTOR = 10.0  # how many times as much, and as little, as in the MJCF a number may be
 
 
@@ -157,11 +157,16 @@ def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tup
     assumed, parameters = robot.dynamics.numbers, sysid.ParameterDict()
     for name in names:
         parameters.add(sysid.Parameter(name, assumed[name], assumed[name] / FACTOR, assumed[name] * FACTOR))
-    for share in SHARES:
+
+    def fitted(parameters: Any, share: float) -> tuple[Any, Any, Any]:
         recorded = sequences(sysid, robot, run, max(1, round(share * steps)))
         residual = sysid.build_residual_fn(models_sequences=[recorded], build_model=build)
         with contextlib.redirect_stdout(io.StringIO()):  # its iterations
-            parameters, ended = sysid.optimize(parameters, residual, verbose=False)
+            return *sysid.optimize(parameters, residual, verbose=False), residual
+
+    for share in SHARES:
+        parameters = fitted(parameters, share)[0]
+    parameters, ended, residual = fitted(parameters, 1.0)
     _, widths = sysid.calculate_intervals(residual(parameters.as_vector(), parameters)[0], ended.jac)
     return {name: (float(parameters[name].value[0]), float(width)) for name, width in zip(names, widths, strict=True)}
 
