@@ -152,7 +152,7 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
 
 
 def touches(model: mujoco.MjModel, states: Array) -> bool:
-    """Whether a contact or a limit acts at one of these states (k, n), in the coordinates of `kernels/mjcf_dynamics`."""
+    """Whether a contact or a limit acts at one of these states (k, n), as `kernels/mjcf_dynamics.py` has them."""
     data, kinds = mujoco.MjData(model), mujoco.mjtConstraint.__members__
     one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
     unturned = np.zeros(model.nq)

@@ -7,9 +7,9 @@
      ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
   3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
-  4. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and on
-     to the true ones from there (`Search.soften`).
-  5. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
+  4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
+  5. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and
+     on to the true ones from there (`Search.soften`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
@@ -90,10 +90,10 @@ def solve(
             search.widen()
         if settings.start is None and search.best[0].second_order and not stop.due:
             search.look_aside()
-        if default and settings.safeguard and not stop.due and not search.best[1].success:
-            search.soften()
         if problem.risk > 0 and settings.safeguard and not stop.due:
             search.retry_without_risk()
+    if default and settings.safeguard and not stop.due and not search.best[1].success:
+        search.soften()
     chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -292,9 +292,7 @@ class Search:
         """
         problem, begin = self._problem, None
         for name, dynamics in problem.dynamics.softened(self.best[1].states):
-            soft = dataclasses.replace(problem, dynamics=dynamics)
-            with dynamics.solving(self._threads):
-                run, found = self._solve_soft(soft, begin)
+            run, found = self._solve_soft(dataclasses.replace(problem, dynamics=dynamics), begin)
             self._softer.append(run.candidate(f"contacts of softness {name}", found))
             if np.isfinite(found.cost):
                 begin = InitialGuess(found.law[0].copy(), found.law[1].copy(), None, None, f"softness {name}")
@@ -304,25 +302,27 @@ class Search:
             return
         run = self._another(replace(begin, summary="a plan for softer contacts"))
         self._named.append(("a plan for softer contacts", run))
-        found = self._to_its_end(run, refine, self._known)
+        with problem.dynamics.solving(self._threads):
+            found = self._to_its_end(run, refine, self._known)
         stages = ", ".join(one.start.removeprefix("contacts of softness ") for one in self._softer)
         detail = f"begun with contacts of softness {stages}; {found.detail}".removesuffix("; ")
         self._finished.append((run, replace(found, detail=detail)))
         self._finished.sort(key=lambda pair: pair[1].rank)
 
     def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
-        """A plan for softer contacts; from the start if there is no plan to begin with."""
-        if begin is None:
-            given = guides(soft, self._settings.starts)
-            runs = [self._another(resolve(one, soft), soft) for _, one in given]
-            search = Search([name for name, _ in given], runs, None, self._threads)
+        """Plan for softer contacts: from that policy, or by a search where there is none."""
+        if begin is not None:
+            run = self._another(begin, soft)
+            with soft.dynamics.solving(self._threads), run.budget.limited(SOFT):
+                return run, refine(run, Known())
+        given = guides(soft, None)
+        runs = [self._another(resolve(one, soft), soft) for _, one in given]
+        search = Search([name for name, _ in given], runs, self._callback, self._threads)
+        with soft.dynamics.solving(self._threads if len(runs) == 1 else 1):
             search.run()
             if search.is_unacceptable and not self._budget.stop.due:
                 search.widen()
-            return search.best
-        run = self._another(begin, soft)
-        with run.budget.limited(SOFT):
-            return run, refine(run, Known())
+        return search.best
 
     def retry_without_risk(self) -> None:
         """If the risk was too high on the way: solve without risk, and continue from that plan."""
