@@ -153,6 +153,7 @@ def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_one
     assert solution.certificate.dynamics_residual <= 1e-8
     ls.save(solution, tmp_path / "hop.npz")
     loaded = ls.load(tmp_path / "hop.npz")
+    assert isinstance(loaded, ls.Solution)
     assert loaded.detail == solution.detail
     assert [(one.start, one.cost, one.status) for one in loaded.candidates] == [
         (one.start, one.cost, one.status) for one in solution.candidates
