@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -241,6 +241,14 @@ class Dynamics:
         details = ("dynamics", *names, *self.constants.items())
         made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
         return text_source(made["source"], f"{self.name}(x, u, p)")
+
+    def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
+        """The same with softer contacts and limits, the softest first, and what they are called.
+
+        Args:
+          states: (T+1, n) of a plan; where nothing touches along it, there are none.
+        """
+        return iter(())
 
     @cached_property
     def step_source(self) -> Source:

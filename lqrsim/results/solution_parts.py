@@ -258,7 +258,7 @@ class Multipliers:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of several starts that a search tried.
+    """One of several starts that a search tried; or a plan for softer contacts, of which the next one begins.
 
     Attributes:
       start: its name.

@@ -20,11 +20,13 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
-from lqrsim.scenes.mjcf_physics import MjcfPhysics
+from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches
 from lqrsim.scenes.scene import unlogged
 
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+
+SOFTER = 0.1, 0.03, 0.01, 0.003  # m or rad, of contacts and limits that are softened less and less
 
 _forming = threading.Lock()  # of teams
 
@@ -142,6 +144,15 @@ class MjcfDynamics(Dynamics):
     def curvature_source(self) -> Source | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """None: MuJoCo has no second derivatives."""
         return None
+
+    def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
+        if "softness" in self._stated or not np.isfinite(states).all() or not touches(self.physics.model, states):
+            return
+        for softness in SOFTER:
+            other = copy.copy(self)
+            other._stated = self._stated | {"softness": softness}
+            other._set_mjcf(self.xml, self.physics.model)
+            yield f"{softness:g}", other
 
     def period_near(self, dt: float) -> float:
         """The whole number of physics steps nearest to `dt`, in seconds."""

@@ -38,6 +38,7 @@ class MjcfPhysics:
       xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
+      softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 as in the MJCF.
 
     Attributes:
       model: MuJoCo's. numbers: what the kernel takes, with no wrench and no loads. team: the words that its threads
@@ -57,10 +58,13 @@ class MjcfPhysics:
         actuators: tuple[int, ...],
         obstacles: tuple[int, ...],
         loaded: bool = False,
+        softness: float = 0.0,
     ) -> None:
         self.model = model_from_xml(xml, name) if model is None else copy.copy(model)
         _check(self.model, name)
         _prepare(self.model, obstacles)
+        if softness > 0:
+            _soften(self.model, softness)
         self._exact = _for_distances(self.model)
         heavy = (self.model.body_treeid >= 0) & (self.model.body_mass > 0)
         self.carriers = tuple(np.flatnonzero(heavy).tolist())
@@ -156,6 +160,34 @@ def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
     option.tolerance = min(option.tolerance, _CONVERGED)
     if mujoco.__version__ == "4.0.0":
         option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse ones its Newton solver is wrong
+
+
+def _soften(model: mujoco.MjModel, width: float) -> None:
+    """Let the impedance of contacts and limits rise from zero, over at least this depth in m or rad.
+
+    By default `solimp` is "0.9 0.95 0.001": a contact that is just reached has 90 % of its impedance, and what arrives
+    there at speed is stopped or not. From zero, a step is continuous.
+    """
+    for solimp in (model.geom_solimp, model.pair_solimp, model.jnt_solimp, model.tendon_solimp_lim):
+        solimp[:, 0], solimp[:, 2] = 0.0, np.maximum(width, solimp[:, 2])
+    model.opt.o_solimp[0], model.opt.o_solimp[2] = 0.0, max(width, model.opt.o_solimp[2])
+
+
+def touches(model: mujoco.MjModel, states: Array) -> bool:
+    """Whether a contact or a limit acts at one of these states (k, n), as `kernels/mjcf_dynamics.py` has them."""
+    data, kinds = mujoco.MjData(model), mujoco.mjtConstraint.__members__
+    one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
+    unturned = np.zeros(model.nq)
+    for joint, kind in enumerate(model.jnt_type):
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            unturned[model.jnt_qposadr[joint] + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 0)] = 1.0
+    for state in states:
+        data.qpos[:] = unturned
+        mujoco.mj_integratePos(model, data.qpos, state[: model.nv], 1.0)
+        mujoco.mj_fwdPosition(model, data)
+        if np.isin(data.efc_type, one_sided).any():
+            return True
+    return False
 
 
 def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:

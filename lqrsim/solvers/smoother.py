@@ -61,7 +61,9 @@ def smooth(
         From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
         which cannot, it runs forwards.
       safeguard: where the method fails, continue from the best plan so far with steps that lower its cost; see
-        `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
+        `kernels/damped_iterations.py`. Where that, too, does not converge among contacts or joint limits of an MJCF,
+        and there is no start, plan for softer ones and go on from there; see docs/mjcf_robots.md. Where the method
+        converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
         the paper's test, which looks at the change of cost alone and can pass early.
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and

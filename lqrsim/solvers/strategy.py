@@ -8,6 +8,8 @@
   3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
   4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
+  5. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and
+     on to the true ones from there (`Search.soften`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
@@ -53,6 +55,8 @@ IDLE = 1e-6
 HEAVIER = (10.0, 100.0)
 # For a free duration: how often a shorter one is tried, by which factor, and with how many iterations.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
+# Iterations for each softness of contacts.
+SOFT = 60
 
 
 def solve(
@@ -88,6 +92,8 @@ def solve(
             search.look_aside()
         if problem.risk > 0 and settings.safeguard and not stop.due:
             search.retry_without_risk()
+    if default and settings.safeguard and not stop.due and not search.best[1].success:
+        search.soften()
     chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -150,6 +156,7 @@ class Search:
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._finished: list[tuple[SolveRun, RunResult]] = []
+        self._softer: list[Candidate] = []  # plans for softer contacts
 
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
@@ -277,6 +284,46 @@ class Search:
         other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
         self._finished.insert(0 if other else len(self._finished), (run, found))
 
+    def soften(self) -> None:
+        """Plan for softer contacts and limits, less and less soft, and then for the true ones.
+
+        Each solve begins with the policy of the one before, not with its controls: what comes to a contact a little
+        earlier or later must not lose the rest of the plan.
+        """
+        problem, begin = self._problem, None
+        for name, dynamics in problem.dynamics.softened(self.best[1].states):
+            run, found = self._solve_soft(dataclasses.replace(problem, dynamics=dynamics), begin)
+            self._softer.append(run.candidate(f"contacts of softness {name}", found))
+            if np.isfinite(found.cost):
+                begin = InitialGuess(found.law[0].copy(), found.law[1].copy(), None, None, f"softness {name}")
+            if self._budget.stop.due:
+                return
+        if begin is None:
+            return
+        run = self._another(replace(begin, summary="a plan for softer contacts"))
+        self._named.append(("a plan for softer contacts", run))
+        with problem.dynamics.solving(self._threads):
+            found = self._to_its_end(run, refine, self._known)
+        stages = ", ".join(one.start.removeprefix("contacts of softness ") for one in self._softer)
+        detail = f"begun with contacts of softness {stages}; {found.detail}".removesuffix("; ")
+        self._finished.append((run, replace(found, detail=detail)))
+        self._finished.sort(key=lambda pair: pair[1].rank)
+
+    def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
+        """Plan for softer contacts: from that policy, or by a search where there is none."""
+        if begin is not None:
+            run = self._another(begin, soft)
+            with soft.dynamics.solving(self._threads), run.budget.limited(SOFT):
+                return run, refine(run, Known())
+        given = guides(soft, None)
+        runs = [self._another(resolve(one, soft), soft) for _, one in given]
+        search = Search([name for name, _ in given], runs, self._callback, self._threads)
+        with soft.dynamics.solving(self._threads if len(runs) == 1 else 1):
+            search.run()
+            if search.is_unacceptable and not self._budget.stop.due:
+                search.widen()
+        return search.best
+
     def retry_without_risk(self) -> None:
         """If the risk was too high on the way: solve without risk, and continue from that plan."""
         if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
@@ -299,7 +346,7 @@ class Search:
         """All runs as candidates; none if there was one run."""
         results = {id(run): found for run, found in self._finished}
         found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
-        return tuple(found) if len(found) > 1 else ()
+        return (*found, *self._softer) if len(found) > 1 else ()
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         problem = self._problem if problem is None else problem

@@ -1,0 +1,167 @@
+"""Plans through contacts: models with softer contacts and limits, and what `smooth` does with them."""
+
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.scenes.scene import scene_from_xml
+
+OPTION = '<option timestep="0.005" tolerance="1e-14"/><compiler autolimits="true"/>'
+# A ball over the floor, a leg of two joints that hops, a pendulum that hangs between stops.
+FALLING = f"""<mujoco>{OPTION}<default><geom solimp="SOLIMP"/></default><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/><geom type="sphere" size="0.1" mass="MASS"/></body>
+  </worldbody><actuator><motor joint="z" gear="10"/></actuator></mujoco>"""
+LEG = f"""<mujoco>{OPTION}<default><geom solimp="SOLIMP"/></default><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.6"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="MASS"/>
+  <body><joint name="leg" type="slide" axis="0 0 1" range="-0.15 0.15" damping="2" stiffness="200"/>
+  <geom type="sphere" pos="0 0 -0.5" size="0.05" mass="0.2"/></body></body>
+  </worldbody><actuator><motor joint="leg" gear="60" ctrlrange="-1 1"/></actuator></mujoco>"""
+STOPS = f"""<mujoco>{OPTION}<default><joint solimplimit="SOLIMP"/></default><worldbody><body>
+  <joint name="swing" axis="0 1 0" range="-60 60" damping="0.01"/><geom type="capsule" fromto="0 0 0 0 0 -0.5"
+  size="0.03" mass="MASS"/></body></worldbody><actuator><motor joint="swing" gear="5" ctrlrange="-1 1"/></actuator>
+  </mujoco>"""
+FILES = {"falling": FALLING, "leg": LEG, "stops": STOPS}
+# A state of each that touches, with its depth as the first argument, and its speed as the second.
+TOUCHING = {
+    "falling": lambda depth, speed: [-depth, -speed],
+    "leg": lambda depth, speed: [-0.05 - depth, 0.0, -speed, 0.0],
+    "stops": lambda depth, speed: [np.pi / 3 + depth, speed],
+}
+MASSES, SPEEDS, STARTS = st.floats(0.2, 5.0), st.floats(0.5, 3.0), st.floats(0.5, 0.95)
+
+
+def text_of(kind: str, mass: float, solimp: str) -> str:
+    return FILES[kind].replace("MASS", repr(mass)).replace("SOLIMP", solimp)
+
+
+@cache
+def robot_of(kind: str, mass: float, solimp: str = "0.9 0.95 0.001") -> ls.MjcfRobot:
+    return ls.MjcfRobot(scene_from_xml(text_of(kind, mass, solimp), kind))
+
+
+def softer(robot: ls.MjcfRobot, state: Array) -> dict[str, ls.Dynamics]:
+    return dict(robot.dynamics.softened(state[None, :]))
+
+
+def stepped(xml: str, state: Array, control: Array, steps: int) -> Array:
+    """By MuJoCo's bindings; all joints are slides and hinges."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = *np.split(state, 2), control
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+    return np.concatenate([data.qpos, data.qvel])
+
+
+@pytest.mark.parametrize("kind", FILES)
+@settings(max_examples=8)
+@given(mass=MASSES, speed=SPEEDS, begin=STARTS, depth=st.floats(1e-4, 0.02), which=st.sampled_from((0.1, 0.01)))
+def test_a_softer_model_is_mujocos_with_another_solimp(
+    kind: str, mass: float, speed: float, begin: float, depth: float, which: float
+) -> None:
+    robot = robot_of(kind, mass, f"{begin} 0.95 0.002")
+    state, control = np.array(TOUCHING[kind](depth, speed)), np.array([0.3])
+    dynamics = softer(robot, state)[f"{which:g}"]
+    want = stepped(text_of(kind, mass, f"0 0.95 {which}"), state, control, 4)
+    # Both are MuJoCo's, with its solver to 1e-14.
+    np.testing.assert_allclose(dynamics.step(state, control, 0.02), want, rtol=0, atol=1e-11)
+    own = stepped(text_of(kind, mass, f"{begin} 0.95 0.002"), state, control, 4)
+    np.testing.assert_allclose(robot.dynamics.step(state, control, 0.02), own, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", FILES)
+@settings(max_examples=8)
+@given(mass=MASSES, speed=SPEEDS)
+def test_a_softer_step_is_continuous_where_a_contact_or_a_limit_is_just_reached(
+    kind: str, mass: float, speed: float
+) -> None:
+    robot, control = robot_of(kind, mass), np.zeros(1)
+
+    def jump(dynamics: ls.Dynamics) -> float:
+        sides = [dynamics.step(np.array(TOUCHING[kind](depth, speed)), control, 0.005) for depth in (1e-6, -1e-6)]
+        return float(np.abs(sides[0] - sides[1]).max())
+
+    # A micrometre in, a spring of the default stops a good part of the speed. The impedance of a soft one is MuJoCo's
+    # least, 1e-4, of forces that change speed by half of itself in a step, on each of four edges of a friction cone.
+    assert jump(robot.dynamics) > 0.05 * speed
+    for dynamics in softer(robot, np.array(TOUCHING[kind](1e-3, speed))).values():
+        assert jump(dynamics) < 5e-4 * max(speed, 1.0)
+
+
+@pytest.mark.parametrize("kind", FILES)
+@settings(max_examples=8)
+@given(mass=MASSES, speed=SPEEDS)
+def test_derivatives_of_a_softer_step_are_its_differences(kind: str, mass: float, speed: float) -> None:
+    robot, control = robot_of(kind, mass), np.array([0.2])
+    state = np.array(TOUCHING[kind](0.01, speed))
+    dynamics = softer(robot, state)["0.1"]
+    a, b, _ = dynamics.linearize(state, control, 0.02)
+    xml, n, far = text_of(kind, mass, "0 0.95 0.1"), len(state), 1e-5
+    for k in range(n + 1):
+        move = far * np.eye(n + 1)[k]
+        sides = [stepped(xml, state + sign * move[:n], control + sign * move[n:], 4) for sign in (1, -1)]
+        # Differences by 1e-5 and by 1e-6: their error is some 1e3 times the square of that.
+        want = (sides[0] - sides[1]) / (2 * far)
+        np.testing.assert_allclose(np.hstack([a, b])[:, k], want, rtol=0, atol=1e-5)
+
+
+def test_where_nothing_touches_there_is_nothing_to_soften() -> None:
+    robot = robot_of("falling", 1.0)
+    assert softer(robot, robot.at(z=0.5)) == {}
+    (first, *_) = softer(robot, robot.at(z=-0.01)).values()
+    assert list(first.softened(robot.at(z=-0.01)[None, :])) == []  # nor of what is soft already
+
+
+def hop(robot: ls.MjcfRobot) -> ls.Problem:
+    """The leg falls, and is to be higher than where it stands at the end."""
+    low, high = robot.dynamics.control_coordinates.low, robot.dynamics.control_coordinates.high
+    return ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=30, initial=ls.FixedState(robot.at(z=0.05)),
+        stage_cost=ls.ControlCost([0.01]), final_cost=ls.QuadraticCost([100.0, 1.0, 1.0, 0.1], about=robot.at(z=0.1)),
+        control_limits=(low, high),
+    )  # fmt: skip
+
+
+def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_ones(tmp_path: Path) -> None:
+    robot = robot_of("leg", 1.0)
+    problem = hop(robot)
+    solution = ls.smooth(problem, max_iterations=12)
+    assert not solution.success  # or nothing is softened
+    names = [one.start for one in solution.candidates]
+    stages = [f"contacts of softness {width}" for width in (0.1, 0.03, 0.01, 0.003)]
+    assert [name for name in names if "softness" in name] == stages
+    # With a start, as here the one that it has by default, nothing is softened. Nothing is lost by softening.
+    plain = ls.smooth(problem, max_iterations=12, start=problem.nominal_control)
+    assert all("softness" not in one.start for one in plain.candidates)
+    assert solution.cost <= plain.cost
+    if "a plan for softer contacts" in names and "softness" in solution.detail:
+        assert solution.detail.startswith("begun with contacts of softness 0.1, 0.03, 0.01, 0.003")
+    # The plan is of the true model: MuJoCo's own steps from its controls.
+    state = solution.trajectory.states[0]
+    for control, planned in zip(solution.trajectory.controls, solution.trajectory.states[1:], strict=True):
+        state = stepped(robot.scene.xml, state, control, 4)
+        np.testing.assert_allclose(state, planned, rtol=0, atol=1e-8)
+        state = planned
+    assert solution.certificate is not None
+    assert solution.certificate.dynamics_residual <= 1e-8
+    ls.save(solution, tmp_path / "hop.npz")
+    loaded = ls.load(tmp_path / "hop.npz")
+    assert isinstance(loaded, ls.Solution)
+    assert loaded.detail == solution.detail
+    assert [(one.start, one.cost, one.status) for one in loaded.candidates] == [
+        (one.start, one.cost, one.status) for one in solution.candidates
+    ]
+
+
+def test_the_time_limit_ends_the_solves_for_softer_contacts_too() -> None:
+    robot = robot_of("leg", 1.0)
+    solution = ls.smooth(hop(robot), time_limit=1e-6)
+    assert solution.status is ls.Status.TIME_LIMIT
+    assert all("softness" not in one.start for one in solution.candidates)
