@@ -129,7 +129,13 @@ class SimulatorPhysics(Physics):
 
     def prepare(self, *, altered: bool) -> None:
         self._simulations = self._simulator.start(self._states, self._factors, self.plant.timestep)
-        self._states = self._simulator.states(self._simulations)
+        self._look()
+
+    def _look(self) -> None:
+        """Read the states, all NaN where one is not finite."""
+        self._states = np.array(self._simulator.states(self._simulations))
+        lost = ~np.isfinite(self._states).all(axis=1)
+        self._states[lost], self.unstable[lost] = np.nan, True
 
     def state(self) -> Array:
         return self._states.copy()
@@ -146,8 +152,7 @@ class SimulatorPhysics(Physics):
         period = Period([], [], [], np.full(len(controls), self.parts))
         for part in range(self.parts):
             self._simulator.step(self._simulations, controls, wrench, wind, self._part)
-            self._states = self._simulator.states(self._simulations)
-            self.unstable |= ~np.isfinite(self._states).all(axis=1)
+            self._look()
             period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
             period.states.append(self.state())
             period.frames.append(self.frame())
@@ -156,7 +161,7 @@ class SimulatorPhysics(Physics):
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         self._simulator.place(self._simulations, self._states + jumps)
-        self._states = self._simulator.states(self._simulations)
+        self._look()
         period.states[-1], period.frames[-1] = self.state(), self.frame()
 
 

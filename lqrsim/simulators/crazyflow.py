@@ -15,6 +15,7 @@ from lqrsim.simulation.simulator import PARAMETERS, Simulator
 from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
 from lqrsim.versions import versions_of
 
+DRONES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")
 INTEGRATORS = ("euler", "rk4", "symplectic_euler")
 
 
@@ -32,7 +33,8 @@ class Crazyflow(Simulator):
       integrator: "rk4", "euler" or "symplectic_euler".
 
     Raises:
-      InputError: crazyflow is not installed; there is no such drone or integrator.
+      InputError: there is no such drone or integrator. Its first use: crazyflow is not installed, or SciPy was imported
+        without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
     """
 
     drone: str = "cf21B_500"
@@ -45,8 +47,7 @@ class Crazyflow(Simulator):
     def __post_init__(self) -> None:
         object.__setattr__(self, "timestep", check_number("Crazyflow: timestep", self.timestep, above=0.0))
         check_name("Crazyflow: integrator", self.integrator, INTEGRATORS)
-        drones = [one.value for one in package("crazyflow.drones", "crazyflow").Drone]
-        check_name("Crazyflow: drone", self.drone, [one for one in drones if one.startswith("cf")])
+        check_name("Crazyflow: drone", self.drone, DRONES)
 
     @property
     def weight(self) -> float:

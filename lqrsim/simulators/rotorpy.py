@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lqrsim.errors import Array, InputError, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
@@ -17,6 +17,7 @@ from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
 from lqrsim.versions import versions_of
 
 GRAVITY = 9.81  # m/s2, RotorPy's
+POSITIVE = ("mass", "Ixx", "Iyy", "Izz", "k_eta", "k_m", "rotor_speed_max")  # numbers of a vehicle
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class RotorPy(Simulator):
     """
 
     vehicle: str | Mapping[str, Any] = "hummingbird"
-    timestep: float = 1 / 30
+    timestep: float = 0.01
 
     name = "RotorPy"
     parameters = PARAMETERS
@@ -56,20 +57,27 @@ class RotorPy(Simulator):
                 ) from None
         if not isinstance(vehicle, Mapping):
             raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want a name, or RotorPy's quad_params")
-        missing = [key for key in ("mass", "Ixx", "Iyy", "Izz", "rotor_pos", "k_eta", "k_m") if key not in vehicle]
-        if missing:
+        if missing := [key for key in (*POSITIVE, "rotor_pos", "rotor_directions") if key not in vehicle]:
             raise InputError(f"RotorPy: vehicle: got one without {', '.join(missing)}, want RotorPy's quad_params")
-        if vehicle.get("motor_noise_std", 0):
+        for key in POSITIVE:
+            check_number(f"RotorPy: vehicle: {key}", vehicle[key], above=0.0)
+        for key in ("rotor_speed_min", "k_d"):
+            check_number(f"RotorPy: vehicle: {key}", vehicle.get(key, 0.0), at_least=0.0)
+        if noise := check_number("RotorPy: vehicle: motor_noise_std", vehicle.get("motor_noise_std", 0.0)):
             raise InputError(
-                f"RotorPy: vehicle: got motor_noise_std {vehicle['motor_noise_std']:g}, want 0: its generator is shared"
-                " by all trials; use ControlNoise"
+                f"RotorPy: vehicle: got motor_noise_std {noise:g}, want 0: its generator is shared by all trials; use"
+                " ControlNoise"
             )
         object.__setattr__(self, "vehicle", dict(vehicle))
+        _ = self._frame
 
     @cached_property
     def _frame(self) -> Frame:
+        places = check_kind("RotorPy: vehicle: rotor_pos", self._numbers["rotor_pos"], Mapping, "name -> place")
         return Frame.of(
-            "RotorPy: vehicle", np.array([*self._numbers["rotor_pos"].values()]), self._numbers["rotor_directions"]
+            "RotorPy: vehicle",
+            check_array("RotorPy: vehicle: rotor_pos", [*places.values()], (4, 3)),
+            check_array("RotorPy: vehicle: rotor_directions", self._numbers["rotor_directions"], (4,)),
         )
 
     @property
@@ -106,7 +114,7 @@ class RotorPy(Simulator):
             "mass": of["mass"], "inertia": (of["Ixx"] + of["Iyy"]) / 2, "yaw_inertia": of["Izz"],
             "arm": self._frame.arm, "torque_ratio": of["k_m"] / of["k_eta"], "gravity": GRAVITY,
             "drag": 4 * self.hover_speed * of.get("k_d", 0.0), "max_force": of["k_eta"] * of["rotor_speed_max"] ** 2,
-            "min_force": of["k_eta"] * of["rotor_speed_min"] ** 2,
+            "min_force": of["k_eta"] * of.get("rotor_speed_min", 0.0) ** 2,
         }  # fmt: skip
         return Quadrotor(**numbers | changes)
 
@@ -181,7 +189,8 @@ def pushed_multirotor() -> Any:
         def _s_dot_fn(self, t: float, s: Array, cmd_rotor_speeds: Array) -> Array:
             rate = super()._s_dot_fn(t, s, cmd_rotor_speeds)
             rate[3:6] += self.pushed[:3] / self.mass
-            rate[10:13] += self.inv_inertia @ Rotation.from_quat(s[6:10]).inv().apply(self.pushed[3:])
+            if self.pushed[3:].any():
+                rate[10:13] += self.inv_inertia @ Rotation.from_quat(s[6:10]).as_matrix().T @ self.pushed[3:]
             return rate
 
     return Pushed

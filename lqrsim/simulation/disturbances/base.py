@@ -79,12 +79,11 @@ class Effect:
         wanted = "a function of the step, states and controls, or None"
         check_function("Effect: kick", self.kick, wanted, arguments=3)
         if self.factors is not None:
-            factors = {
-                check_name("Effect: factors", name, PARAMETERS): shaped(
-                    f"Effect: factors: {name}", values, (None, None)
-                )
-                for name, values in self.factors.items()
-            }
+            factors = {check_name("Effect: factors", name, PARAMETERS): one for name, one in dict(self.factors).items()}
+            for name, one in factors.items():
+                factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
+                if not (factors[name] > 0).all():
+                    raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")
             object.__setattr__(self, "factors", factors)
         if self.displaced is not None:
             displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
