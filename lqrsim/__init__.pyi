@@ -5,6 +5,7 @@ from . import lq as lq
 from . import robots as robots
 from . import rotations as rotations
 from . import scenarios as scenarios
+from . import simulators as simulators
 from . import stress as stress
 from . import types as types
 from . import view as view

@@ -22,8 +22,9 @@ from lqrsim.simulation.disturbances import (
     TorqueNoise,
     WheelRadiusMismatch,
 )
-from lqrsim.simulation.disturbances.mismatch import bodies, cut_normal
-from lqrsim.simulation.physics import Physics
+from lqrsim.simulation.disturbances.mismatch import cut_normal
+from lqrsim.simulation.effects import Effects, seeded
+from lqrsim.simulation.mujoco_physics import MujocoPhysics, bodies
 from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30
@@ -41,9 +42,8 @@ def cage():
 
 def altered(plant, mismatch, trials=400):
     """The simulations of a mismatch, without running them."""
-    physics = Physics(plant, trials, 1, contacts=True, threads=1)
-    effect = mismatch.start(plant, hover(1).trajectory, [np.random.default_rng(trial) for trial in range(trials)])
-    effect.alter(physics.simulations)
+    physics = MujocoPhysics(plant, trials, 1, contacts=True, threads=1)
+    Effects(plant, hover(1).trajectory, [mismatch], range(trials), seeded(0)).alter_models(physics)
     physics.simulations.set_const()
     return physics.simulations
 

@@ -26,7 +26,7 @@ FLOORS = (
     ("solvers",),
     ("control",),
     ("simulation",),
-    ("scenarios", "templates"),
+    ("scenarios", "simulators", "templates"),
     ("stress",),
     ("view",),
     ("gym", "bridge"),
@@ -65,7 +65,7 @@ FLOORS_WITHIN = {
         ("problem",),
     ),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
-    "simulation": (("plant_validation", "plant"), ("physics",), ("disturbances",)),
+    "simulation": (("plant_validation", "plant", "simulator"), ("physics", "mujoco_physics"), ("disturbances",)),
 }
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.

@@ -110,7 +110,8 @@ def vehicle(robot: ls.Quadrotor) -> dict[str, Any]:
     corners = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     return dict.fromkeys(unused, 0.0) | {
         "mass": robot.mass,
-        **dict.fromkeys(("Ixx", "Iyy", "Izz"), robot.inertia),
+        **dict.fromkeys(("Ixx", "Iyy"), robot.inertia),
+        "Izz": robot.inertia if robot.yaw_inertia is None else robot.yaw_inertia,
         "num_rotors": 4,
         "rotor_pos": {f"r{i + 1}": robot.arm * corner for i, corner in enumerate(corners)},
         "rotor_directions": np.array([1, -1, 1, -1]),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.errors import Array, vectors_of
+from lqrsim.errors import Array, check_number, vectors_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.base import Robot, configuration_of
 
@@ -22,11 +22,13 @@ class Quadrotor(Robot):
     Attributes:
       mass: in kg.
       inertia: in kg m^2, about each axis.
+      yaw_inertia: about the body's z axis instead, in kg m^2; None for the same.
       arm: in m, from the centre of mass to a rotor.
       torque_ratio: in N m of a rotor's drag per N of its force; the paper's k_m.
       drag: in N s/m, against the velocity; the paper's k_v.
       gravity: in m/s^2.
-      max_force: in N, of a rotor; the least is 0.
+      max_force: in N, of a rotor.
+      min_force: likewise, the least.
       radius: in m, of the collision sphere.
 
     Raises:
@@ -41,6 +43,8 @@ class Quadrotor(Robot):
     gravity: float = 9.8
     max_force: float = 3.71
     radius: float = 0.3
+    yaw_inertia: float | None = None
+    min_force: float = 0.0
 
     name = "quadrotor"
     body = "quadrotor"
@@ -55,8 +59,11 @@ class Quadrotor(Robot):
     def __post_init__(self) -> None:
         self._check(
             above_zero=("mass", "inertia", "arm", "max_force", "radius"),
-            at_least_zero=("torque_ratio", "drag", "gravity"),
+            at_least_zero=("torque_ratio", "drag", "gravity", "min_force"),
         )
+        if self.yaw_inertia is not None:
+            self._check(above_zero=("yaw_inertia",))
+        check_number("Quadrotor: min_force", self.min_force, below=self.max_force)
 
     @property
     def hover_force(self) -> float:
@@ -84,16 +91,25 @@ class Quadrotor(Robot):
 def _dynamics(robot: Quadrotor) -> Dynamics:
     units = {"x y z": "m", "vx vy vz": "m/s", "rx ry rz": "rad", "wx wy wz": "rad/s"}
     constants = ("mass", "inertia", "arm", "torque_ratio", "drag", "gravity")
+    if robot.yaw_inertia is not None:
+        constants += ("yaw_inertia",)
     return Dynamics(
-        _rate,
+        _rate if robot.yaw_inertia is None else _rate_with_two_inertias,
         states={name: unit for names, unit in units.items() for name in names.split()},
         controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
         parameters={name: getattr(robot, name) for name in constants},
         disturbances={f"{what}_{axis}": 0.0 for what in ("wind", "force", "torque") for axis in "xyz"},
         position=("x", "y", "z"),
         rotation_vectors=(("rx", "ry", "rz"),),
-        control_limits=(0.0, robot.max_force),
+        control_limits=(robot.min_force, robot.max_force),
     )
+
+
+def _rate_with_two_inertias(x: Any, u: Any, p: Any) -> list[Any]:
+    """As `_rate`, with J = diag(inertia, inertia, yaw_inertia) and the gyroscopic torque -w x J w."""
+    *rate, x_rate, y_rate, z_rate = _rate(x, u, p)
+    gyroscopic = (p.yaw_inertia - p.inertia) / p.inertia * x[11]
+    return [*rate, x_rate - gyroscopic * x[10], y_rate + gyroscopic * x[9], z_rate * p.inertia / p.yaw_inertia]
 
 
 def _rate(x: Any, u: Any, p: Any) -> list[Any]:

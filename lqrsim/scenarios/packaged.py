@@ -18,6 +18,7 @@ from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.simulator import Simulator
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, resolve
 
 
@@ -37,6 +38,7 @@ class Scenario:
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
+      simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Scenario:
     paper_start: InitialPrior | None = None
     goal_radius: float | None = None
     goal_tolerance: float | None = None
+    simulator: Simulator | None = None
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
         """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
@@ -91,11 +94,12 @@ class Scenario:
         object.__setattr__(self, "disturbances", found)
         if not is_function(self.start):  # a function is called when the scenario is solved
             resolve(self.start, self.problem)
+        check_kind("Scenario: simulator", self.simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
-        """The robot in its scene, ready to run in MuJoCo."""
-        return Plant(self.robot, self.scene)
+        """The robot in its scene, ready to run."""
+        return Plant(self.robot, self.scene, self.simulator)
 
 
 def names() -> list[str]:

@@ -20,7 +20,8 @@ from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import Effects
-from lqrsim.simulation.physics import Physics
+from lqrsim.simulation.mujoco_physics import MujocoPhysics
+from lqrsim.simulation.physics import Physics, SimulatorPhysics
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.recorder import Recorder
 from lqrsim.simulation.run_settings import RunSettings
@@ -45,7 +46,7 @@ def simulate(
     progress: Callable[[int, int], object] | None = None,
     watch: Callable[[float, Array, npt.NDArray[np.bool_]], object] | None = None,
 ) -> Rollout:
-    """Run a policy, or anything else that controls, closed-loop in MuJoCo, from the first state of a plan.
+    """Run a policy, or anything else that controls, closed-loop in the plant's physics, from a plan's first state.
 
     In each control period: read the true state, measure it, compute the control, disturb it, saturate it, apply
     disturbing forces, step the physics, and let the state jump.
@@ -71,7 +72,8 @@ def simulate(
         `results/goal.py` has the details.
       frames: whether to record the data for drawing, also between the control periods; without it there is no video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
-        through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome.
+        through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome. In
+        another simulator than MuJoCo it always moves through them.
       threads: number of MuJoCo's threads; by default one per processor.
       generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
       progress: called after each control period with the number of finished periods and that of all.
@@ -110,9 +112,9 @@ class ClosedLoop:
         self.settings = settings
         plant, plan, trials = settings.plant, settings.trajectory, settings.trials
         self.effects = Effects(plant, plan, settings.disturbances, settings.numbers, settings.random_streams)
-        self.physics = Physics(plant, trials, settings.substeps, contacts=settings.contacts, threads=settings.threads)
+        self.physics = self._physics()
         self.physics.place(self.effects.initial_states(np.tile(plan.states[0], (trials, 1))))
-        self.effects.alter_models(plant, self.physics.simulations)
+        self.effects.alter_models(self.physics)
         with unlogged():
             self.physics.prepare(altered=self.effects.alters_models)
         name = f"{type(settings.law).__name__}.start"
@@ -124,6 +126,13 @@ class ClosedLoop:
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
         self.step, self.measured = 0, self.states
+
+    def _physics(self) -> Physics:
+        plant, trials, substeps = self.settings.plant, self.settings.trials, self.settings.substeps
+        if plant.simulator is not None:
+            return SimulatorPhysics(plant, plant.simulator, trials, substeps)
+        contacts, threads = self.settings.contacts, self.settings.threads
+        return MujocoPhysics(plant, trials, substeps, contacts=contacts, threads=threads)
 
     def run(self) -> None:
         """Run all control periods; fewer if all trials have ended."""
@@ -143,10 +152,10 @@ class ClosedLoop:
         step = self.step
         commands = self.decide(step, self.measured)
         controls = self.actuate(step, commands)
-        wrench = self.push(step)
+        wrench, wind = self.push(step)
         if self.records.over(step).all():
             return False
-        self.advance(step, controls, wrench)
+        self.advance(step, controls, wrench, wind)
         self.step, self.measured = step + 1, self.measure(step + 1)
         return True
 
@@ -181,20 +190,20 @@ class ClosedLoop:
         self.records.applied[:, step] = controls
         return controls
 
-    def push(self, step: int) -> Array:
-        """The disturbing forces in N and torques in N m, (K, 6)."""
-        wrench = self.effects.push(step, self.states)
+    def push(self, step: int) -> tuple[Array, Array]:
+        """The disturbing forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3)."""
+        wrench, wind = self.effects.push(step, self.states)
         self.records.wrench[:, step] = wrench
-        return wrench
+        return wrench, wind
 
-    def advance(self, step: int, controls: Array, wrench: Array) -> None:
+    def advance(self, step: int, controls: Array, wrench: Array, wind: Array) -> None:
         """Advance the physics to the next knot. Obstacles stop a trial from the period of its first collision on."""
         physics, over = self.physics, self.records.over(step)
-        period, kick = physics.advance(controls, wrench), self.effects.kick(step, self.states, controls)
+        period, kick = physics.advance(controls, wrench, wind), self.effects.kick(step, self.states, controls)
         if kick is not None:
             physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
-        if self.settings.contacts:
+        if physics.solidifies:
             if len(collided):
                 physics.rerun_with_contacts(collided, period)
                 if kick is not None:
@@ -270,7 +279,7 @@ class ClosedLoop:
             disturbances=tuple(disturbance.describe(plant) for disturbance in settings.disturbances),
             seed=settings.seed,
             first_trial=settings.first_trial,
-            versions=versions(),
+            versions=versions() | (plant.simulator.versions if plant.simulator is not None else {}),
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
             controller_run=self.controller_run,
         )

@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
 
 MakeGenerator = Callable[[int, int], np.random.Generator]
@@ -48,19 +48,24 @@ class Effects:
         if not np.isfinite(self.displaced).all():
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
-        self._pushes = [(slice(0, 3), *hook) for hook in self._hooks("force")]
-        self._pushes += [(slice(3, 6), *hook) for hook in self._hooks("torque")]
         self._kicks = self._hooks("kick")
+        # To which of force, torque and wind each adds, and times what. Without a wind of a simulator it is a force.
+        blown = plant.simulator is not None and plant.simulator.wind
+        wind = (slice(6, 9), 1.0) if blown else (slice(0, 3), plant.robot.drag)
+        self._pushes = [(slice(3, 6), 1.0, *hook) for hook in self._hooks("torque")]
+        for one in self._effects:
+            self._pushes += [(slice(0, 3), 1.0, *hook) for hook in self._hooks("force", [one])]
+            self._pushes += [(*wind, *hook) for hook in self._hooks("wind", [one])]
 
-    def _hooks(self, kind: str) -> list[tuple[str, Any]]:
-        """The hooks of one kind, each with its label for messages."""
-        given = [(name, getattr(effect, kind)) for name, effect in self._effects]
+    def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
+        """The hooks of one kind, of all effects or these, each with its label for messages."""
+        given = [(name, getattr(effect, kind)) for name, effect in effects or self._effects]
         return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
 
     @property
     def alters_models(self) -> bool:
         """Whether a trial has a model of its own."""
-        return bool(self.displaced.any()) or any(effect.alter for _, effect in self._effects)
+        return bool(self.displaced.any()) or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def initial_states(self, states: Array) -> Array:
         """The first states of the trials (K, n), from those of the plan. Raises InputError unless they are finite."""
@@ -72,13 +77,17 @@ class Effects:
             raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
 
-    def alter_models(self, plant: Plant, simulations: batch.Batch) -> None:
+    def alter_models(self, physics: Physics) -> None:
         """Alter the models of the trials; `Physics.prepare` must follow."""
-        for _, effect in self._effects:
+        for name, effect in self._effects:
+            for parameter, factors in (effect.factors or {}).items():
+                columns = len(physics.plant.ctrl) if parameter == "thrust" else 1
+                shape = len(self.displaced), columns
+                physics.multiply(parameter, shaped(f"{name}: factors: {parameter}", factors, shape))
             if effect.alter is not None:
-                effect.alter(simulations)
+                physics.alter(name, effect.alter)
         if self.displaced.any():
-            plant.displace(simulations, self.displaced)
+            physics.displace(self.displaced)
 
     def measure(self, step: int, states: Array) -> Array:
         """The measured states (K, n), from the true ones."""
@@ -93,12 +102,15 @@ class Effects:
             controls = shaped(name, actuate(step, controls), controls.shape)
         return controls
 
-    def push(self, step: int, states: Array) -> Array:
-        """The forces in N and torques in N m in the true states (K, n), along the world's axes, (K, 6)."""
-        wrench = np.zeros((len(states), 6))
-        for which, name, push in self._pushes:
-            wrench[:, which] += shaped(name, push(step, states), (len(states), 3))
-        return wrench
+    def push(self, step: int, states: Array) -> tuple[Array, Array]:
+        """The forces in N and torques in N m in the true states (K, n), (K, 6), and the wind in m/s, (K, 3).
+
+        All are along the world's axes.
+        """
+        pushed = np.zeros((len(states), 9))
+        for which, factor, name, push in self._pushes:
+            pushed[:, which] += factor * shaped(name, push(step, states), (len(states), 3))
+        return pushed[:, :6], pushed[:, 6:]
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:
         """The jump of the states at the end of a period, (K, n), for the applied controls; None for none."""

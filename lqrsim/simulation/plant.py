@@ -1,4 +1,7 @@
-"""A robot in a scene: the MuJoCo model of both, and the places of the robot's states and actuators in it."""
+"""A robot in a scene: the MuJoCo model of both, and the places of the robot's states and actuators in it.
+
+With a `Simulator` the robot moves as that says; the MuJoCo model then has the obstacles and the pictures.
+"""
 
 import copy
 import math
@@ -19,6 +22,7 @@ from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import ROW, World, signed_distance
 from lqrsim.simulation import plant_validation
+from lqrsim.simulation.simulator import Simulator
 
 MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
 MOST_SUBSTEPS = 20_000  # physics steps in a control period
@@ -32,6 +36,7 @@ class Plant:
     Attributes:
       robot: the robot, with its dynamics and limits.
       scene: the scene, with its MJCF and obstacles.
+      simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
       geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
       balls, places: the robot's balls and their centres; None if it is one ball at its position.
       world: the obstacles for the robot's geoms, its balls or its position; none without any.
@@ -46,15 +51,16 @@ class Plant:
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
-        do not fit these; or its position is not that of its body in MuJoCo.
+        do not fit these; or its position is not that of its body in MuJoCo. The simulator cannot simulate the robot.
     """
 
-    def __init__(self, robot: Robot, scene: Scene) -> None:
+    def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
+        check_kind("simulator", simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
         plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
-        self.robot, self.scene = robot, scene
+        self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, instead of the MJCF's
         self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
         self.geoms = geoms_in(robot, scene)
@@ -80,10 +86,39 @@ class Plant:
         except ValueError as error:
             raise InputError(f"scene {scene.name}: got an MJCF that cannot be run in batches: {error}") from None
         plant_validation.check_maps(self)
+        if simulator is not None:
+            if self.obstacles != self.world.names:
+                raise InputError(
+                    f"simulator: got {simulator.name} for robot {robot.name}, which has neither a position nor balls to"
+                    f" find its collisions by, want one that has"
+                )
+            simulator.check(robot)
 
     @property
     def timestep(self) -> float:
+        if self.simulator is not None:
+            return self._step or self.simulator.timestep
         return float(self.model.opt.timestep)
+
+    @property
+    def weight(self) -> float:
+        """Weight of the robot in N."""
+        if self.simulator is not None:
+            return self.simulator.weight
+        return float(self.model.body_subtreemass[self.body] * np.linalg.norm(self.model.opt.gravity))
+
+    def check_simulator(self, what: str, parameter: str | None = None) -> None:
+        """Check that a disturbance can change a parameter of the physics.
+
+        Args:
+          what: the disturbance.
+          parameter: "mass", "inertia" or "thrust"; None for one that only MuJoCo's models have.
+
+        Raises:
+          InputError: it cannot.
+        """
+        if self.simulator is not None and parameter not in self.simulator.parameters:
+            raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, which cannot have it")
 
     def for_period(self, period: float) -> "Plant":
         """The same plant with the longest physics step, up to its own, that divides a control period.
@@ -114,17 +149,20 @@ class Plant:
         """
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
+        whose, larger = f"scene {self.scene.name}", "a larger <option timestep=.../> there"
+        other = f'; or set <option timestep="{period / max(round(min(steps, 1e9)), 1):.17g}"/> there'
+        if self.simulator is not None:
+            whose, larger, other = self.simulator.name, "a larger one", ""
         if steps > MOST_SUBSTEPS:
             count = f"{steps:,.0f}" if steps < 1e12 else f"{steps:.3g}"
             raise InputError(
-                f"control period: got {period:g} s, {count} physics steps of scene {self.scene.name},"
-                f" want at most {MOST_SUBSTEPS:,}: a larger <option timestep=.../> there than {self.timestep:g} s"
+                f"control period: got {period:g} s, {count} physics steps of {whose},"
+                f" want at most {MOST_SUBSTEPS:,}: {larger} than {self.timestep:g} s"
             )
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
-                f"control period: got {period:g} s, want a multiple of the physics step of scene {self.scene.name},"
-                f" {self.timestep:g} s: plant.for_period({period:g}); or set <option"
-                f' timestep="{period / max(round(steps), 1):.17g}"/> there'
+                f"control period: got {period:g} s, want a multiple of the physics step of {whose},"
+                f" {self.timestep:g} s: plant.for_period({period:g}){other}"
             )
         return round(steps)
 

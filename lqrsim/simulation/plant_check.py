@@ -24,7 +24,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
-from lqrsim.simulation.physics import UNSTABLE
+from lqrsim.simulation.mujoco_physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 
 MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one

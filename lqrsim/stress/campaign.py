@@ -200,7 +200,9 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
     """Solve for the policies, store them, and write the manifest; or check the one that is there."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
-        "model": sha256(scenario.scene.xml),
+        "model": sha256(
+            scenario.scene.xml if scenario.simulator is None else f"{scenario.simulator} {scenario.scene.xml}"
+        ),
         "problem": scenario.problem.digest,
         "start": solving.digest_of_start(scenario),
         "solution": None if given is None else digest_of_solution(given),
@@ -232,7 +234,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(
                 f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
             )
-    for field, what in (("model", "MJCF"), ("problem", "problem"), ("start", "start")):
+    for field, what in (("model", "MJCF or simulator"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
             raise InputError(f"scenario: got another {what} than {folder} was begun with, want another folder")
     if specification["solution"] != manifest["solution"]:

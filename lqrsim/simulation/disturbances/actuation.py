@@ -201,6 +201,7 @@ class ActuatorLoss(Disturbance):
     def check(self, plant: Plant) -> None:
         if self.actuator is not None:
             check_name(f"ActuatorLoss: actuator of {plant.robot.name}", self.actuator, plant.robot.actuators)
+        plant.check_simulator("ActuatorLoss")
         check_gains(self, plant)
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:

@@ -7,7 +7,7 @@ plant that cannot have it; `uncertainty` describes it to filters, tracking laws 
 """
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -16,10 +16,21 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.control.uncertainty import Uncertainty, Unknown, possible_unknowns
-from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_function,
+    check_name,
+    check_number,
+    excerpt,
+    real,
+    shaped,
+)
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.simulator import PARAMETERS
 
 Hook = Callable[[int, Array], Array]
 Kick = Callable[[int, Array, Array], Array]
@@ -34,34 +45,46 @@ class Effect:
 
     Attributes:
       initial_states: (first states of the plan (K, n)) -> first states of the trials, (K, n).
-      alter: called once, before the first step, with the simulations; gives each trial its own values of fields of
-        the model with `simulations.expand(field)`, whose first axis is the trial.
+      factors: "mass", "inertia" -> (K, 1) or "thrust" -> (K, actuators), factors of these parameters of the robot.
+      alter: called once, before the first step, with MuJoCo's simulations; gives each trial its own values of fields of
+        the model with `simulations.expand(field)`, whose first axis is the trial. Refused for other simulators.
       measure: (step, states (K, n)) -> measured states, (K, n); step runs to T inclusive.
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
+      wind: (step, true states (K, n)) -> wind in m/s, world axes, (K, 3); a force of `robot.drag` times the wind unless
+        the plant's simulator has a wind.
       kick: (step, true states (K, n), saturated controls (K, m)) -> jump of the states at the end of the control
         period, (K, n).
       displaced: (K, obstacles, 3), displacement of each of the plant's obstacles from its place in the scene, in m.
     """
 
     initial_states: Callable[[Array], Array] | None = None
+    factors: Mapping[str, Array] | None = None
     alter: Callable[[batch.Batch], None] | None = None
     measure: Hook | None = None
     actuate: Hook | None = None
     force: Hook | None = None
     torque: Hook | None = None
+    wind: Hook | None = None
     kick: Kick | None = None
     displaced: Array | None = None
 
     def __post_init__(self) -> None:
         for name in ("initial_states", "alter"):
             check_function(f"Effect: {name}", getattr(self, name), "a function of one argument, or None", arguments=1)
-        for name in ("measure", "actuate", "force", "torque"):
+        for name in ("measure", "actuate", "force", "torque", "wind"):
             wanted = "a function of the step and an array, or None"
             check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
         wanted = "a function of the step, states and controls, or None"
         check_function("Effect: kick", self.kick, wanted, arguments=3)
+        if self.factors is not None:
+            factors = {check_name("Effect: factors", name, PARAMETERS): one for name, one in dict(self.factors).items()}
+            for name, one in factors.items():
+                factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
+                if not (factors[name] > 0).all():
+                    raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")
+            object.__setattr__(self, "factors", factors)
         if self.displaced is not None:
             displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
             object.__setattr__(self, "displaced", displaced)

@@ -1,6 +1,6 @@
 """Robots that differ from the model for which the policy was designed.
 
-Each class multiplies a parameter in the MuJoCo model of each trial by a factor: 1 plus a normal number, truncated at
+Each class multiplies a parameter in the model of each trial by a factor: 1 plus a normal number, truncated at
 three standard deviations and drawn for each trial; or a fixed factor. For filters and tubes a fixed factor is unknown,
 too, with mean 1 and its distance from 1 as standard deviation.
 """
@@ -52,6 +52,7 @@ class Mismatch(Disturbance):
     factor: Numbers | None = None
 
     what: ClassVar[str]
+    parameter: ClassVar[str]  # of a simulator
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -70,9 +71,12 @@ class Mismatch(Disturbance):
         """The parts that have a factor each."""
         return (self.what,)
 
-    @abc.abstractmethod
-    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        """Multiply the parameters of the simulations by factors (K, parts)."""
+    def check(self, plant: Plant) -> None:
+        plant.check_simulator(type(self).__name__, self.parameter)
+
+    def effect(self, plant: Plant, factors: Array) -> Effect:
+        """The effect of factors (K, parts)."""
+        return Effect(factors={self.parameter: factors})
 
     def describe(self, plant: Plant) -> str:
         if self.factor is not None:
@@ -101,7 +105,7 @@ class Mismatch(Disturbance):
             factors = 1 + (self.std or 0.0) * np.array([[cut_normal(one) for _ in parts] for one in generators])
         else:
             factors = np.tile(fit(self, self.factor, parts, "factor"), (len(generators), 1))
-        return Effect(alter=lambda simulations: self.multiply(plant, simulations, factors))
+        return self.effect(plant, factors)
 
 
 class MassMismatch(Mismatch):
@@ -110,10 +114,7 @@ class MassMismatch(Mismatch):
     Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
-    what = "mass"
-
-    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        simulations.expand("body_mass")[:, bodies(plant)] *= factors
+    what = parameter = "mass"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         dynamics, masses = plant.robot.dynamics, plant.model.body_mass
@@ -176,10 +177,7 @@ class InertiaMismatch(Mismatch):
     The mass does not change. Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
 
-    what = "inertia"
-
-    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        simulations.expand("body_inertia")[:, bodies(plant)] *= factors[:, :, None]
+    what = parameter = "inertia"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         if not self.spread(plant).any():
@@ -193,9 +191,10 @@ class ThrustMismatch(Mismatch):
     Drawn for each trial and actuator from a truncated normal distribution, or fixed factors.
     """
 
-    what = "thrust"
+    what = parameter = "thrust"
 
     def check(self, plant: Plant) -> None:
+        super().check(plant)
         check_gains(self, plant)
         if plant.model.actuator_biastype[plant.ctrl].any():
             raise InputError(
@@ -206,17 +205,22 @@ class ThrustMismatch(Mismatch):
     def parts(self, plant: Plant) -> Sequence[str]:
         return plant.robot.actuators
 
-    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
-        simulations.expand("actuator_gainprm")[:, plant.ctrl] *= factors[:, :, None]
-
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return gain_unknowns(self, plant, plant.robot.actuators)
 
 
 class WheelMismatch(Mismatch):
-    """Base class of the mismatches of wheels, which need a robot with wheels."""
+    """Base class of the mismatches of wheels, which need a robot with wheels in MuJoCo."""
+
+    @abc.abstractmethod
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        """Multiply fields of MuJoCo's models by factors (K, parts)."""
+
+    def effect(self, plant: Plant, factors: Array) -> Effect:
+        return Effect(alter=lambda simulations: self.multiply(plant, simulations, factors))
 
     def check(self, plant: Plant) -> None:
+        plant.check_simulator(type(self).__name__)
         if not plant.robot.wheels:
             raise InputError(
                 f"{type(self).__name__}: got robot {plant.robot.name}, which has no wheels, want one with the geoms of"
@@ -342,15 +346,6 @@ def cut_normal(generator: np.random.Generator) -> float:
 
     low, high = ndtr((-CUT, CUT))
     return float(ndtri(low + (high - low) * generator.random()))
-
-
-def bodies(plant: Plant) -> npt.NDArray[np.intp]:
-    """Ids of the robot's bodies: its main body and those attached to it."""
-    found = {plant.body}
-    for body in range(plant.body + 1, plant.model.nbody):  # parents come before their children
-        if plant.model.body_parentid[body] in found:
-            found.add(body)
-    return np.array(sorted(found), dtype=np.intp)
 
 
 def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

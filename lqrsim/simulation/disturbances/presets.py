@@ -56,7 +56,6 @@ def _light(plant: Plant) -> list[Disturbance]:
     """All disturbances at strength 1, in the order in which they act."""
     space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
     ranges = np.subtract(controls.high, controls.low)
-    weight = float(plant.model.body_subtreemass[plant.body] * np.linalg.norm(plant.model.opt.gravity))
     return [
         InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
         DisplacedObstacles(0.01),  # our choice: the accuracy of a map
@@ -71,7 +70,7 @@ def _light(plant: Plant) -> list[Disturbance]:
         CommandDropouts(0.01),  # our choice: the same link
         ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
         MotorLag(0.024),  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
-        ForceNoise(0.01 * weight),  # our choice: 1 % of the weight
+        ForceNoise(0.01 * plant.weight),  # our choice: 1 % of the weight
         Dryden("light", altitude=2.0),
     ]
 

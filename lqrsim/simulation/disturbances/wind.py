@@ -1,4 +1,7 @@
-"""Constant wind, gusts, and Dryden turbulence. They act through the robot's linear drag: F = drag * wind."""
+"""Constant wind, gusts, and Dryden turbulence.
+
+They act through the robot's linear drag, F = drag * wind, or as the wind of a simulator that has one.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,10 +31,10 @@ ROUGHNESS = 0.15  # ft, roughness length of the ground in MIL-F-8785C's mean win
 
 
 class Wind(Disturbance):
-    """Base class of winds, which need a robot with drag."""
+    """Base class of winds, which need a robot with drag, or a simulator with a wind."""
 
     def check(self, plant: Plant) -> None:
-        if not plant.robot.drag > 0:
+        if not plant.robot.drag > 0 and not (plant.simulator and plant.simulator.wind):
             raise InputError(
                 f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag for wind to act through, want"
                 " one with a `drag` in N s/m"
@@ -39,8 +42,7 @@ class Wind(Disturbance):
 
     def blow(self, plant: Plant, wind: Array) -> Effect:
         """The effect of winds (K, T, 3) in m/s, held over each control period."""
-        forces = plant.robot.drag * wind
-        return Effect(force=lambda step, states: forces[:, step])
+        return Effect(wind=lambda step, states: wind[:, step])
 
 
 @dataclass(frozen=True)

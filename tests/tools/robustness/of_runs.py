@@ -90,6 +90,15 @@ def steering(step: int, shown: Any) -> Any:
     return np.full((len(shown), 2), 0.1)
 
 
+# A vehicle as RotorPy describes one, which takes no RotorPy.
+MULTIROTOR = {
+    "mass": 0.5, "Ixx": 0.004, "Iyy": 0.004, "Izz": 0.007, "k_eta": 6e-6, "k_m": 1e-7,
+    "rotor_directions": [1, -1, 1, -1],
+    "rotor_pos": {"r1": [0.1, 0.1, 0], "r2": [0.1, -0.1, 0], "r3": [-0.1, -0.1, 0], "r4": [-0.1, 0.1, 0]},
+    "rotor_speed_min": 0.0, "rotor_speed_max": 1500.0,
+}  # fmt: skip
+
+
 def hook(step: int, values: Any) -> Any:
     return values
 
@@ -111,7 +120,8 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
     plant, solution, rollout = place.plant, place.solution, place.rollout
     effect = {"initial_states": lambda states: states, "alter": print_nothing, "measure": hook,
               "actuate": hook, "force": nothing_of_three, "torque": nothing_of_three,
-              "displaced": np.zeros((1, len(plant.world), 3))}  # fmt: skip
+              "displaced": np.zeros((1, len(plant.world), 3)), "wind": nothing_of_three,
+              "factors": {"mass": np.ones((1, 1))}}  # fmt: skip
     disturbances = {name: getattr(ls.disturbances, name)(**arguments) for name, arguments in DISTURBANCES.items()}
     for name, one in disturbances.items():  # those whose arguments are all optional
         DISTURBANCES[name] = {field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init}
@@ -139,6 +149,10 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         ),
         "Plant.for_period": ({"self": plant, "period": 1 / 7},),
         "Plant.substeps": ({"self": plant, "period": 1 / 6},),
+        "Plant.check_simulator": ({"self": plant, "what": "Mine", "parameter": "mass"},),
+        "Crazyflow": ({"drone": "cf21B_500", "timestep": 0.002, "integrator": "rk4"},),
+        "RotorPy": ({"vehicle": MULTIROTOR, "timestep": 0.01},),
+        "RotorPy.quadrotor": ({"self": ls.simulators.RotorPy(MULTIROTOR), "drag": 0.2},),
         "Plant.clearance": ({"self": plant, "states": np.zeros((1, 5, 3)),
                              "displaced": np.zeros((1, len(plant.world), 3))},),
         "simulate": ({

@@ -36,7 +36,9 @@ HOOKS |= {
     "uncertainty",
     "spread",
 }
-HOOKS |= {"solving", "check_period", "ControllerRun.control", "Plant.nearest"}
+HOOKS |= {"solving", "check_period", "ControllerRun.control", "Plant.nearest", "effect"}
+HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for name in ("step", "states", "place")}
+HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 
 RAISES = {"Results.read": (Damaged,)}
 
@@ -59,7 +61,7 @@ class Subject:
 def public() -> Iterator[tuple[str, Any]]:
     """Each public callable by its name: `smooth`, `Problem`, `AffinePolicy.control`, `rotations.rotate`."""
     offered = {name: getattr(ls, name) for name in ls.__all__}
-    for room in (ls.disturbances, ls.lq, ls.stress, ls.types, ls.view):
+    for room in (ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view):
         del offered[room.__name__.removeprefix("lqrsim.")]
         offered |= {name: getattr(room, name) for name in room.__all__}
     offered |= {f"gym.{name}": getattr(gym, name) for name in gym.__all__}
@@ -95,7 +97,7 @@ def _own(item: type, key: str) -> int:
 
 def _offered(name: str) -> Any:
     """A public name, in whichever room it is."""
-    rooms = (ls.disturbances, ls.lq, ls.stress, ls.types, ls.view)
+    rooms = (ls.disturbances, ls.lq, ls.simulators, ls.stress, ls.types, ls.view)
     return getattr(next((room for room in rooms if name in room.__all__), ls), name)
 
 

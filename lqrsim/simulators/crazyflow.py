@@ -1,0 +1,192 @@
+"""crazyflow's identified Crazyflies as plants: their curves of thrust, their rotors' lag and momentum, their drag."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.robots.base import Robot
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.simulation.simulator import PARAMETERS, Simulator
+from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
+from lqrsim.versions import versions_of
+
+DRONES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")
+INTEGRATORS = ("euler", "rk4", "symplectic_euler")
+
+
+@dataclass(frozen=True)
+class Crazyflow(Simulator):
+    """crazyflow's first-principles model for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
+
+    A control is the force of a rotor. Its speed follows that at which it would have this force, with the rotor's lag.
+    Rotors begin at hover speed. There is no floor, and a wind acts through the robot's linear drag. It computes in
+    double precision, one trial after the other, for the bits of crazyflow's batches depend on their size.
+
+    Args:
+      drone: one of crazyflow's: "cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350".
+      timestep: in s; 1 / timestep has to be a whole number.
+      integrator: "rk4", "euler" or "symplectic_euler".
+
+    Raises:
+      InputError: there is no such drone or integrator. Its first use: crazyflow is not installed, or SciPy was imported
+        without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
+    """
+
+    drone: str = "cf21B_500"
+    timestep: float = 0.002
+    integrator: str = "rk4"
+
+    name = "crazyflow"
+    parameters = PARAMETERS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "timestep", check_number("Crazyflow: timestep", self.timestep, above=0.0))
+        check_name("Crazyflow: integrator", self.integrator, INTEGRATORS)
+        check_name("Crazyflow: drone", self.drone, DRONES)
+
+    @property
+    def weight(self) -> float:
+        of = numbers_of(self.drone)
+        return float(of["mass"] * -of["gravity_vec"][2])
+
+    @property
+    def versions(self) -> dict[str, str]:
+        return versions_of("crazyflow", "jax", "jaxlib")
+
+    def quadrotor(self, **changes: Any) -> Quadrotor:
+        """Our model with the drone's numbers.
+
+        The inertia about the level axes is their mean, drag that along them, and a rotor's drag that at hover.
+
+        Args:
+          **changes: fields of `Quadrotor` with other values, such as a drag that was fitted.
+
+        Returns:
+          A Quadrotor.
+        """
+        of, hover = numbers_of(self.drone), self.weight / 4
+        inertia = np.diag(of["J"])
+        torque = np.polyval(of["rpm2torque"][::-1], speed_of(self.drone, np.array(hover)))
+        numbers = {
+            "mass": float(of["mass"]), "inertia": float(inertia[:2].mean()), "yaw_inertia": float(inertia[2]),
+            "arm": frame_of(self.drone).arm, "torque_ratio": float(torque / hover), "gravity": self.weight / of["mass"],
+            "drag": float(-np.diag(of["drag_matrix"])[:2].mean()), "max_force": float(of["thrust_max"]),
+            "min_force": float(of["thrust_min"]),
+        }  # fmt: skip
+        return Quadrotor(**numbers | changes)
+
+    def check(self, robot: Robot) -> None:
+        check_quadrotor("crazyflow", robot)
+        limits, of = robot.dynamics.control_coordinates, numbers_of(self.drone)
+        low, high = of["thrust_min"], of["thrust_max"]
+        if min(limits.low) < low - 1e-12 or max(limits.high) > high + 1e-12:
+            raise InputError(
+                f"crazyflow: got a robot with rotors of {min(limits.low):g} to {max(limits.high):g} N, want at most"
+                f" {low:g} to {high:g} N, beyond which it limits them itself"
+            )
+
+    def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Drones":
+        return _Drones(self, states, factors, timestep)
+
+    def step(self, simulations: "_Drones", controls: Array, wrench: Array, wind: Array, steps: int) -> None:
+        simulations.step(controls, wrench, steps)
+
+    def states(self, simulations: "_Drones") -> Array:
+        of = simulations.states
+        return frame_of(self.drone).ours(of[:, :3], of[:, 7:10], of[:, 3:7], of[:, 10:13])
+
+    def place(self, simulations: "_Drones", states: Array) -> None:
+        simulations.place(states)
+
+
+class _Drones:
+    """States (K, 17) as crazyflow has them: position, quaternion, velocity, rates, rotor speeds in 1/min."""
+
+    def __init__(self, of: Crazyflow, states: Array, factors: Mapping[str, Array], timestep: float) -> None:
+        frequency = round(1 / timestep)
+        if abs(frequency * timestep - 1) > 1e-9:
+            raise InputError(f"crazyflow: got a timestep of {timestep:g} s, want 1 s divided by a whole number")
+        self._of, self._frequency = of, frequency
+        self.states = np.full((len(states), 17), float(speed_of(of.drone, np.array(of.weight / 4))))
+        self._factors = np.ones((len(states), 6))
+        for parameter, columns in (("mass", slice(0, 1)), ("inertia", slice(1, 2))):
+            self._factors[:, columns] = factors.get(parameter, 1.0)
+        self._factors[:, 2 + frame_of(of.drone).order] = factors.get("thrust", 1.0)
+        self.place(states)
+
+    def place(self, states: Array) -> None:
+        x, v, q, w = frame_of(self._of.drone).theirs(states)
+        self.states[:, :13] = np.concatenate([x, q, v, w], axis=1)
+
+    def step(self, controls: Array, wrench: Array, steps: int) -> None:
+        speeds = np.empty_like(controls)
+        speeds[:, frame_of(self._of.drone).order] = speed_of(self._of.drone, controls)
+        advance = stepper(self._of.drone, self._of.integrator, self._frequency, steps)
+        for trial, given in enumerate(np.concatenate([self.states, speeds, wrench, self._factors], axis=1)):
+            if np.isfinite(given).all():
+                self.states[trial] = advance(given)
+
+
+@cache
+def numbers_of(drone: str) -> dict[str, Any]:
+    """crazyflow's parameters of a drone."""
+    dynamics = package("crazyflow.dynamics", "crazyflow")
+    return dynamics.load_params(dynamics.Dynamics.first_principles, drone)
+
+
+@cache
+def frame_of(drone: str) -> Frame:
+    """Our body axes in those of a drone: torques there are sums of y_i f_i about x, and of -x_i f_i about y."""
+    of = numbers_of(drone)
+    mixed, arm = of["mixing_matrix"], of["L"]
+    return Frame.of("crazyflow", np.stack([-mixed[1] * arm, mixed[0] * arm], axis=1), mixed[2])
+
+
+def speed_of(drone: str, forces: Array) -> Array:
+    """Speeds in 1/min at which rotors have these forces in N, of the same shape."""
+    c, b, a = numbers_of(drone)["rpm2thrust"]
+    return (-b + np.sqrt(b**2 - 4 * a * (c - forces))) / (2 * a)
+
+
+@cache
+def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
+    """A function of a trial's 17 states, 4 rotor speeds, wrench (6,) and factors (6,) that returns its next states."""
+    jax, sim = package("jax", "crazyflow"), package("crazyflow.sim", "crazyflow")
+    with jax.enable_x64(True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its scene, which is not used
+        one = sim.Sim(
+            drone=drone, dynamics="first_principles", control="rotor_vel", integrator=integrator, freq=frequency
+        )
+        del one.step_pipeline["clip_floor_pos"]
+        advance, template = one.build_step_fn(), one.data
+
+        @jax.jit
+        def compiled(given: Any) -> Any:
+            def at(first: int, size: int) -> Any:
+                return given[first : first + size].reshape(1, 1, size)
+
+            moved = template.states.replace(
+                pos=at(0, 3), quat=at(3, 4), vel=at(7, 3), ang_vel=at(10, 3), rotor_vel=at(13, 4), force=at(21, 3),
+                torque=at(24, 3),
+            )  # fmt: skip
+            own, (mass, inertia), thrust = template.params, given[27:29], given[29:33]
+            changed = own.replace(
+                mass=own.mass * mass, J=own.J * inertia, J_inv=own.J_inv / inertia,
+                rpm2thrust=own.rpm2thrust * thrust[:, None], rpm2torque=own.rpm2torque * thrust[:, None],
+            )  # fmt: skip
+            data = template.replace(
+                states=moved, params=changed, controls=template.controls.replace(rotor_vel=at(17, 4))
+            )
+            of = advance(data, n_steps=steps).states
+            return jax.numpy.concatenate([part.ravel() for part in (of.pos, of.quat, of.vel, of.ang_vel, of.rotor_vel)])
+
+    def run(given: Array) -> Array:
+        with jax.enable_x64(True):
+            return np.asarray(compiled(given))
+
+    return run

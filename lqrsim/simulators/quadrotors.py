@@ -1,0 +1,92 @@
+"""What simulators of quadrotors share: their vehicle in the terms of `Quadrotor`, and its states in theirs.
+
+Both have rotors between the axes of the body. `Quadrotor` has them on its axes, so its body is turned against theirs
+about the vertical one, and rotors are numbered from its x axis, counterclockwise from above.
+"""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lqrsim.errors import Array, InputError, check_kind
+from lqrsim.robots.base import Robot
+from lqrsim.robots.quadrotor import Quadrotor
+
+TWIST = 1e-6  # m, by which rotors may be off the corners of a square
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The body axes of `Quadrotor` in those of a simulator.
+
+    Attributes:
+      turn: angle from their x axis to ours, in rad. order: (4,) the number there of each of our rotors. arm: in m.
+    """
+
+    turn: float
+    order: npt.NDArray[np.intp]
+    arm: float
+
+    @classmethod
+    def of(cls, name: str, places: Array, turning: Array) -> "Frame":
+        """From the rotors' places (4, 2 or 3) in m, and the signs (4,) of the torque with which each drags on the body.
+
+        Raises:
+          InputError: the rotors are not at the corners of a square about the centre of mass, or turn otherwise than in
+            alternating directions.
+        """
+        angles = np.arctan2(places[:, 1], places[:, 0])
+        first = int(np.argmax(turning > 0))
+        order = np.argsort(np.mod(angles - angles[first] + 1e-9, 2 * np.pi))  # counterclockwise
+        arm = float(np.linalg.norm(places[first, :2]))
+        corners = angles[first] + np.pi / 2 * np.arange(4)
+        square = arm * np.stack([np.cos(corners), np.sin(corners)], axis=1)
+        if np.abs(places[order, :2] - square).max() > TWIST or not np.array_equal(turning[order], [1, -1, 1, -1]):
+            raise InputError(f"{name}: got rotors at {places.tolist()}, want those of a square, turning alternately")
+        return cls(float(angles[first]), order, arm)
+
+    def theirs(self, states: Array) -> tuple[Array, Array, Array, Array]:
+        """Position, velocity, quaternion with the scalar last, and angular velocity, for states (K, 12)."""
+        turned = Rotation.from_rotvec(states[:, 6:9]) * Rotation.from_euler("z", -self.turn)
+        return states[:, :3], states[:, 3:6], turned.as_quat(), about_z(states[:, 9:], self.turn)
+
+    def ours(self, position: Array, velocity: Array, attitude: Array, rates: Array) -> Array:
+        """The states (K, 12), NaN where something is not finite."""
+        parts = np.concatenate([position, velocity, attitude, rates], axis=1)
+        known, states = np.isfinite(parts).all(axis=1), np.full((len(parts), 12), np.nan)
+        if known.any():
+            turned = Rotation.from_quat(attitude[known]) * Rotation.from_euler("z", self.turn)
+            parts = position[known], velocity[known], turned.as_rotvec(), about_z(rates[known], -self.turn)
+            states[known] = np.concatenate(parts, axis=1)
+        return states
+
+
+def about_z(vectors: Array, angle: float) -> Array:
+    """Vectors (K, 3), turned about the z axis. SciPy's product has bits that depend on K."""
+    (x, y, z), cosine, sine = vectors.T, np.cos(angle), np.sin(angle)
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
+
+
+def check_quadrotor(name: str, robot: Robot) -> None:
+    """Raise InputError unless it has the states and controls of a Quadrotor."""
+    check_kind(f"{name}: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
+
+
+def package(module: str, extra: str) -> Any:
+    """A module of a package that an extra installs. Raises InputError with that extra if it is not there."""
+    name = module.partition(".")[0]
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise InputError(f"{name}: got none, want it installed: pip install 'lqrsim[{extra}]'") from None
+    except RuntimeError as error:
+        if "SCIPY_ARRAY_API" not in str(error):
+            raise
+        raise InputError(
+            f"{name}: got SciPy imported without SCIPY_ARRAY_API, want SCIPY_ARRAY_API=1 in the environment from the"
+            " start"
+        ) from None

@@ -1,0 +1,196 @@
+"""RotorPy's vehicles as plants: its rotors with their lag, its drag on body and rotors, and its wind."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt
+from lqrsim.robots.base import Robot
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.simulation.simulator import PARAMETERS, Simulator
+from lqrsim.simulators.quadrotors import Frame, check_quadrotor, package
+from lqrsim.versions import versions_of
+
+GRAVITY = 9.81  # m/s2, RotorPy's
+POSITIVE = ("mass", "Ixx", "Iyy", "Izz", "k_eta", "k_m", "rotor_speed_max")  # numbers of a vehicle
+
+
+@dataclass(frozen=True)
+class RotorPy(Simulator):
+    """RotorPy's `Multirotor` for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
+
+    A control is the force of a rotor. Its speed follows that at which it would have this force, with the vehicle's lag;
+    a factor of the thrust acts through the speed. Rotors begin at hover speed. There is no ground.
+
+    Args:
+      vehicle: RotorPy's `quad_params`, or the name of one: "hummingbird", "crazyflie" and what else
+        `rotorpy.vehicles` has as NAME_params.
+      timestep: in s; within it RotorPy's integrator chooses its own steps.
+
+    Raises:
+      InputError: RotorPy is not installed; there is no such vehicle; its rotors are not four at the corners of a
+        square; or it has noise of its own, which would be drawn from a generator that all trials share.
+    """
+
+    vehicle: str | Mapping[str, Any] = "hummingbird"
+    timestep: float = 0.01
+
+    name = "RotorPy"
+    parameters = PARAMETERS
+    wind = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "timestep", check_number("RotorPy: timestep", self.timestep, above=0.0))
+        vehicle = self.vehicle
+        if isinstance(vehicle, str):
+            package("rotorpy", "rotorpy")
+            try:
+                vehicle = package(f"rotorpy.vehicles.{vehicle}_params", "rotorpy").quad_params
+            except (InputError, AttributeError):
+                raise InputError(
+                    f"RotorPy: vehicle: got {excerpt(vehicle)}, want 'hummingbird', 'crazyflie' or its quad_params"
+                ) from None
+        if not isinstance(vehicle, Mapping):
+            raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want a name, or RotorPy's quad_params")
+        if missing := [key for key in (*POSITIVE, "rotor_pos", "rotor_directions") if key not in vehicle]:
+            raise InputError(f"RotorPy: vehicle: got one without {', '.join(missing)}, want RotorPy's quad_params")
+        for key in POSITIVE:
+            check_number(f"RotorPy: vehicle: {key}", vehicle[key], above=0.0)
+        for key in ("rotor_speed_min", "k_d"):
+            check_number(f"RotorPy: vehicle: {key}", vehicle.get(key, 0.0), at_least=0.0)
+        if noise := check_number("RotorPy: vehicle: motor_noise_std", vehicle.get("motor_noise_std", 0.0)):
+            raise InputError(
+                f"RotorPy: vehicle: got motor_noise_std {noise:g}, want 0: its generator is shared by all trials; use"
+                " ControlNoise"
+            )
+        object.__setattr__(self, "vehicle", dict(vehicle))
+        _ = self._frame
+
+    @cached_property
+    def _frame(self) -> Frame:
+        places = check_kind("RotorPy: vehicle: rotor_pos", self._numbers["rotor_pos"], Mapping, "name -> place")
+        return Frame.of(
+            "RotorPy: vehicle",
+            check_array("RotorPy: vehicle: rotor_pos", [*places.values()], (4, 3)),
+            check_array("RotorPy: vehicle: rotor_directions", self._numbers["rotor_directions"], (4,)),
+        )
+
+    @property
+    def _numbers(self) -> Mapping[str, Any]:
+        assert not isinstance(self.vehicle, str)
+        return self.vehicle
+
+    @property
+    def weight(self) -> float:
+        return self._numbers["mass"] * GRAVITY
+
+    @property
+    def hover_speed(self) -> float:
+        """Speed of each rotor in rad/s that carries the weight."""
+        return float(np.sqrt(self.weight / 4 / self._numbers["k_eta"]))
+
+    @property
+    def versions(self) -> dict[str, str]:
+        return versions_of("rotorpy", "scipy")
+
+    def quadrotor(self, **changes: Any) -> Quadrotor:
+        """Our model with the vehicle's numbers.
+
+        Drag is that of the rotors at hover speed, across their axes. The inertia about the level axes is their mean.
+
+        Args:
+          **changes: fields of `Quadrotor` with other values, such as a drag that was fitted.
+
+        Returns:
+          A Quadrotor.
+        """
+        of = self._numbers
+        numbers = {
+            "mass": of["mass"], "inertia": (of["Ixx"] + of["Iyy"]) / 2, "yaw_inertia": of["Izz"],
+            "arm": self._frame.arm, "torque_ratio": of["k_m"] / of["k_eta"], "gravity": GRAVITY,
+            "drag": 4 * self.hover_speed * of.get("k_d", 0.0), "max_force": of["k_eta"] * of["rotor_speed_max"] ** 2,
+            "min_force": of["k_eta"] * of.get("rotor_speed_min", 0.0) ** 2,
+        }  # fmt: skip
+        return Quadrotor(**numbers | changes)
+
+    def check(self, robot: Robot) -> None:
+        check_quadrotor("RotorPy", robot)
+
+    def start(self, states: Array, factors: Mapping[str, Array], timestep: float) -> "_Vehicles":
+        return _Vehicles(self, self._frame, states, factors, timestep)
+
+    def step(self, simulations: "_Vehicles", controls: Array, wrench: Array, wind: Array, steps: int) -> None:
+        simulations.step(controls, wrench, wind, steps)
+
+    def states(self, simulations: "_Vehicles") -> Array:
+        of = simulations.states
+        return self._frame.ours(*(np.array([state[key] for state in of]) for key in ("x", "v", "q", "w")))
+
+    def place(self, simulations: "_Vehicles", states: Array) -> None:
+        simulations.place(states)
+
+
+class _Vehicles:
+    """A `Multirotor` and its state, as RotorPy has it, for each trial."""
+
+    def __init__(
+        self, simulator: RotorPy, frame: Frame, states: Array, factors: Mapping[str, Array], timestep: float
+    ) -> None:
+        kind, self._frame, self._timestep = pushed_multirotor(), frame, timestep
+        speeds = np.full(4, simulator.hover_speed)
+        self.vehicles, self.states = list[Any](), [{"rotor_speeds": speeds.copy()} for _ in states]
+        self._gain = np.sqrt(factors.get("thrust", np.ones((len(states), 4))) / simulator._numbers["k_eta"])
+        for trial in range(len(states)):
+            vehicle = kind(copy.deepcopy(dict(simulator._numbers)))
+            vehicle.mass = vehicle.mass * float(factors["mass"][trial, 0]) if "mass" in factors else vehicle.mass
+            vehicle.weight = np.array([0.0, 0.0, -vehicle.mass * vehicle.g])
+            if "inertia" in factors:
+                vehicle.inertia = vehicle.inertia * factors["inertia"][trial, 0]
+                vehicle.inv_inertia = np.linalg.inv(vehicle.inertia)
+            if "thrust" in factors:
+                vehicle.rotor_speed_max *= np.sqrt(max(factors["thrust"][trial].max(), 1.0))
+            self.vehicles.append(vehicle)
+        self.place(states)
+
+    def place(self, states: Array) -> None:
+        for state, x, v, q, w in zip(self.states, *self._frame.theirs(states), strict=True):
+            state |= {"x": x.copy(), "v": v.copy(), "q": q, "w": w}
+
+    def step(self, controls: Array, wrench: Array, wind: Array, steps: int) -> None:
+        speeds = np.empty_like(controls)
+        speeds[:, self._frame.order] = np.sqrt(controls) * self._gain
+        for trial, vehicle in enumerate(self.vehicles):
+            state = self.states[trial]
+            if not all(np.isfinite(part).all() for part in state.values()):
+                continue
+            state["wind"], vehicle.pushed = wind[trial], wrench[trial]
+            command = {"cmd_motor_speeds": speeds[trial]}
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    for _ in range(steps):
+                        state = vehicle.step(state, command, self._timestep)
+            except (ValueError, FloatingPointError):  # numbers that overflowed
+                state = state | {"x": np.full(3, np.nan)}
+            self.states[trial] = state
+
+
+def pushed_multirotor() -> Any:
+    """RotorPy's `Multirotor` with a force in N and a torque in N m on it, along the world's axes."""
+    base = package("rotorpy.vehicles.multirotor", "rotorpy").Multirotor
+
+    class Pushed(base):
+        pushed = np.zeros(6)
+
+        def _s_dot_fn(self, t: float, s: Array, cmd_rotor_speeds: Array) -> Array:
+            rate = super()._s_dot_fn(t, s, cmd_rotor_speeds)
+            rate[3:6] += self.pushed[:3] / self.mass
+            if self.pushed[3:].any():
+                rate[10:13] += self.inv_inertia @ Rotation.from_quat(s[6:10]).as_matrix().T @ self.pushed[3:]
+            return rate
+
+    return Pushed
