@@ -86,7 +86,8 @@ def with_duration(problem: Problem) -> Problem:
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
         stage_cost=CostSum(stage), final_cost=CostSum((*final, time)), control_limits=problem.control_limits,
-        constraints=(*(_longer(one, dynamics.state_coordinates.names) for one in problem.constraints), bounds), begin=problem.begin,
+        constraints=(*(_longer(one, dynamics.state_coordinates.names) for one in problem.constraints), bounds),
+        begin=problem.begin,
     )  # fmt: skip
 
 
