@@ -3,6 +3,7 @@
     python experiments/benchmark_parking.py                  # 2,000 problems, each for 10 s at most
     python experiments/benchmark_parking.py --problems 200   # the first of them
     python experiments/benchmark_parking.py --only 17        # that one, with all that is said about it
+    python experiments/benchmark_parking.py --keep F.json    # what is done is in F.json: the same command goes on there
     python experiments/benchmark_parking.py --quick          # 24 problems: too few to trust
 
 A quarter of the problems have no plan, by a proof that needs no solver; of the others one is known, and kept with the
@@ -17,6 +18,7 @@ raised            An exception.
 """
 
 import dataclasses
+import json
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -24,6 +26,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, get_args
 
 from parking import cases
@@ -31,7 +34,9 @@ from parking.outcomes import Outcome, Verdict, look
 from runner import Settings, at_most, opening, run
 from tqdm import tqdm
 
+from lqrsim.errors import InputError
 from lqrsim.machine import processors
+from lqrsim.results.save_load import replacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +55,40 @@ class Config(Settings):
     """Every how manieth is tried for a cheaper plan, if it is said to be optimal; with `only` each."""
     workers: int | None = None
     """How many processes; by default as many as there are processors."""
+    keep: Path | None = None
+    """File of the outcomes so far."""
 
 
 def main(config: Config) -> dict[str, Any]:
     if config.quick:
         config = dataclasses.replace(at_most(config, problems=24), workers=1)
     numbers = config.only or range(config.problems)
-    with tqdm(total=len(numbers), desc="parking", disable=None) as bar:
-        found = []
-        for outcome in _solved(config, numbers):
-            found.append(asdict(outcome))
+    found = _kept(config)
+    left = [number for number in numbers if number not in found]
+    with tqdm(total=len(numbers), initial=len(numbers) - len(left), desc="parking", disable=None) as bar:
+        for outcome in _solved(config, left) if left else ():
+            found[outcome.number] = asdict(outcome)
+            if config.keep is not None:
+                with replacing(config.keep) as unfinished:
+                    kept = {"config": _asked(config), "outcomes": list(found.values())}
+                    unfinished.write_text(json.dumps(kept) + "\n", encoding="utf-8")
             bar.update()
-    return opening(config) | {"outcomes": found}
+    return opening(config) | {"outcomes": [found[number] for number in numbers]}
+
+
+def _asked(config: Config) -> dict[str, Any]:
+    """What an outcome depends on."""
+    return {name: getattr(config, name) for name in ("seed", "time_limit", "max_iterations", "tried")}
+
+
+def _kept(config: Config) -> dict[int, dict[str, Any]]:
+    """The outcomes of an earlier run by number. Raises InputError if that had other settings."""
+    if config.keep is None or not config.keep.is_file():
+        return {}
+    kept = json.loads(config.keep.read_text("utf-8"))
+    if kept["config"] != _asked(config):
+        raise InputError(f"--keep: got outcomes for {kept['config']}, want those for {_asked(config)}")
+    return {row["number"]: row for row in kept["outcomes"]}
 
 
 def _look(config: Config, number: int) -> Outcome:

@@ -90,9 +90,9 @@ class TestPlanarQuadrotor:
         assert contradictions(problem, solution) == []
 
     def test_where_the_search_ends_before_the_wall_another_way_is_found(self) -> None:
-        """The seven starts end 2.3 m short of the goal, or at a cost of thousands; over the wall it costs 61 to 70.
+        """The seven starts end 2.3 m short of the goal, or at a cost of thousands; over the wall it costs 60.9.
 
-        There is an optimum for each pair of steps at which the wall's corners may be passed.
+        There is an optimum for each pair of steps at which the wall's corners may be passed, at up to 72.
         """
         problem = planar_quadrotor.problem(
             (-1.02, 0.62), (1.92, 0.63), steps=247, effort=10.0, weight=500.0, sharpness=5.0
@@ -103,7 +103,7 @@ class TestPlanarQuadrotor:
             assert one.status is Status.CONVERGED
             assert contradictions(problem, one) == []
         assert short.cost > 1000
-        assert solution.cost < 71
+        assert solution.cost < 61.1
         assert np.linalg.norm(solution.trajectory.states[-1][:2] - (1.92, 0.63)) < planar_quadrotor.RADIUS
         assert "times the weight of obstacles and goal" in solution.summary()
 

@@ -87,6 +87,15 @@ def _sine(angle: Any) -> Any:
     return sin(angle)
 
 
+def test_a_duration_that_is_not_the_best_is_not_dropped_for_the_stated_one() -> None:
+    """The stated 4 s take three iterations, and the least time of 2 s seven: with six there is a plan between."""
+    solution = ls.smooth(problem(time_weight=5.0), max_iterations=6)
+    assert solution.status is Status.MAX_ITERATIONS
+    assert "the best duration was not found" in solution.detail
+    assert solution.violation <= 1e-6
+    assert 2.0 <= solution.trajectory.horizon < 4.0 - 1e-3
+
+
 def test_a_duration_ends_at_its_bound() -> None:
     solution = ls.smooth(problem(duration=(3.0, 5.0)))
     assert solution.trajectory.horizon == pytest.approx(3.0, abs=1e-7)

@@ -33,7 +33,7 @@ ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped one
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
-REFINED = 5  # damped iterations from a plan of the search before Newton's method, or the interior point, goes on
+REFINED = 5  # damped iterations from a plan of the search before Newton's method goes on
 
 
 def finish(run: SolveRun) -> RunResult:
@@ -65,8 +65,11 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
     return _first_feasible(run, found)
 
 
-def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
-    """Continue from the result without the constraints or, without one, from another solution's multipliers."""
+def satisfy(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> RunResult:
+    """Continue from the result without the constraints or, without one, from another solution's multipliers.
+
+    `stale` is the number of undamped iterations that come no closer before damped ones follow.
+    """
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
@@ -78,7 +81,7 @@ def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
         lagrangian.start()
         # These will be overwritten.
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
-    undamped = _undamped(run, lagrangian, known=found is None)
+    undamped = _undamped(run, lagrangian, known=found is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
         return undamped
     return _damped(run, lagrangian, found, undamped)
@@ -114,8 +117,11 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     return run, satisfy(run, found) if found.success and not budget.over else found
 
 
-def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool) -> RunResult:
-    """Undamped iterations, and updated multipliers in between; these are `known` at first from another solution."""
+def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, patience: int) -> RunResult:
+    """Undamped iterations, and updated multipliers in between; these are `known` at first from another solution.
+
+    They end after `patience` that come no closer.
+    """
     work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
     work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
     rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
@@ -136,7 +142,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool) 
         off = max(last.gap / most, last.violation / run.settings.violation_tolerance(run.problem))
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
-        if stale == STALE and not known and run.settings.safeguard:
+        if stale == patience and not known and run.settings.safeguard:
             break
         rough = abs(last.improvement) < ROUGH and last.gap < ROUGH_GAP
         if settled or rough or since == PATIENCE:

@@ -33,7 +33,9 @@ from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
 STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
-AUGMENTED = 100  # iterations of the augmented Lagrangian
+# Iterations of the augmented Lagrangian: from the plan of smoothing; of these, undamped ones that come no closer; and
+# damped ones from a plan of the search, which creep along a wall's corner to optima that cost less.
+AUGMENTED, STALE, REFINED = 50, 25, 100
 DEEP = 0.03  # part of a row's typical size by which the plan of smoothing may miss it for the interior point
 OPENING, GUIDED = 6, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
 MOST, RESTORED = 300, 150  # iterations of the interior point from one plan, and of a descent at one price
@@ -176,7 +178,7 @@ class Ladder:
 
     def _refined(self) -> RunResult | None:
         """From the plan of damped iterations on the augmented Lagrangian."""
-        with self._budget.limited(augmented_lagrangian.REFINED):
+        with self._budget.limited(REFINED):
             found = augmented_lagrangian.refine(self._run)
         return self._after_multipliers(found)
 
@@ -189,7 +191,7 @@ class Ladder:
         if self._smoothed is None or run.settings.elastic is not None or not self._guided:
             return None
         with self._budget.limited(AUGMENTED):
-            found = augmented_lagrangian.satisfy(run, run.result(run.ending))
+            found = augmented_lagrangian.satisfy(run, run.result(run.ending), stale=STALE)
         return self._after_multipliers(found, most=start.cost)
 
     def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:

@@ -7,7 +7,7 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 
 import copy
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,12 +30,13 @@ Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
 
 
 def find_duration(
-    problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, watch: Callable[[Measures], bool]
-) -> tuple[Problem, Found] | None:
-    """Find the best duration near that of a plan. Return the problem with it, and the optimum; None if none was found.
+    problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, most: int,
+    watch: Callable[[Measures], bool],
+) -> tuple[Problem, Found]:  # fmt: skip
+    """Find the best duration near that of a plan. Return the problem with it, and the optimum, or how far it came.
 
-    `violation` is the tolerance of the constraints; `watch` is called with the measures after each iteration, and ends
-    the search by returning True.
+    `violation` is the tolerance of the constraints, `most` the number of iterations, up to `MOST`; `watch` is called
+    with the measures after each, and ends the search by returning True.
     """
     assert problem.duration is not None
     freed, n = with_duration(problem), len(problem.dynamics.state_coordinates)
@@ -45,9 +46,7 @@ def find_duration(
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
         point = InteriorPoint(freed, plan, room=0.02, stages=stages)
-        found = point.run(tolerance=tolerance, violation=violation, most=MOST, watch=watch)
-    if not found.solved:
-        return None
+        found = point.run(tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch)
     # Remove everything that belongs to the duration.
     rows = found.row_size[stages.owners != len(problem.constraint_terms)]
     found = dataclasses.replace(
@@ -87,7 +86,8 @@ def with_duration(problem: Problem) -> Problem:
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
         stage_cost=CostSum(stage), final_cost=CostSum((*final, time)), control_limits=problem.control_limits,
-        constraints=(*(_longer(one, dynamics) for one in problem.constraints), bounds), begin=problem.begin,
+        constraints=(*(_longer(one, dynamics.state_coordinates.names) for one in problem.constraints), bounds),
+        begin=problem.begin,
     )  # fmt: skip
 
 
@@ -125,11 +125,11 @@ def _longer_cost(cost: Cost, n: int) -> Cost:
     )
 
 
-def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
-    """A constraint of n states as a constraint of n + 1, independent of the last."""
-    names = dynamics.state_coordinates.names
+def _longer(constraint: Constraint, names: Sequence[str]) -> Constraint:
+    """A constraint of the states of these names as one of these and another, independent of the last."""
     if isinstance(constraint, GoalState):
-        return GoalState({names[i]: number for i, number in constraint._numbers(dynamics).items()})
+        goal = constraint.goal
+        return GoalState(goal if isinstance(goal, dict) else dict(zip(names, goal.tolist(), strict=True)))
     if isinstance(constraint, SymbolicConstraint):
         return _of_fewer(constraint, len(names))
     if isinstance(constraint, (StateBounds, Clearance)):

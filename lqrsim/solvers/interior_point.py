@@ -41,6 +41,9 @@ LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
 LATELY = 4  # iterations with that rule; to continue, the measures must be better than in the worst of them
 # Most corrections after a long step, and the largest share of the violation that each may leave.
 CLOSINGS, CLOSER = 3, 0.3
+# Part of a step below which its products are centred; how much further that looks, and the share of this that it must
+# gain; the factor by which products may then differ from the barrier's parameter.
+EARLY, REACH, FURTHER, OUTLIER = 0.5, 0.5, 0.1, 10.0
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
 NOTHING, FAR = 1e-4, 1e-2  # scale of the first plan, relative to the typical cost of a change: the least; if infinite
 SHORTEST = 1e-7  # part of a step before the line search gives up
@@ -678,8 +681,9 @@ class InteriorPoint:
                 corrections = self._predict(hessian, sigma, duals, least)
                 self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
             step = self._step(sigma, duals, corrections)
-            slope = self._slope(step)
-            taken = self._search(step, slope, hessian, sigma, duals, corrections)
+            if not self._mixed:
+                step, corrections = self._centred(step, hessian, sigma, duals, corrections)
+            taken = self._search(step, self._slope(step), hessian, sigma, duals, corrections)
             moving = taken is not None and taken[1] >= STUCK
             asked = float((np.abs(step.multipliers) * self._size * (soft > 0)).max(initial=0.0))
             if moving or asked < ABSURD * scale or self._soft >= SOFTEST:
@@ -799,6 +803,27 @@ class InteriorPoint:
         self.parameter = max(least, min(10 * self._first, (after / average) ** 3 * average))
         self._filter = []
         return step.slack * moved if primal > 0.5 else none
+
+    def _centred(
+        self, step: Step, hessian: Array, sigma: Array, duals: Array, corrections: Array
+    ) -> tuple[Step, Array]:
+        """The step and its corrections; where a slack stops it early, another one if it goes further.
+
+        Its corrections bring the outliers among the products, as they would be a little further on, back to within a
+        factor of `OUTLIER` of the barrier's parameter (Gondzio, 1996).
+        """
+        moved, slack = self._sign * step.multipliers[self._row], self.point.slack
+        part, dual_part = self._longest(slack, step.slack), self._longest(duals, moved)
+        if part >= EARLY:
+            return step, corrections
+        products = (slack + min(1.0, part + REACH) * step.slack) * (duals + min(1.0, dual_part + REACH) * moved)
+        wanted = np.clip(products, self.parameter / OUTLIER, OUTLIER * self.parameter)
+        others = corrections - np.maximum(wanted - products, -OUTLIER * self.parameter)
+        if self._solve(hessian, sigma, duals, others, np.zeros(len(self.point.numbers))):
+            other = self._step(sigma, duals, others)
+            if self._longest(slack, other.slack) >= part + FURTHER * REACH:
+                return other, others
+        return step, corrections
 
     def _longest(self, numbers: Array, changes: Array, share: float | None = None) -> float:
         """The largest part of the changes, at most 1, by the fraction-to-the-boundary rule."""

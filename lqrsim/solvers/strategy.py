@@ -36,7 +36,7 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Status
+from lqrsim.results.solution_parts import Candidate, Status, Trajectory
 from lqrsim.solvers import augmented_lagrangian
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.budget import Budget, Callback, Stop
@@ -367,7 +367,8 @@ def _solve_for_duration(
 ) -> Solution:
     """Solve for the stated duration, then find the best one near it, and finish the plan with that.
 
-    With a weight on time, shorter durations are tried, too, since they may lead another way round.
+    With a weight on time, and no start from the caller, shorter durations are tried, too, since they may lead another
+    way round.
     """
     budget = Budget(settings.max_iterations, callback=callback)
     budget.stop.begin(settings.time_limit)
@@ -381,33 +382,37 @@ def _solve_for_duration(
         return budget.stop.due
 
     assert problem.duration is not None
-    stated, first, best = problem.steps * problem.dt, None, None
-    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
+    stated, first, best, near = problem.steps * problem.dt, None, None, None
+    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 and settings.start is None else 1):
         tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
         begin = solve(settled(problem, stated), tries, attentive=attentive, threads=threads, callback=callback)
         first = begin if first is None else first
         if attempt and not begin.success:
             break
-        ended = find_duration(
-            problem,
-            begin.trajectory,
-            tolerance=settings.final(problem),
-            violation=settings.violation_tolerance(problem),
-            watch=watch,
-        )
-        if (
-            budget.stop.due
-            or ended is None
-            or (best is not None and not ended[1].measures.cost < best[1].measures.cost)
-        ):
+        near = find_duration(
+            problem, begin.trajectory, tolerance=settings.final(problem),
+            violation=settings.violation_tolerance(problem), most=settings.max_iterations, watch=watch,
+        )  # fmt: skip
+        cheaper = best is None or near[1].measures.cost < best[1].measures.cost
+        if budget.stop.due or not near[1].solved or not cheaper:
             break
-        best = ended
+        best = near
         stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
     assert first is not None
     if best is None:
+        candidates = [first]
+        if near is not None and np.isfinite(near[1].plan.states).all() and not budget.stop.due:
+            ordinary, found = near
+            start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            begun = replace(settings, start=start, starts=None)
+            candidates.append(solve(ordinary, begun, attentive=attentive, callback=callback))
+        chosen = min(candidates, key=lambda one: _rank_with_time(one, problem.time_weight))
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS
-        detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
-        return budget.stop.finish(replace(first, status=status, detail=detail, iterations=(*first.iterations, *log)))
+        detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
+        iterations = (*first.iterations, *log, *(chosen.iterations if chosen is not first else ()))
+        return budget.stop.finish(
+            replace(chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations)
+        )
     ordinary, found = best
     m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
     guess = InitialGuess(
@@ -416,3 +421,9 @@ def _solve_for_duration(
     )  # fmt: skip
     settings = replace(settings, start=guess, starts=None)
     return budget.stop.finish(solve(ordinary, settings, attentive=attentive, callback=callback))
+
+
+def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
+    """The smaller, the better: the violation of a plan that failed, then the cost with that of its time."""
+    missed = 0.0 if solution.success else solution.violation
+    return missed, solution.cost + time_weight * solution.trajectory.horizon
