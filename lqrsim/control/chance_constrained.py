@@ -237,11 +237,15 @@ class _Search:
         """
         clearance, std, correlation = self._spread(plan)
         clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
+        # The moments' chance of the next plan is taken to be as wrong as that of this one.
+        wanted, tube = AIM * self.asked, plan.tube
+        if tube.collision_chance > 0:
+            wanted *= tube.linear_chance / tube.collision_chance
         low, high = 0.0, 12.0
         for _ in range(40):
             middle = (low + high) / 2
             moved = np.maximum(clearance, middle * std)
-            safe = chance_of_clearances(moved / std, correlation)[1] <= AIM * self.asked
+            safe = chance_of_clearances(moved / std, correlation)[1] <= wanted
             low, high = (low, middle) if safe else (middle, high)
         return high
 
