@@ -8,8 +8,8 @@ Where no such clearance is safe enough, or there is no room for it, obstacles co
 all the room that there is, where a constraint says only that it is too little.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -55,6 +55,8 @@ class SafePlan:
       asked: the requested chance.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
       weight: by how much the weight of the problem's obstacles is multiplied, in its own cost as well; mostly by 1.
+      instead: if it is not safe enough, the predicted chances on the same plan with actuators that do not lag, twice
+        their range, exact sensors, and all of these: what limits it.
     """
 
     problem: Problem
@@ -64,6 +66,7 @@ class SafePlan:
     asked: float
     rounds: tuple[tuple[float, float, float, float], ...]
     weight: float = 1.0
+    instead: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, kind in (("problem", Problem), ("solution", Solution), ("tube", Tube)):
@@ -75,6 +78,7 @@ class SafePlan:
         each = tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds)
         object.__setattr__(self, "rounds", each)
         object.__setattr__(self, "weight", check_number("SafePlan: weight", self.weight, above=0.0))
+        check_kind("SafePlan: instead", self.instead, Mapping, "a dictionary of chances")
 
     @property
     def success(self) -> bool:
@@ -85,7 +89,13 @@ class SafePlan:
         lines = [f"{self.solution.summary()}", "  margin (m)       cost        chance of collision"]
         lines += [f"  {low:5.3f} to {high:5.3f}  {cost:10.6g}  {chance:.3g}" for low, high, cost, chance in self.rounds]
         verdict = "as asked" if self.success else "MORE than asked" if self.solution.success else "no solution"
-        return "\n".join([*lines, f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})"])
+        lines.append(f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})")
+        if self.weight != 1:
+            lines.append(f"  with {self.weight:g} times the weight of obstacles")
+        if self.instead:
+            each = ", ".join(f"{chance:.3g} with {what}" for what, chance in self.instead.items())
+            lines.append(f"  on this plan {each}")
+        return "\n".join(lines)
 
 
 def smooth_chance_constrained(
@@ -146,6 +156,34 @@ def smooth_chance_constrained(
     if progress is not None:
         progress(rounds, rounds, search.last())
     return search.result()
+
+
+def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
+    """Predicted chances of collision on a plan, if one thing after another were better, and if all were.
+
+    An OffsetFree is made for that.
+    """
+    policy = plan.solution.policy
+    space = policy.control_coordinates
+    half = 0.5 * np.subtract(space.high, space.low)
+    wider = replace(space, low=tuple(np.subtract(space.low, half)), high=tuple(np.add(space.high, half)))
+    no_lag, no_noise = {"lag": 0.0}, {"measurement": 0.0, "loss": 0.0}
+    cases: dict[str, tuple[bool, dict[str, float]]] = {
+        "no lag": (False, no_lag), "twice the range of controls": (True, {}), "exact sensors": (False, no_noise),
+        "all of these": (True, no_lag | no_noise),
+    }  # fmt: skip
+    found = {}
+    for what, (strong, changes) in cases.items():
+        solution, told = plan.solution, replace(uncertainty, **changes)
+        if strong:
+            solution = replace(solution, policy=replace(policy, control_coordinates=wider))
+        law = plan.controller
+        if isinstance(law, OffsetFree):
+            law = OffsetFree(plan.problem, solution, told)
+        elif strong:
+            law = replace(law, control_coordinates=wider)
+        found[what] = predict_tube(plan.problem, solution, told, law).collision_chance
+    return found
 
 
 class _Search:
@@ -305,4 +343,7 @@ class _Search:
         return f"chance {chance:.2g} with margins of {low:.3g} to {high:.3g} m, cost {cost:.5g}"
 
     def result(self) -> SafePlan:
-        return replace(self._best(), rounds=tuple(self.lines))
+        best = replace(self._best(), rounds=tuple(self.lines))
+        if best.success or not best.solution.success:
+            return best
+        return replace(best, instead=chances_instead(best, self.uncertainty))

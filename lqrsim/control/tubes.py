@@ -26,7 +26,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
-SAMPLES = 4000
+# Trials by default: as many as this many numbers in all, z at each step; at least and at most.
+NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
 STRAY = 6.0  # standard deviations of the position, of the direction and the knot with the largest
 
 
@@ -130,8 +131,9 @@ def predict_tube(
       uncertainty: the uncertainty in a run. With a latency or a delay mean and covariance are those of the samples that
         stay finite.
       controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
-      samples: number of trials with the nonlinear model, for the chance of collision. By default 4000; none without
-        obstacles, with dynamics that are stepped by MuJoCo or written in plain Python, and with distances by MuJoCo.
+      samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
+        plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
+        written in plain Python, and with distances by MuJoCo.
       seed: of these.
 
     Returns:
@@ -163,7 +165,7 @@ def predict_tube(
     late = [f"{field} of {getattr(told, field)}" for field in ("latency", "delay") if getattr(told, field)]
     if samples is None:
         slow = problem.dynamics.discrete or problem.dynamics.level == "plain" or surroundings.by_mujoco
-        samples = 0 if slow or not (surroundings.worlds or late) else SAMPLES
+        samples = 0 if slow or not (surroundings.worlds or late) else _affordable(loop.model)
     if samples and surroundings.by_mujoco:
         raise InputError(f"predict_tube: samples: got {samples} and distances by MuJoCo, want 0")
     if late and not samples:
@@ -173,6 +175,10 @@ def predict_tube(
         )
     trials = sample_loop(loop.model, law, (loop.low, loop.high), surroundings, samples, seed) if samples else None
     return _tube(loop, None if late else loop.moments(), trials, surroundings)
+
+
+def _affordable(model: PlanModel) -> int:
+    return min(max(NUMBERS // (model.plan.steps * model.size), FEWEST), MOST)
 
 
 def _tube(
