@@ -11,17 +11,18 @@ alone    How strong one disturbance alone must be for half of the trials to fail
 steady   A steady wind, a wrong mass: whether it gets there, and what error stays when it hovers.
 drive    The differential drive under all disturbances at once.
 filter   Whether the filter knows how wrong it is.
-chances  The predicted chance of collision against what splitting measures.
+chances  The predicted chance of collision against what is measured, for four robots.
+severe   What keeps the quadrotor from its goal at 'severe': the plan, the lag, the thrust or the sensors.
 worlds   Whether safe plans in random worlds keep the chance that they were asked for, and what they cost.
 """
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from robust import alone, chances, common, consistency, drive, presets, steady, worlds
+from robust import alone, chances, common, consistency, drive, presets, severe, steady, worlds
 from runner import Result, Section, measure, opening, report_of, run
 
-Name = Literal["presets", "alone", "steady", "drive", "filter", "chances", "worlds"]
+Name = Literal["presets", "alone", "steady", "drive", "filter", "chances", "severe", "worlds"]
 SECTIONS = {
     "presets": Section(presets, "All disturbances of a preset"),
     "alone": Section(alone, "One disturbance alone"),
@@ -29,6 +30,7 @@ SECTIONS = {
     "drive": Section(drive, "The differential drive"),
     "filter": Section(consistency, "Consistency of the filter"),
     "chances": Section(chances, "Predicted chances of collision"),
+    "severe": Section(severe, "What limits severe disturbances"),
     "worlds": Section(worlds, "Safe plans in random worlds"),
 }
 

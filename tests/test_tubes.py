@@ -10,13 +10,14 @@ import pytest
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, by_hand, double_integrator, linear
 from scipy.integrate import quad
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import binomtest, multivariate_normal, norm
 
 import lqrsim as ls
 from lqrsim.control.collision_chance import Surroundings, both_below, collision_chance
 from lqrsim.control.controllers import Feedback
-from lqrsim.control.linear_loop import limited
+from lqrsim.control.linear_loop import LinearLoop, limited
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.errors import Array
 
 
@@ -232,10 +233,119 @@ def test_the_error_of_the_estimate_is_the_filters_where_that_is_told_the_truth()
 
 
 @pytest.mark.parametrize("field", ["latency", "delay"])
-def test_what_a_tube_does_not_have_is_refused(field: str) -> None:
+def test_moments_of_what_is_late_need_samples(field: str) -> None:
     system = double_integrator(steps=5)
-    with pytest.raises(ls.InputError, match=f"Uncertainty: {field}: got 2 control periods, want 0 for a tube"):
-        ls.predict_tube(system.problem, system.solution, ls.Uncertainty(**{field: 2}))  # type: ignore[arg-type]
+    late = ls.Uncertainty(**{field: 2})  # type: ignore[arg-type]
+    with pytest.raises(ls.InputError, match=f"samples: got 0 and a {field} of 2 control periods, which the moments do"):
+        ls.predict_tube(system.problem, system.solution, late, samples=0)
+
+
+# Sampled trials.
+
+
+@pytest.mark.parametrize("estimates", [False, True])
+@pytest.mark.parametrize("lost", [0.0, 0.2])
+def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates: bool, lost: float) -> None:
+    """Of 20,000 trials a standard deviation is known to 0.5 %; the largest error over 40 knots is some 2 %.
+
+    Lost commands give heavier tails.
+    """
+    system = weave(1e6)
+    stated = replace(STATED, lag=0.0 if lost else 0.05, command_loss=lost)
+    if estimates:
+        law = ls.OffsetFree(system.problem, system.solution, stated, tolerate={"s0": 0.1, "s1": 0.5}, effort=0.5)
+        loop, controller = law.loop(), law
+    else:
+        tolerate = {"s0": 0.1, "s1": 0.5}
+        policy = ls.track(system.problem, system.solution, tolerate=tolerate, effort=0.5, uncertainty=stated)
+        controller, model = Feedback(policy), PlanModel.of(system.problem.dynamics, system.plan, stated)
+        offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
+        loop = LinearLoop(model, policy.gain, offset, None, np.full(1, -1e6), np.full(1, 1e6))
+    moments, n = loop.moments(), loop.model.n
+    surroundings = Surroundings.of(system.problem, 0.0)
+    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, 20_000, 0)
+    std = np.sqrt(np.diagonal(moments.covariance[:, :n, :n], axis1=1, axis2=2))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
+    assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()
+    scale = std[1:, :, None] * std[:-1, None, :]
+    np.testing.assert_allclose(found.across / scale, moments.across / scale, rtol=0, atol=0.05)
+
+
+def test_samples_are_those_of_a_loop_with_limits_latency_and_delay() -> None:
+    """The share of collisions with a wall, against runs in NumPy: of two times 20,000 trials 10 % are off by 3 %.
+
+    The force that pushes towards the wall is at times more than the limits, so that the moments' chance is another.
+    """
+    trials, limit, wall = 20_000, 0.8, -0.5
+    system = walled(limit, wall)
+    stated = replace(STATED, control=0.0, unknowns=(ls.disturbances.Unknown("d0", 0.5),), latency=1, delay=2, loss=0.1)
+    policy = ls.track(system.problem, system.solution, tolerate={"s0": 0.2, "s1": 0.5}, effort=0.5, uncertainty=stated)
+    solution = by_hand(system.plan, policy)
+    tube = ls.predict_tube(system.problem, solution, stated, samples=trials)
+    rng = np.random.default_rng(5)
+    push = 0.5 * rng.normal(size=(trials, 1))
+    x = system.plan.states[0] + 0.1 * rng.normal(size=(trials, 2))
+    measured, under_way, shown = (
+        [],
+        [np.tile(one, (trials, 1)) for one in system.plan.controls[:2]],
+        system.plan.states[0],
+    )
+    hit = x[:, 0] < wall
+    for t in range(system.plan.steps):
+        measured.append(x + 0.02 * rng.normal(size=x.shape))
+        arrived = measured[max(t - 1, 0)]
+        shown = np.where(rng.random((trials, 1)) < 0.1, shown, arrived)
+        under_way.append(np.clip(shown @ policy.gain[t].T + policy.offset[t], -limit, limit))
+        x = x @ system.A.T + under_way.pop(0) @ system.B.T + push @ system.E.T
+        hit |= x[:, 0] < wall
+    assert 0.05 < hit.mean() < 0.5
+    assert tube.collision_chance == pytest.approx(hit.mean(), rel=0.1)
+    assert tube.samples == trials
+    again = ls.predict_tube(system.problem, solution, stated, samples=trials)
+    np.testing.assert_array_equal(again.covariance, tube.covariance)
+
+
+def walled(limit: float, wall: float) -> Linear:
+    """A mass on a line with a wall behind it."""
+    behind = ls.World([ls.Obstacle("wall", "plane", np.array([wall, 0.0, 0.0]), _facing_x(), np.zeros(3))])
+    return linear(
+        [[0, 1], [0, 0]], [[0], [1]], [[0], [1]], steps=40, limits=(-limit, limit), position=("s0", "s1"),
+        costs=(ls.ObstacleCost(behind, radius=0.0, sharpness=10.0),),
+    )  # fmt: skip
+
+
+def _facing_x() -> Array:
+    """The rotation of a plane whose normal, its z axis, is along x."""
+    return np.array([[0, 0, 1.0], [0, 1.0, 0], [-1.0, 0, 0]])
+
+
+def test_the_nearest_obstacle_of_each_trial_is_where_it_was_displaced_to() -> None:
+    """Two balls, in closed form."""
+    centres, rng = np.array([[-1.0, 0.0, 0.0], [1.0, 0.5, 0.0]]), np.random.default_rng(0)
+    balls = [
+        ls.Obstacle(f"ball {i}", "sphere", centre, np.eye(3), np.array([0.5, 0, 0])) for i, centre in enumerate(centres)
+    ]
+    surroundings = _among(ls.World(balls), radius=0.2, std=0.3)
+    displaced, states = surroundings.displacements(rng, 2000), rng.normal(size=(2000, 2))
+    assert displaced[0][..., :2].std() == pytest.approx(0.3, rel=0.05)
+    assert not displaced[0][..., 2].any()  # a robot in a plane sees obstacles in it
+    away = np.linalg.norm(states[:, None] - centres[:, :2] - displaced[0][..., :2], axis=2) - 0.7
+    np.testing.assert_allclose(surroundings.nearest(states, displaced), away.min(axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("collided", [0, 1, 7, 40, 1000])
+@pytest.mark.parametrize("predicted", [0.0, 1e-9, 1e-3, 0.05, 0.9])
+def test_a_chance_is_between_the_predicted_and_the_counted_one(collided: int, predicted: float) -> None:
+    """And the counted one where an exact interval of 95 % does not have the predicted one."""
+    trials = 1000
+    hit = np.arange(trials) < collided
+    none = np.zeros((0, 0))
+    found = SampledLoop(none, none, none, none, none, hit, np.zeros(trials)).chance(predicted)
+    low, high = binomtest(collided, trials).proportion_ci(0.95, method="exact")
+    if low <= predicted <= high:
+        assert min(predicted, collided / trials) <= found <= max(predicted, collided / trials)
+    else:
+        assert found == collided / trials
 
 
 # Dynamics that declare what disturbs them.

@@ -3,10 +3,13 @@
 The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
 for all steps. It is chosen such that the chance of any collision, as `collision_chance.py` computes it, is the
 requested one. A plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+
+Where no such clearance is safe enough, or there is no room for it, obstacles cost more and more instead. Such plans use
+all the room that there is, where a constraint says only that it is too little.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -24,6 +27,7 @@ from lqrsim.errors import (
     check_kind,
     check_number,
 )
+from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy
@@ -34,6 +38,8 @@ from lqrsim.solvers.smoother import smooth
 ENOUGH = 0.5
 HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
 AIM = 0.8  # target for the next plan, relative to the requested chance
+PATIENCE = 2  # plans in a row that are not safer than the safest, after which wider margins, or weights, are given up
+HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # times the weight of the obstacles' cost
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
@@ -42,12 +48,15 @@ class SafePlan:
     """A plan with its predicted chance of collision.
 
     Attributes:
-      problem: the problem, with the clearances that were found as constraints.
+      problem: the problem, with the clearances that were found as constraints; or with heavier obstacles.
       solution: solution of it.
       controller: the controller that follows the plan, an OffsetFree or a policy.
       tube: the prediction of its runs; `tube.collision_chance` is the chance.
       asked: the requested chance.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
+      weight: by how much the weight of the problem's obstacles is multiplied, in its own cost as well; mostly by 1.
+      instead: if it is not safe enough, the predicted chances on the same plan with actuators that do not lag, twice
+        their range, exact sensors, and all of these: what limits it.
     """
 
     problem: Problem
@@ -56,6 +65,8 @@ class SafePlan:
     tube: Tube
     asked: float
     rounds: tuple[tuple[float, float, float, float], ...]
+    weight: float = 1.0
+    instead: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, kind in (("problem", Problem), ("solution", Solution), ("tube", Tube)):
@@ -66,6 +77,8 @@ class SafePlan:
         rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
         each = tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds)
         object.__setattr__(self, "rounds", each)
+        object.__setattr__(self, "weight", check_number("SafePlan: weight", self.weight, above=0.0))
+        check_kind("SafePlan: instead", self.instead, Mapping, "a dictionary of chances")
 
     @property
     def success(self) -> bool:
@@ -76,7 +89,13 @@ class SafePlan:
         lines = [f"{self.solution.summary()}", "  margin (m)       cost        chance of collision"]
         lines += [f"  {low:5.3f} to {high:5.3f}  {cost:10.6g}  {chance:.3g}" for low, high, cost, chance in self.rounds]
         verdict = "as asked" if self.success else "MORE than asked" if self.solution.success else "no solution"
-        return "\n".join([*lines, f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})"])
+        lines.append(f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})")
+        if self.weight != 1:
+            lines.append(f"  with {self.weight:g} times the weight of obstacles")
+        if self.instead:
+            each = ", ".join(f"{chance:.3g} with {what}" for what, chance in self.instead.items())
+            lines.append(f"  on this plan {each}")
+        return "\n".join(lines)
 
 
 def smooth_chance_constrained(
@@ -91,8 +110,9 @@ def smooth_chance_constrained(
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
     It ends when the chance is between half of the requested one and the requested one, or when the plan without any
-    clearance is safe enough. If no plan is safe enough, it returns the safest one found, with `success` False:
-    print(plan) says how far it got; allow a higher chance, estimate better, or permit another way round.
+    clearance is safe enough. If no clearance is safe enough, the problem's obstacles get 10 to 3000 times their weight.
+    If that does not do either, it returns the safest plan found, with `success` False: print(plan) says how far it got;
+    allow a higher chance, estimate better, or permit another way round.
 
     Args:
       problem: a problem with obstacles in its costs or constraints.
@@ -100,7 +120,7 @@ def smooth_chance_constrained(
       chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
-      rounds: plans to solve for, at most.
+      rounds: plans with clearances to solve for, at most.
       progress: called with the rounds that are done, all of them, and what the last one found as text.
 
     Returns:
@@ -131,9 +151,39 @@ def smooth_chance_constrained(
             if deviations is None:
                 break
             search.solve(deviations)
+        for times in search.heavier():
+            search.solve_heavier(times)
     if progress is not None:
         progress(rounds, rounds, search.last())
     return search.result()
+
+
+def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
+    """Predicted chances of collision on a plan, if one thing after another were better, and if all were.
+
+    An OffsetFree is made for that.
+    """
+    policy = plan.solution.policy
+    space = policy.control_coordinates
+    half = 0.5 * np.subtract(space.high, space.low)
+    wider = replace(space, low=tuple(np.subtract(space.low, half)), high=tuple(np.add(space.high, half)))
+    no_lag, no_noise = {"lag": 0.0}, {"measurement": 0.0, "loss": 0.0}
+    cases: dict[str, tuple[bool, dict[str, float]]] = {
+        "no lag": (False, no_lag), "twice the range of controls": (True, {}), "exact sensors": (False, no_noise),
+        "all of these": (True, no_lag | no_noise),
+    }  # fmt: skip
+    found = {}
+    for what, (strong, changes) in cases.items():
+        solution, told = plan.solution, replace(uncertainty, **changes)
+        if strong:
+            solution = replace(solution, policy=replace(policy, control_coordinates=wider))
+        law = plan.controller
+        if isinstance(law, OffsetFree):
+            law = OffsetFree(plan.problem, solution, told)
+        elif strong:
+            law = replace(law, control_coordinates=wider)
+        found[what] = predict_tube(plan.problem, solution, told, law).collision_chance
+    return found
 
 
 class _Search:
@@ -174,15 +224,8 @@ class _Search:
         if not solution.success and self.plans:
             self.impossible = min(self.impossible, deviations or 0.0)
             return
-        controller, self.margin = self._controller(problem, solution), margin
-        tube = predict_tube(problem, solution, self.uncertainty, controller)
-        self.lines.append((float(margin.min()), float(margin.max()), solution.cost, tube.collision_chance))
-        self.plans.append(
-            SafePlan(
-                problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked,
-                rounds=tuple(self.lines),
-            )
-        )  # fmt: skip
+        self.margin = margin
+        tube = self._keep(problem, solution, 1.0)
         if deviations is None:
             return
         if tube.collision_chance > self.asked:
@@ -190,6 +233,42 @@ class _Search:
                 self.too_few, self.log_of_too_few = deviations, np.log(tube.collision_chance)
         elif not second and deviations < self.enough:  # the second plan's margins are others, and may be too large
             self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
+
+    def _keep(self, problem: Problem, solution: Solution, weight: float) -> Tube:
+        """Predict the outcome of a plan, and keep it."""
+        controller, margin = self._controller(problem, solution), self.margin
+        tube = predict_tube(problem, solution, self.uncertainty, controller)
+        self.lines.append((float(margin.min()), float(margin.max()), solution.cost, tube.collision_chance))
+        self.plans.append(
+            SafePlan(
+                problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked,
+                rounds=tuple(self.lines), weight=weight,
+            )
+        )  # fmt: skip
+        return tube
+
+    def heavier(self) -> Iterator[float]:
+        """The weights of obstacles to try, as long as no plan is safe enough and heavier ones help."""
+        if self.problem.obstacle_costs:
+            first = len(self.plans)
+            for times in HEAVIER:
+                if self._best().success or self._gave_up(first):
+                    return
+                yield times
+
+    def solve_heavier(self, times: float) -> None:
+        """Plan with heavier obstacles and without margins, and predict the outcome."""
+        terms = terms_of(self.problem.stage_cost)
+        costs = tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms)
+        problem = self.problem.with_costs(stage_cost=CostSum(costs))
+        solution, self.margin = smooth(problem), np.zeros((1, 1))
+        if solution.success:
+            self._keep(problem, solution, times)
+
+    def _gave_up(self, first: int) -> bool:
+        """Whether the last plans, of those from the first on, were no safer than the safest of these."""
+        chances = [plan.tube.collision_chance for plan in self.plans[first:]]
+        return len(chances) > PATIENCE and min(chances[-PATIENCE:]) >= min(chances[:-PATIENCE])
 
     def _controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
         if self.make is not None:
@@ -214,6 +293,8 @@ class _Search:
         best = self._best()
         if not first and best.success and best.tube.collision_chance >= ENOUGH * self.asked:
             return None
+        if self._gave_up(0):
+            return None
         if np.isfinite(self.impossible):  # between a margin that has a plan and one that has none
             low = self.too_few if not np.isfinite(self.enough) else None
             if low is None or self.impossible - low < 0.05 * self.impossible:
@@ -237,11 +318,15 @@ class _Search:
         """
         clearance, std, correlation = self._spread(plan)
         clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
+        # The moments' chance of the next plan is taken to be as wrong as that of this one.
+        wanted, tube = AIM * self.asked, plan.tube
+        if tube.collision_chance > 0:
+            wanted *= tube.linear_chance / tube.collision_chance
         low, high = 0.0, 12.0
         for _ in range(40):
             middle = (low + high) / 2
             moved = np.maximum(clearance, middle * std)
-            safe = chance_of_clearances(moved / std, correlation)[1] <= AIM * self.asked
+            safe = chance_of_clearances(moved / std, correlation)[1] <= wanted
             low, high = (low, middle) if safe else (middle, high)
         return high
 
@@ -258,4 +343,7 @@ class _Search:
         return f"chance {chance:.2g} with margins of {low:.3g} to {high:.3g} m, cost {cost:.5g}"
 
     def result(self) -> SafePlan:
-        return replace(self._best(), rounds=tuple(self.lines))
+        best = replace(self._best(), rounds=tuple(self.lines))
+        if best.success or not best.solution.success:
+            return best
+        return replace(best, instead=chances_instead(best, self.uncertainty))

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, owens_t
 
-from lqrsim.codegen.distances import distances_with_normals
+from lqrsim.codegen.distances import distances_with_normals, signed_distance_displaced
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate_slopes
+from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate, evaluate_slopes
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
@@ -135,6 +135,29 @@ class Surroundings:
         normals = normals.reshape(len(states), count, -1, 3)[knots, nearest, obstacle]
         moves = slopes[knots, nearest][..., list(self.position)]
         return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
+
+    @property
+    def by_mujoco(self) -> bool:
+        """Whether distances are those of MuJoCo's geoms."""
+        return any(one.geoms is not None for one in self.worlds)
+
+    def displacements(self, rng: np.random.Generator, trials: int) -> list[Array]:
+        """By how much the obstacles of each world are off in K trials, (K, O, 3), in their plane; planes stay."""
+        axes = np.arange(3) < (len(self.place) or 3)
+        std = [np.array([self.std * axes * (one.kind != "plane") for one in seen.obstacles]) for seen in self.seen]
+        return [own * rng.standard_normal((trials, *own.shape)) for own in std]
+
+    def nearest(self, states: Array, displaced: list[Array]) -> Array:
+        """Clearance of states (K, n) to the nearest obstacle, (K,), the obstacles of each world displaced (K, O, 3)."""
+        nearest = np.full(len(states), np.inf)
+        for one, seen, places, away in zip(self.worlds, self.seen, self.places, displaced, strict=True):
+            if one.balls is None or places is None:
+                points, radii = states[:, None, list(self.place)], one.radius
+            else:
+                points, radii = evaluate(places, len(one.balls), states), one.balls.radii
+            clearance = signed_distance_displaced(seen, points, away) - radii
+            nearest = np.minimum(nearest, clearance.min(axis=1))
+        return nearest
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
         """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""

@@ -1,7 +1,8 @@
 """Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion.
+are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion. The chance of collision is that of
+these moments as far as trials of the nonlinear model do not refute it; `sampled_loop.py` has them.
 """
 
 from dataclasses import dataclass, replace
@@ -10,19 +11,24 @@ from functools import cached_property
 import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
-from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.controllers import ControllerLike, Feedback
+from lqrsim.control.linear_loop import LinearLoop, LoopMoments
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_kind, check_number, shaped
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, shaped
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
+
+# Trials by default: as many as this many numbers in all, z at each step; at least and at most.
+NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
+STRAY = 6.0  # standard deviations of the position, of the direction and the knot with the largest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +45,14 @@ class Tube:
         filter.
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
-      step_chance: the chance of being in collision at each knot, (T+1,); bounded by the sum over obstacles.
-      collision_chance: chance of colliding at all.
+      step_chance: the chance of being in collision at each knot by these moments, (T+1,); bounded by the sum over
+        obstacles.
+      linear_chance: chance of colliding at all, by these moments.
+      collision_chance: the same by moments and sampled trials: the share of the trials that collide, if that refutes
+        the moments' chance, else both together.
+      samples: number of sampled trials.
+      strays: share of these that get farther from the plan than six of the position's largest standard deviations.
+        They are not what the moments describe.
 
     Raises:
       InputError: arrays that do not fit together.
@@ -55,7 +67,10 @@ class Tube:
     command: Array
     saturation: Array
     step_chance: Array
+    linear_chance: float
     collision_chance: float
+    samples: int = 0
+    strays: float = 0.0
 
     def __post_init__(self) -> None:
         plan = check_kind("Tube: plan", self.plan, Trajectory, "a Trajectory")
@@ -68,8 +83,10 @@ class Tube:
         for name, shape in shapes.items():
             if name != "estimate_covariance" or self.estimate_covariance is not None:
                 object.__setattr__(self, name, shaped(f"Tube: {name}", getattr(self, name), shape))
-        chance = check_number("Tube: collision_chance", self.collision_chance, at_least=0.0, at_most=1.0)
-        object.__setattr__(self, "collision_chance", chance)
+        for name in ("linear_chance", "collision_chance", "strays"):
+            share = check_number(f"Tube: {name}", getattr(self, name), at_least=0.0, at_most=1.0)
+            object.__setattr__(self, name, share)
+        object.__setattr__(self, "samples", check_count("Tube: samples", self.samples, at_least=0))
 
     @cached_property
     def position_covariance(self) -> Array:
@@ -98,28 +115,41 @@ class Tube:
 
 
 def predict_tube(
-    problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: ControllerLike | None = None
+    problem: Problem,
+    solution: Solution,
+    uncertainty: Uncertainty,
+    controller: ControllerLike | None = None,
+    *,
+    samples: int | None = None,
+    seed: int = 0,
 ) -> Tube:
     """Predict the distribution of a run about its plan, and its chance of collision.
 
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
       solution: the solution whose plan is run.
-      uncertainty: the uncertainty in a run.
+      uncertainty: the uncertainty in a run. With a latency or a delay mean and covariance are those of the samples that
+        stay finite.
       controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
+      samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
+        plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
+        written in plain Python, and with distances by MuJoCo.
+      seed: of these.
 
     Returns:
       The Tube.
 
     Raises:
-      InputError: something does not fit the system; the controller is of another kind; or the uncertainty has a latency
-        or a delay, which the linear model does not have.
+      InputError: something does not fit the system; the controller is of another kind; samples are asked for where
+        distances are MuJoCo's; or there is a latency or a delay and there are no samples.
     """
     check_plan("predict_tube", problem, solution)
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+    check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=10**7)
+    check_count("predict_tube: seed", seed, at_least=0)
     plan = solution.trajectory
     if isinstance(controller, OffsetFree):
-        loop = controller.loop()
+        loop, law = controller.loop(), controller
     else:
         asked: object = solution.policy if controller is None else controller
         policy = check_kind("predict_tube: controller", asked, AffinePolicy, "an OffsetFree or an AffinePolicy")
@@ -127,32 +157,51 @@ def predict_tube(
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         space = policy.control_coordinates
-        loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
-    return tube_of(loop, Surroundings.of(problem, uncertainty.obstacles))
+        loop, law = (
+            LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high)),
+            Feedback(policy),
+        )
+    surroundings, told = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
+    late = [f"{field} of {getattr(told, field)}" for field in ("latency", "delay") if getattr(told, field)]
+    if samples is None:
+        slow = problem.dynamics.discrete or problem.dynamics.level == "plain" or surroundings.by_mujoco
+        samples = 0 if slow or not (surroundings.worlds or late) else _affordable(loop.model)
+    if samples and surroundings.by_mujoco:
+        raise InputError(f"predict_tube: samples: got {samples} and distances by MuJoCo, want 0")
+    if late and not samples:
+        raise InputError(
+            f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"
+            " want more than 0"
+        )
+    trials = sample_loop(loop.model, law, (loop.low, loop.high), surroundings, samples, seed) if samples else None
+    return _tube(loop, None if late else loop.moments(), trials, surroundings)
 
 
-def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
-    """The tube of a closed loop among obstacles. Raises InputError for a controller that the linear model does not
-    cover.
-    """
-    model = loop.model
-    for field in ("latency", "delay"):
-        if getattr(model.uncertainty, field):
-            raise InputError(
-                f"Uncertainty: {field}: got {getattr(model.uncertainty, field)} control periods, want 0 for a tube:"
-                " it has neither latency nor delay"
-            )
-    moments = loop.moments()
-    n, size = model.n, model.size
-    mean, covariance = moments.mean[:, :n], moments.covariance[:, :n, :n]
-    estimate = None
-    if loop.filter_gain is not None:
+def _affordable(model: PlanModel) -> int:
+    return min(max(NUMBERS // (model.plan.steps * model.size), FEWEST), MOST)
+
+
+def _tube(
+    loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings
+) -> Tube:
+    """The tube by moments, or else by the trials' own."""
+    model, n, size, estimate = loop.model, loop.model.n, loop.model.size, None
+    if moments is not None and loop.filter_gain is not None:
         whole = moments.covariance
         guess, both = whole[:, size : size + n, size : size + n], whole[:, :n, size : size + n]
-        estimate = covariance + guess - both - both.transpose(0, 2, 1)
-    chance, total = collision_chance(model.plan.states + mean, covariance, moments.across, surroundings)
+        estimate = whole[:, :n, :n] + guess - both - both.transpose(0, 2, 1)
+    shown = moments or trials
+    assert shown is not None
+    mean, covariance = shown.mean[:, :n], shown.covariance[:, :n, :n]
+    chance, linear = collision_chance(model.plan.states + mean, covariance, shown.across, surroundings)
+    place, strays = list(model.dynamics.state_coordinates.position), 0.0
+    if trials is not None and place:
+        widest = np.sqrt(max(np.linalg.eigvalsh(covariance[:, place][:, :, place]).max(), 0.0))
+        strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
-        across=moments.across, estimate_covariance=estimate, command=moments.command,
-        saturation=moments.saturation, step_chance=chance, collision_chance=total,
+        across=shown.across, estimate_covariance=estimate, command=shown.command, saturation=shown.saturation,
+        step_chance=chance, linear_chance=linear, strays=strays,
+        collision_chance=linear if trials is None else trials.chance(linear),
+        samples=0 if trials is None else len(trials.collided),
     )  # fmt: skip

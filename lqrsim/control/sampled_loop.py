@@ -1,0 +1,143 @@
+"""Trials of a closed loop by the model that its filter predicts with, and the chance of collision that they show.
+
+The moments of `linear_loop.py` are those of small deviations. A robot whose commands stay at their limits leaves its
+plan, where its dynamics are others. Here the nonlinear dynamics run, with limits, lag, delays, and lost commands and
+measurements: a trial takes a tenth of the time that it takes in MuJoCo. A seed draws the same numbers for all plans and
+laws, so that two of them are compared on the same trials.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import betaincinv
+
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.control.collision_chance import Surroundings
+from lqrsim.control.controllers import Controller, turn_to_nearest
+from lqrsim.control.plan_model import Lag, PlanModel
+from lqrsim.control.uncertainty import per_entry
+from lqrsim.errors import Array
+
+# Collisions that a predicted chance counts for beside those of the trials: with fewer than these the prediction is the
+# better known of the two.
+PRIOR = 4.0
+REFUTED = 0.025  # It does not count if the trials have so many more, or so many fewer, with this chance.
+
+
+@dataclass(frozen=True)
+class SampledLoop:
+    """K trials.
+
+    Attributes:
+      mean: of the states' deviations from the plan, (T+1, n). covariance: (T+1, n, n). across: covariance with the
+        deviation at the knot before, (T, n, n). All three of the trials whose states stay finite.
+      command: standard deviation of each command, (T, m). saturation: share of the commands at their limits, (T, m).
+      collided: whether each trial collides at a knot, or its state is not finite, (K,).
+      farthest: largest distance of each trial from its plan in m, (K,).
+    """
+
+    mean: Array
+    covariance: Array
+    across: Array
+    command: Array
+    saturation: Array
+    collided: npt.NDArray[np.bool_]
+    farthest: Array
+
+    def chance(self, predicted: float) -> float:
+        """The chance of collision by these trials and a prediction."""
+        trials, found = len(self.collided), int(self.collided.sum())
+        low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
+        high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
+        if not low <= predicted <= high:
+            return found / trials
+        return (PRIOR + found) / (PRIOR / predicted + trials) if predicted else 0.0
+
+
+def sample_loop(
+    model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings, trials: int,
+    seed: int,
+) -> SampledLoop:  # fmt: skip
+    """Run K trials of a controller.
+
+    Args:
+      model: model of the true system. limits: lowest and highest controls, (m,) each.
+    """
+    plan, n = model.plan, model.n
+    robots, run = _Robots(model, limits, trials, np.random.default_rng(seed)), controller.start(trials)
+    displaced, place = surroundings.displacements(robots.rng, trials), list(surroundings.place)
+    collided, farthest = np.zeros(trials, dtype=bool), np.zeros(trials)
+    states, commands = np.empty((plan.steps + 1, trials, n)), np.empty((plan.steps, trials, model.m))
+    with np.errstate(over="ignore", invalid="ignore"):  # trials that are lost
+        for t in range(plan.steps + 1):
+            states[t] = robots.states(t)
+            finite = np.isfinite(states[t]).all(axis=1)
+            collided |= ~finite
+            collided[finite] |= surroundings.nearest(states[t, finite], [one[finite] for one in displaced]) < 0
+            off = states[t][:, place] - plan.states[t, place]
+            farthest = np.maximum(farthest, np.where(finite, np.linalg.norm(off, axis=1), np.inf))
+            if t < plan.steps:
+                commands[t] = robots.advance(t, run.control(t, robots.measure(t)))
+    off = (states - plan.states[:, None])[:, np.isfinite(farthest)]
+    mean = off.mean(axis=1)
+    off -= mean[:, None]
+    count = max(off.shape[1], 1)
+    at_limit = (commands <= limits[0]) | (commands >= limits[1])
+    return SampledLoop(
+        mean, off.transpose(0, 2, 1) @ off / count, off[1:].transpose(0, 2, 1) @ off[:-1] / count,
+        commands.std(axis=1), at_limit.mean(axis=1), collided, farthest,
+    )  # fmt: skip
+
+
+class _Robots:
+    """The true systems of K trials: their z as in `plan_model.py`, in absolute numbers; and the links to them."""
+
+    def __init__(self, model: PlanModel, limits: tuple[Array, Array], trials: int, rng: np.random.Generator) -> None:
+        plan, told = model.plan, model.uncertainty
+        self.model, self.limits, self.rng, self._trials = model, limits, rng, trials
+        start = np.concatenate([plan.states[0], model.reached[0], np.zeros(len(model.transition))])
+        self.z = start + self._normal(model.size) @ model.start_root.T
+        # Noise on controls counts before their limits, so not as noise on states.
+        self._shaken = per_entry("Uncertainty: control", told.control, model.dynamics.control_coordinates)
+        self._roots = replace(model, uncertainty=replace(told, control=0.0)).process_root
+        arrived = Lag.of(told.lag, plan.dt)
+        self._predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
+        # What is under way: until the first measurement arrives it is repeated; until the first command does, the
+        # plan's controls are applied.
+        self._late_measured = deque[Array]()
+        first = [np.tile(plan.controls[min(i, plan.steps - 1)], (trials, 1)) for i in range(told.delay)]
+        self._late_commands = deque(first)
+        self._shown, self._applied = np.tile(plan.states[0], (trials, 1)), np.tile(plan.controls[0], (trials, 1))
+
+    def _normal(self, size: int) -> Array:
+        return self.rng.standard_normal((self._trials, size))
+
+    def states(self, t: int) -> Array:
+        """The states (K, n), angles near the plan's."""
+        model = self.model
+        x = self.z[:, : model.n].copy()
+        turn_to_nearest(model.dynamics.state_coordinates, x[None], model.plan.states[t : t + 1])
+        self.z[:, : model.n] = x
+        return x
+
+    def measure(self, t: int) -> Array:
+        """What is shown, (K, n)."""
+        told, measured = self.model.uncertainty, self._late_measured
+        measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.shown_std)
+        shown = measured.popleft() if t >= told.latency else measured[0]
+        lost = self.rng.random((self._trials, 1)) < told.loss
+        self._shown = np.where(lost, self._shown, shown)
+        return self._shown
+
+    def advance(self, t: int, commands: Array) -> Array:
+        """Advance by a control period, under commands (K, m). Returns those that were applied."""
+        told, model = self.model.uncertainty, self.model
+        self._late_commands.append(commands)
+        lost = self.rng.random((self._trials, 1)) < told.command_loss
+        self._applied = np.where(lost, self._applied, self._late_commands.popleft())
+        shaken = np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits)
+        model.compiled.predict(self._trials, in_c_order(shaken), self._predictor, self.z)
+        self.z += self._normal(model.size) @ self._roots[t].T
+        return shaken
