@@ -32,6 +32,7 @@ from lqrsim.simulation.disturbances.base import (
     unknowns_of,
     words,
 )
+from lqrsim.simulation.mujoco_physics import bodies
 from lqrsim.simulation.plant import Plant
 
 CUT = 3.0  # standard deviations at which normal numbers are truncated
@@ -143,6 +144,7 @@ class Payload(Disturbance):
         check_text("Payload: body", self.body, "the name of a body")
 
     def check(self, plant: Plant) -> None:
+        plant.check_simulator(type(self).__name__)
         self._number(plant)
 
     def _number(self, plant: Plant) -> int:
@@ -157,6 +159,7 @@ class Payload(Disturbance):
         return replace(self, mass=times(self, self.mass, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
         number = self._number(plant)
 
         def alter(simulations: batch.Batch) -> None:
