@@ -160,6 +160,33 @@ def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_one
     ]
 
 
+SWIMMER = """<mujoco><option timestep="0.01" density="4000" viscosity="0.1" integrator="RK4"/>
+  <compiler autolimits="true"/><default><geom type="capsule" size="0.1" density="1000" contype="0" conaffinity="0"/>
+  <joint armature="0.1"/></default><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+  <joint name="y" type="slide" axis="0 1 0"/><joint name="turn" axis="0 0 1"/><geom fromto="1.5 0 0 0.5 0 0"/>
+  <body pos="0.5 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="a" axis="0 0 1" range="-20 20"/>
+  <body pos="-1 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="b" axis="0 0 1" range="-20 20"/></body></body></body>
+  </worldbody><actuator><motor joint="a" gear="150" ctrlrange="-1 1"/><motor joint="b" gear="150" ctrlrange="-1 1"/>
+  </actuator></mujoco>"""
+
+
+def test_softening_does_not_bring_back_a_plan_that_does_nothing() -> None:
+    robot = ls.MjcfRobot(scene_from_xml(SWIMMER, "swimmer"))
+    low, high = robot.dynamics.control_coordinates.low, robot.dynamics.control_coordinates.high
+    ends = [100.0, *[0.0] * 9]
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.04, steps=25, initial=ls.FixedState(robot.at()),
+        stage_cost=ls.ControlCost([0.01, 0.01]), final_cost=ls.QuadraticCost(ends, about=robot.at(x=0.5)),
+        control_limits=(low, high),
+    )  # fmt: skip
+    solution = ls.smooth(problem, max_iterations=6)
+    rest = solution.candidates[0]
+    assert rest.status is ls.Status.CONVERGED
+    assert any("softness" in one.start for one in solution.candidates)
+    assert rest.cost == pytest.approx(0.5 * 100 * 0.5**2)  # at rest, that of the goal alone
+    assert solution.cost < 0.99 * rest.cost
+
+
 def test_the_time_limit_ends_the_solves_for_softer_contacts_too() -> None:
     robot = robot_of("leg", 1.0)
     solution = ls.smooth(hop(robot), time_limit=1e-6)

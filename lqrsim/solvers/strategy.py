@@ -306,8 +306,9 @@ class Search:
             found = self._to_its_end(run, refine, self._known)
         stages = ", ".join(one.start.removeprefix("contacts of softness ") for one in self._softer)
         detail = f"begun with contacts of softness {stages}; {found.detail}".removesuffix("; ")
-        self._finished.append((run, replace(found, detail=detail)))
-        self._finished.sort(key=lambda pair: pair[1].rank)
+        # The best so far may have been put before a plan that converged, but does nothing; so nothing is sorted here.
+        better = found.rank < self.best[1].rank
+        self._finished.insert(0 if better else len(self._finished), (run, replace(found, detail=detail)))
 
     def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
         """Plan for softer contacts: from that policy, or by a search where there is none."""
