@@ -41,6 +41,9 @@ from lqrsim.simulation.disturbances.wind import first_order
 from lqrsim.simulators import RotorPy
 from lqrsim.stress.statistics import rate
 
+Kind = Literal["none", "wind", "force", "torque", "model", "rotors", "payload"]
+Part = Literal["ranges", "when2fail", "delay"]
+
 ARM, THRUST = 0.166, 7.64e-6  # m; N s2
 VEHICLE: dict[str, Any] = {
     "mass": 0.826, "Ixx": 0.0047, "Iyy": 0.005, "Izz": 0.0074, "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0,
@@ -56,8 +59,8 @@ T, DT, REACH = 5.0, 0.01, 2.0  # s, s, and the SI units of the references' ends
 FAILED = 5.0  # m, root mean square
 LOST = 1.0  # m, at most, for the delay margin
 # Largest strengths of the ranges, and the steps of when2fail: m/s, N, N m, share, share, share of the mass.
-RANGES = {"wind": 3.0, "force": 1.0, "torque": 0.1, "model": 0.1, "rotors": 0.3, "payload": 0.5}
-STEPS = {
+RANGES: dict[Kind, float] = {"wind": 3.0, "force": 1.0, "torque": 0.1, "model": 0.1, "rotors": 0.3, "payload": 0.5}
+STEPS: dict[Kind, tuple[float, ...]] = {
     "wind": (10.0, 20.0), "force": (2.0, 4.0), "torque": (0.15, 0.2), "model": (0.4, 0.8), "rotors": (0.4, 0.6),
     "payload": (1.0, 2.0),
 }  # fmt: skip
@@ -72,9 +75,6 @@ TOLD = ls.Uncertainty(
 )
 TOLERATE, EFFORT = {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 2.0}, 0.2
 EVERY = 0.5  # s, between re-plans
-
-Kind = Literal["none", "wind", "force", "torque", "model", "rotors", "payload"]
-Part = Literal["ranges", "when2fail", "delay"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +118,11 @@ class Bench(Disturbance):
 
             return Effect(factors=factors, torque=torque)
         pushed = np.stack([part["over_time"] for part in parts])  # (K, T, 3)
-        hook = {self.kind: lambda step, states: pushed[:, step]}
-        return Effect(**hook)
+
+        def push(step: int, states: Array) -> Array:
+            return pushed[:, step]
+
+        return {"wind": Effect(wind=push), "force": Effect(force=push), "torque": Effect(torque=push)}[self.kind]
 
     def _drawn(self, generator: np.random.Generator, plan: Trajectory) -> dict[str, Array]:
         low, high = self.least, self.most
@@ -217,7 +220,7 @@ def problem_of(reference: Callable[[Array], Array]) -> ls.Problem:
     assert isinstance(robot, ls.Quadrotor)
     force = robot.hover_force
     end = np.concatenate([reference(np.array([T]))[0], np.zeros(6)])
-    weight = np.array([1000.0] * 3 + [10.0] * 3)
+    weight = [1000.0] * 3 + [10.0] * 3
     return ls.Problem(
         dynamics=robot.dynamics, dt=DT, steps=round(T / DT), initial=ls.FixedState(np.zeros(12)),
         stage_cost=ls.ControlCost(np.full(4, 1 / force**2), about=np.full(4, force)) + ReferenceCost(reference, weight),

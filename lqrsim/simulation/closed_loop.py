@@ -279,7 +279,7 @@ class ClosedLoop:
             disturbances=tuple(disturbance.describe(plant) for disturbance in settings.disturbances),
             seed=settings.seed,
             first_trial=settings.first_trial,
-            versions=versions() | (plant.simulator.versions if plant.simulator is not None else {}),
+            versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
             controller_run=self.controller_run,
         )

@@ -48,7 +48,7 @@ class Physics(abc.ABC):
         self.plant, self._part, self.parts = plant, part, substeps // part
         self._every = part_of(plant, substeps) // part
         self.drawn_parts = self.parts // self._every
-        self.unstable = np.zeros(trials, dtype=bool)
+        self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
 
     @abc.abstractmethod
     def place(self, states: Array) -> None:

@@ -4,7 +4,9 @@ Both have rotors between the axes of the body. `Quadrotor` has them on its axes,
 about the vertical one, and rotors are numbered from its x axis, counterclockwise from above.
 """
 
+import contextlib
 import importlib
+import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,7 +82,8 @@ def package(module: str, extra: str) -> Any:
     """A module of a package that an extra installs. Raises InputError with that extra if it is not there."""
     name = module.partition(".")[0]
     try:
-        return importlib.import_module(module)
+        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx says there what it can do without
+            return importlib.import_module(module)
     except ImportError:
         raise InputError(f"{name}: got none, want it installed: pip install 'lqrsim[{extra}]'") from None
     except RuntimeError as error:
