@@ -41,9 +41,9 @@ LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
 LATELY = 4  # iterations with that rule; to continue, the measures must be better than in the worst of them
 # Most corrections after a long step, and the largest share of the violation that each may leave.
 CLOSINGS, CLOSER = 3, 0.3
-# Part of a step below which its products are centred; how much further that looks, and the share of this that it must
-# gain; the factor by which products may then differ from the barrier's parameter.
-EARLY, REACH, FURTHER, OUTLIER = 0.5, 0.5, 0.1, 10.0
+# How much further the centring of a step that is not long looks, and the share of this that it must gain; the factor by
+# which products may then differ from the barrier's parameter.
+REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
 NOTHING, FAR = 1e-4, 1e-2  # scale of the first plan, relative to the typical cost of a change: the least; if infinite
 SHORTEST = 1e-7  # part of a step before the line search gives up
@@ -814,7 +814,7 @@ class InteriorPoint:
         """
         moved, slack = self._sign * step.multipliers[self._row], self.point.slack
         part, dual_part = self._longest(slack, step.slack), self._longest(duals, moved)
-        if part >= EARLY:
+        if part >= LONG:
             return step, corrections
         products = (slack + min(1.0, part + REACH) * step.slack) * (duals + min(1.0, dual_part + REACH) * moved)
         wanted = np.clip(products, self.parameter / OUTLIER, OUTLIER * self.parameter)
