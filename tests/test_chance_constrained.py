@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,26 @@ def test_what_cannot_be_is_said_to_fail(problem: ls.Problem) -> None:
     plan = ls.smooth_chance_constrained(problem, wild, chance=1e-4, controller=tracked, rounds=3)
     assert not plan.success
     assert plan.tube.collision_chance > 1e-4
+    assert list(plan.instead) == ["no lag", "twice the range of controls", "exact sensors", "all of these"]
+    assert plan.instead["no lag"] == plan.tube.collision_chance  # there is none
+    assert plan.instead["exact sensors"] < plan.tube.collision_chance
+    assert f"{plan.instead['exact sensors']:.3g} with exact sensors" in str(plan)
+
+
+def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -> None:
+    """One round of margins between two pillars is not enough; heavier ones lead round them."""
+    pillars = [
+        ls.Obstacle(f"pillar {side}", "cylinder", np.array([0.0, side, 0.0]), np.eye(3), np.array([0.6, 2.0, 0.0]))
+        for side in (-1.0, 1.0)
+    ]
+    stage = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(ls.World(pillars), radius=RADIUS, sharpness=10.0)
+    narrow, wild = replace(problem, stage_cost=stage), ls.Uncertainty(start=0.2, control=3.0, measurement=0.2)
+    plan = ls.smooth_chance_constrained(narrow, wild, chance=1e-3, controller=tracked, rounds=1)
+    assert plan.success
+    assert plan.weight > 1
+    (cost,) = plan.problem.obstacle_costs
+    assert cost.weight == plan.weight
+    assert f"with {plan.weight:g} times the weight of obstacles" in str(plan)
 
 
 def test_a_margin_of_each_knot_is_kept(problem: ls.Problem) -> None:

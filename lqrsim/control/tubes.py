@@ -145,7 +145,7 @@ def predict_tube(
     """
     check_plan("predict_tube", problem, solution)
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
-    check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=10**7)
+    check_count("predict_tube: samples", 0 if samples is None else samples, at_least=0, at_most=40_000)
     check_count("predict_tube: seed", seed, at_least=0)
     plan = solution.trajectory
     if isinstance(controller, OffsetFree):
