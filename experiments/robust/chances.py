@@ -81,7 +81,7 @@ class Bar(MyRobot):
     """The template's robot with a bar before it."""
 
     @property
-    def balls(self) -> ls.CollisionSpheres:
+    def balls(self) -> ls.CollisionSpheres:  # pyright: ignore[reportIncompatibleVariableOverride]
         def places(x: Any, p: Any) -> list[tuple[Any, Any]]:
             return [(x[0], x[1]), *((x[0] + 0.18, x[1] + beside) for beside in (-0.12, 0.0, 0.12))]
 
@@ -91,10 +91,9 @@ class Bar(MyRobot):
 def template(robot: MyRobot, number: int) -> Case:
     """The template's robot, or the one with a bar, past its crate, with forces that its motors cannot always resist."""
     scene, rng = ls.load_scene(MJCF), np.random.default_rng(number)
-    outline = {"radius": robot.radius} if robot.balls is None else {"balls": robot.balls}
     problem = ls.Problem(
         dynamics=robot.dynamics, dt=0.05, steps=80, initial=ls.FixedState((-1.2, rng.uniform(-0.6, 0.6), 0.0, 0.0)),
-        stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(scene.world, sharpness=20.0, **outline),
+        stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(scene.world, sharpness=20.0, **robot.shape),
         final_cost=ls.QuadraticCost((5000.0,) * 4, about=(1.4, rng.uniform(-0.2, 0.6), 0.0, 0.0)),
     )  # fmt: skip
     disturbances = [
