@@ -66,7 +66,7 @@ STEPS: dict[Kind, tuple[float, ...]] = {
 }  # fmt: skip
 GUSTS = (0.98, 1.96)  # m/s, range of the turbulence's standard deviation
 # What the laws are told, whatever they meet; and what they may let each state deviate, with 0.2 of the hover force.
-TOLD = ls.Uncertainty(
+TOLD = ls.disturbances.Uncertainty(
     unknowns=[
         *(ls.disturbances.Unknown(f"force_{axis}", 0.5, 1.0) for axis in "xyz"),
         *(ls.disturbances.Unknown(f"torque_{axis}", 0.05, 1.0) for axis in "xyz"),

@@ -30,6 +30,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.stress.policies import make_controller
 from lqrsim.stress.statistics import rate
+from lqrsim.types import OutputFeedbackPolicy
 
 ROBOTS = ("differential_drive", "quadrotor")
 LAWS = ("smooth", "track", "offset_free")
@@ -75,7 +76,12 @@ class CompiledLaw(ls.Controller):
     """
 
     def __init__(
-        self, policy: ls.AffinePolicy | ls.OutputFeedbackPolicy, folder: Path, *, number: str = "double", **options: Any
+        self,
+        policy: ls.AffinePolicy | OutputFeedbackPolicy,
+        folder: Path,
+        *,
+        number: str = "double",
+        **options: Any,
     ) -> None:
         self.policy, self.number = policy, number
         self.exported = ls.export_c(policy, folder, number=number, **options)
@@ -116,12 +122,12 @@ class CompiledLaw(ls.Controller):
         return self.policy.state_coordinates, self.policy.control_coordinates
 
 
-class _Run(ls.ControllerRun):
+class _Run(ls.types.ControllerRun):
     def __init__(self, law: CompiledLaw, trials: int) -> None:
         self._law, self._last = law, np.full((trials, len(law.policy.state_coordinates)), np.nan)
-        self._filters = isinstance(law.policy, ls.OutputFeedbackPolicy)
+        self._filters = isinstance(law.policy, OutputFeedbackPolicy)
         self._z = np.tile(law.policy.nominal[0], (trials, 1)).astype(REAL[law.number])
-        self._chosen = OutputFeedback(law.policy).measures if isinstance(law.policy, ls.OutputFeedbackPolicy) else []
+        self._chosen = OutputFeedback(law.policy).measures if isinstance(law.policy, OutputFeedbackPolicy) else []
 
     def control(self, step: int, measured: Array) -> Array:
         law, commands = self._law, []
@@ -272,7 +278,7 @@ def on_board(law: CompiledLaw, rollout: ls.Rollout, solution: ls.Solution, folde
     """What the law takes on the emulated board along a run, and its commands beside the host's and Python's."""
     measured, commanded = rollout.measured[0, :-1].astype(np.float32), rollout.commanded[0]
     lost = np.zeros(len(measured), dtype=int)
-    if isinstance(law.policy, ls.OutputFeedbackPolicy):
+    if isinstance(law.policy, OutputFeedbackPolicy):
         lost[1:] = (measured[1:] == measured[:-1]).all(axis=1)
         measured = measured[:, OutputFeedback(law.policy).measures]
     rows = ",\n".join("{" + ", ".join(f"{value!s}f" for value in row) + "}" for row in measured)

@@ -144,8 +144,9 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         name = task.name.replace(" ", "_")
         camera = "overview" if isinstance(task, FamilyTask) else camera_of(robot)
         render_still(
-            config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
-        )
+            config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption"),
+            title=task.name,
+        )  # fmt: skip
     return row
 
 

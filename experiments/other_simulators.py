@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
+from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 from lqrsim.simulators import Crazyflow, RotorPy, Simulator
 from lqrsim.stress.statistics import rate
@@ -64,7 +65,7 @@ def problem_of(robot: ls.Quadrotor, query: int, dt: float) -> ls.Problem:
     )  # fmt: skip
 
 
-def gentle(robot: ls.Quadrotor, stated: ls.Uncertainty) -> Callable[[ls.Problem, ls.Solution], ls.OffsetFree]:
+def gentle(robot: ls.Quadrotor, stated: Uncertainty) -> Callable[[ls.Problem, ls.Solution], ls.OffsetFree]:
     """Makes an OffsetFree with the stated tolerances."""
     effort = EFFORT * robot.hover_force
     return lambda problem, plan: ls.OffsetFree(problem, plan, stated, tolerate=TOLERATE, effort=effort)
@@ -114,7 +115,7 @@ def laws(
     """Numbers of the model, name, plan, and what flies it under a preset: a law is made for that which it meets."""
     for numbers, robot in robots.items():
         problem, known = problem_of(robot, query, dt), lag if numbers == "fitted" else 0.0
-        stated = dict[str, ls.Uncertainty]()
+        stated = dict[str, Uncertainty]()
         for preset in PRESETS:
             disturbances = ls.disturbances.preset("calm" if preset == "undisturbed" else preset, plant)
             told = ls.uncertainty_of(ls.Plant(robot, plant.scene, plant.simulator), disturbances)

@@ -25,7 +25,7 @@ from lqrsim.errors import Array
 LENGTH, RADIUS, HEIGHT = 0.4, 0.03, 0.15  # m: of a link without its round ends, and where the plane is
 MASS, INERTIA = 0.6, 0.6 * 0.4**2 / 12  # of a link, kg and kg m^2, in whose middle its mass is
 ROTOR, DAMPING, TORQUE = 0.02, 0.4, 2.0  # of a joint: kg m^2, N m s; the most that its motor can do, N m
-LINK = ls.Capsule(LENGTH, RADIUS, 0.002)
+LINK = ls.types.Capsule(LENGTH, RADIUS, 0.002)
 JOINTS = ("shoulder", "elbow", "wrist")
 POSTS = {"first": (0.45, -0.55), "second": (0.6, 0.05), "third": (0.35, 0.6), "fourth": (-0.25, 0.65)}
 POST, MARGIN = 0.04, 0.02  # m: their radius, and what is to be left between links and posts at the steps

@@ -9,15 +9,12 @@ from . import simulators as simulators
 from . import stress as stress
 from . import types as types
 from . import view as view
-from .capsules import Capsule as Capsule
 from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
-from .control.controllers import ControllerRun as ControllerRun
 from .control.offset_free import OffsetFree as OffsetFree
 from .control.replanner import Replanner as Replanner
 from .control.tracking import track as track
 from .control.tubes import predict_tube as predict_tube
-from .control.uncertainty import Uncertainty as Uncertainty
 from .errors import InputError as InputError
 from .problem.clearance import Clearance as Clearance
 from .problem.collision_spheres import CollisionSpheres as CollisionSpheres
@@ -37,10 +34,7 @@ from .problem.noise import Noise as Noise
 from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
-from .results.coordinates import Coordinates as Coordinates
 from .results.export_c import export_c as export_c
-from .results.funnel import Funnel as Funnel
-from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.plan import Plan as Plan
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout

@@ -23,7 +23,7 @@ MOST = 10_000  # balls in a chain
 class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     """A capsule that is covered by a chain of balls, for `CollisionSpheres`.
 
-        link = ls.Capsule(length=0.4, radius=0.03, tolerance=0.002)
+        link = ls.types.Capsule(length=0.4, radius=0.03, tolerance=0.002)
 
         def arm(x, p):
             from sympy import cos, sin

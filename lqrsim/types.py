@@ -1,6 +1,8 @@
 """Records that functions return or take, for annotations and extensions."""
 
+from lqrsim.capsules import Capsule
 from lqrsim.control.chance_constrained import SafePlan
+from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.replan_rule import ReplanRecord
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.control.tubes import Tube
@@ -8,7 +10,10 @@ from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.export_c import ExportedC
+from lqrsim.results.funnel import Funnel
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
@@ -18,15 +23,20 @@ from lqrsim.verify.verdict import Verification
 
 __all__ = [
     "Candidate",
+    "Capsule",
     "Certificate",
     "ConstraintTerm",
+    "ControllerRun",
+    "Coordinates",
     "CostTerm",
     "DerivativeCheck",
     "ExportedC",
+    "Funnel",
     "Iteration",
     "LiveReplanner",
     "Moments",
     "Multipliers",
+    "OutputFeedbackPolicy",
     "PlantCheck",
     "PreparedSolver",
     "Quadratic",

@@ -256,7 +256,7 @@ class TestCapsule:
     @pytest.mark.parametrize(("length", "radius", "tolerance"), [(0.4, 0.03, 0.002), (1.0, 0.1, 0.01), (0.2, 0.3, 0.5)])
     def test_it_sticks_out_by_what_is_said(self, length: float, radius: float, tolerance: float) -> None:
         """Of points all over its surface, and by one ball fewer it would be more than asked."""
-        capsule = ls.Capsule(length, radius, tolerance)
+        capsule = ls.types.Capsule(length, radius, tolerance)
         assert capsule.missed <= tolerance
         centres = np.array(capsule.between((0.0, 0.0, 0.0), (length, 0.0, 0.0)))
         along = np.linspace(0, length, 2001)
@@ -288,8 +288,8 @@ class TestCapsule:
         assert seen > 60
 
     def test_of_no_length_it_is_a_ball(self) -> None:
-        assert ls.Capsule(0.0, 0.1, 0.01).count == 1
-        assert ls.Capsule(0.0, 0.1, 0.01).missed == 0
+        assert ls.types.Capsule(0.0, 0.1, 0.01).count == 1
+        assert ls.types.Capsule(0.0, 0.1, 0.01).missed == 0
 
     def test_pickled(self) -> None:
         assert pickle.loads(pickle.dumps(LINK)) == LINK
@@ -357,9 +357,9 @@ def with_u(x, u, p):
         (lambda: ls.Clearance(WORLD), "Clearance: got none of radius, balls and geoms, want one"),
         (lambda: ls.ObstacleCost(WORLD, balls=[0.1]), "ObstacleCost: balls: got"),  # pyright: ignore
         (lambda: ls.ObstacleCost(WORLD, radius=0.1).bind(ARM.dynamics), "without a position, want .* or balls="),
-        (lambda: ls.Capsule(1.0, 0.1, 0.0), "Capsule: tolerance: got 0"),
-        (lambda: ls.Capsule(1.0, -0.1, 0.1), "Capsule: radius: got -0.1"),
-        (lambda: ls.Capsule(1e6, 0.1, 1e-9), "balls, want at most 10000"),
+        (lambda: ls.types.Capsule(1.0, 0.1, 0.0), "Capsule: tolerance: got 0"),
+        (lambda: ls.types.Capsule(1.0, -0.1, 0.1), "Capsule: radius: got -0.1"),
+        (lambda: ls.types.Capsule(1e6, 0.1, 1e-9), "balls, want at most 10000"),
         (lambda: LINK.between((0, 0), (0, 0, 0)), "between: got"),
     ],
 )

@@ -50,10 +50,10 @@ def topics() -> dict[str, Any]:
 def policy(steps: int = 10, dt: float = 0.05) -> ls.AffinePolicy:
     """A law that differs from step to step."""
     rng = np.random.default_rng(0)
-    controls = ls.Coordinates(names=("push",), units=("N",), low=(-5.0,), high=(5.0,))
+    controls = ls.types.Coordinates(names=("push",), units=("N",), low=(-5.0,), high=(5.0,))
     return ls.AffinePolicy(
         gain=rng.normal(size=(steps, 1, 2)), offset=rng.normal(size=(steps, 1)), nominal=np.zeros((steps, 2)), dt=dt,
-        state_coordinates=ls.Coordinates(names=JOINT, units=("m", "m/s")), control_coordinates=controls,
+        state_coordinates=ls.types.Coordinates(names=JOINT, units=("m", "m/s")), control_coordinates=controls,
     )  # fmt: skip
 
 

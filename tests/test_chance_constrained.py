@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
 STEPS, DT = 40, 0.1
 PILLAR = ls.World([ls.Obstacle("pillar", "cylinder", np.array([0.0, 0.1, 0.0]), np.eye(3), np.array([0.4, 2.0, 0.0]))])
 RADIUS = 0.2
-UNCERTAINTY = ls.Uncertainty(start=0.05, control=1.5, measurement=0.03)
+UNCERTAINTY = Uncertainty(start=0.05, control=1.5, measurement=0.03)
 TOLERATE = {"m": 0.5, "m/s": 1.0}
 
 
@@ -107,7 +108,7 @@ def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: flo
     """
     cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
     changed: dict[str, Any] = {"stage_cost": cost}
-    narrow = ls.Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.2}, measurement=0.01)
+    narrow = Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.2}, measurement=0.01)
     asked = ls.Problem(**(fields(problem) | changed))
     plan = ls.smooth_chance_constrained(asked, narrow, chance=1e-3, controller=tracked)
     assert 0.5e-3 <= plan.tube.collision_chance <= 1e-3
@@ -117,7 +118,7 @@ def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: flo
 
 
 def test_what_is_safe_enough_stays_as_it_is(problem: ls.Problem) -> None:
-    calm = ls.Uncertainty(start=1e-6)
+    calm = Uncertainty(start=1e-6)
     plan = ls.smooth_chance_constrained(problem, calm, chance=0.5, controller=tracked)
     assert len(plan.rounds) == 1
     np.testing.assert_array_equal(plan.solution.trajectory.states, ls.smooth(problem).trajectory.states)
@@ -125,7 +126,7 @@ def test_what_is_safe_enough_stays_as_it_is(problem: ls.Problem) -> None:
 
 def test_what_cannot_be_is_said_to_fail(problem: ls.Problem) -> None:
     """Noise so strong that no way round is safe enough."""
-    wild = ls.Uncertainty(start=1.0, control=3.0, measurement=0.5)
+    wild = Uncertainty(start=1.0, control=3.0, measurement=0.5)
     plan = ls.smooth_chance_constrained(problem, wild, chance=1e-4, controller=tracked, rounds=3)
     assert not plan.success
     assert plan.tube.collision_chance > 1e-4
@@ -142,7 +143,10 @@ def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -
         for side in (-1.0, 1.0)
     ]
     stage = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(ls.World(pillars), radius=RADIUS, sharpness=10.0)
-    narrow, wild = replace(problem, stage_cost=stage), ls.Uncertainty(start=0.2, control=3.0, measurement=0.2)
+    narrow, wild = (
+        replace(problem, stage_cost=stage),
+        Uncertainty(start=0.2, control=3.0, measurement=0.2),
+    )
     plan = ls.smooth_chance_constrained(narrow, wild, chance=1e-3, controller=tracked, rounds=1)
     assert plan.success
     assert plan.weight > 1

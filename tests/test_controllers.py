@@ -14,7 +14,7 @@ from lqrsim.disturbances import ControlNoise, MeasurementDropouts, MeasurementNo
 from lqrsim.errors import Array
 
 NOISE = [ControlNoise(0.05), MeasurementNoise(0.01)]
-STATED = ls.Uncertainty(measurement=0.01, start=0.01, control=0.05)
+STATED = ls.disturbances.Uncertainty(measurement=0.01, start=0.01, control=0.05)
 TOLERATE = {"m": 0.05, "rad": 0.1}
 
 
@@ -206,7 +206,7 @@ def test_one_controller_serves_two_runs_at_once(
 
 def test_the_run_of_the_controller_stays_in_memory(plant: ls.Plant, drive_solution: ls.Solution, tmp_path: Any) -> None:
     run = ls.simulate(plant, drive_solution, frames=False)
-    assert isinstance(run.controller_run, ls.ControllerRun)
+    assert isinstance(run.controller_run, ls.types.ControllerRun)
     assert dataclasses.replace(run, seed=1).controller_run is run.controller_run
     assert copy.deepcopy(run).controller_run is None
     loaded = ls.load(ls.save(run, tmp_path / "run.npz"))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 
-SPACE = ls.Coordinates(
+SPACE = ls.types.Coordinates(
     names=("x", "heading", "rx", "ry", "rz"), units=("m", *("rad",) * 4), angles=(1,), rotation_vectors=(2,)
 )
 
@@ -64,4 +64,4 @@ def test_a_vector_near_enough_is_returned_to_the_bit() -> None:
 )
 def test_what_does_not_fit_is_refused(fields: dict, message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
-        ls.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})
+        ls.types.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})

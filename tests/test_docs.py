@@ -191,7 +191,7 @@ def test_robust_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     # The recursion of the file gives what the filter gave in the simulation, shown the same.
     np.testing.assert_allclose(names["control"], run.commanded[0, 0], rtol=0, atol=1e-9)
     with pytest.raises(ls.InputError, match=r"wind_z.*wind_x"):
-        ls.Uncertainty(unknowns=[ls.disturbances.Unknown("wind_z", std=1.0)]).check(names["mass"])
+        ls.disturbances.Uncertainty(unknowns=[ls.disturbances.Unknown("wind_z", std=1.0)]).check(names["mass"])
 
 
 def presets() -> str:

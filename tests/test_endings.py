@@ -165,7 +165,7 @@ def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant,
         None,
         "no predicted tube: the robot has no position",
     )
-    tube = ls.predict_tube(problem, swing, ls.Uncertainty(control=0.1))
+    tube = ls.predict_tube(problem, swing, ls.disturbances.Uncertainty(control=0.1))
     run = ls.simulate(arm, swing)
     with pytest.raises(ls.InputError, match=r"state_coordinates\.position: got none"):
         tube.added_to(run)
@@ -477,7 +477,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     scenario = ls.scenarios.quadrotor()
     tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
     # Estimates of drag that are negative make its predictions explode.
-    wrong = ls.Uncertainty(unknowns=[Unknown("drag", 60.0)], measurement=0.02, start=0.01)
+    wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("drag", 60.0)], measurement=0.02, start=0.01)
 
     def controller(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
         return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)

@@ -62,17 +62,17 @@ CASES = st.builds(
 
 
 @st.composite
-def coordinates(draw: st.DrawFn, sizes: st.SearchStrategy[int], *, turning: bool) -> ls.Coordinates:
+def coordinates(draw: st.DrawFn, sizes: st.SearchStrategy[int], *, turning: bool) -> ls.types.Coordinates:
     """Names, units, angles and rotation vectors, or limits on both sides, on one, or none."""
     names = draw(st.lists(NAMES, min_size=(size := draw(sizes)), max_size=size, unique=True))
     units = tuple(draw(st.lists(NAMES, min_size=size, max_size=size)))
     if not turning:
         low = [draw(st.sampled_from([-np.inf, -1.1, -0.3])) for _ in names]
         high = [draw(st.sampled_from([np.inf, 0.7, 0.1])) for _ in names]
-        return ls.Coordinates(names=tuple(names), units=units, low=tuple(low), high=tuple(high))
+        return ls.types.Coordinates(names=tuple(names), units=units, low=tuple(low), high=tuple(high))
     vector = (size - 3,) if size >= 3 and draw(st.booleans()) else ()
     angles = tuple(i for i in range(size - 3 * len(vector)) if draw(st.booleans()))
-    return ls.Coordinates(names=tuple(names), units=units, angles=angles, rotation_vectors=vector)
+    return ls.types.Coordinates(names=tuple(names), units=units, angles=angles, rotation_vectors=vector)
 
 
 @st.composite
@@ -90,7 +90,7 @@ def affine_policies(draw: st.DrawFn) -> tuple[Case, ls.AffinePolicy]:
 
 
 @st.composite
-def filters(draw: st.DrawFn) -> tuple[Case, ls.OutputFeedbackPolicy]:
+def filters(draw: st.DrawFn) -> tuple[Case, ls.types.OutputFeedbackPolicy]:
     """Filters with random recursions that forget; some rows are the same in all steps, as those of unknowns."""
     case, space = draw(CASES), draw(coordinates(st.integers(1, 4), turning=True))
     controls, measured = (draw(coordinates(st.integers(1, 3), turning=turning)) for turning in (False, True))
@@ -104,7 +104,7 @@ def filters(draw: st.DrawFn) -> tuple[Case, ls.OutputFeedbackPolicy]:
         values[:, shape[0] - same :] = values[0, shape[0] - same :]
         return values
 
-    policy = ls.OutputFeedbackPolicy(
+    policy = ls.types.OutputFeedbackPolicy(
         gain=drawn(m, Z), offset=drawn(m), correction=drawn(Z, Y, size=0.2), sensor=drawn(Y, n), sensor_offset=drawn(Y),
         transition=drawn(Z, Z, size=0.5), input=drawn(Z, m), drift=drawn(Z), nominal=drawn(Z), dt=0.05,
         state_coordinates=space, control_coordinates=controls, measured_coordinates=measured,
@@ -112,7 +112,7 @@ def filters(draw: st.DrawFn) -> tuple[Case, ls.OutputFeedbackPolicy]:
     return case, policy
 
 
-def turned(space: ls.Coordinates, near: Array, rng: np.random.Generator, size: float) -> Array:
+def turned(space: ls.types.Coordinates, near: Array, rng: np.random.Generator, size: float) -> Array:
     """States by up to `size` beside others, with whole turns on top; what is nearest is clear, up to rounding."""
     state = near + rng.uniform(-size, size, size=len(space))
     for i in space.angles:
@@ -124,7 +124,7 @@ def turned(space: ls.Coordinates, near: Array, rng: np.random.Generator, size: f
     return state
 
 
-def magnitude(space: ls.Coordinates, *vectors: Array) -> Array:
+def magnitude(space: ls.types.Coordinates, *vectors: Array) -> Array:
     """The sum of absolute values, (n,); in a rotation vector, of lengths."""
     total = np.sum(np.abs(vectors), axis=0)
     for i in space.rotation_vectors:
@@ -132,7 +132,7 @@ def magnitude(space: ls.Coordinates, *vectors: Array) -> Array:
     return total
 
 
-def beside(case: Case, space: ls.Coordinates, shown: Array, near: Array, off: Array) -> tuple[Array, Array]:
+def beside(case: Case, space: ls.types.Coordinates, shown: Array, near: Array, off: Array) -> tuple[Array, Array]:
     """The deviation from the nearest representative, and a bound of its error, (n,) each; `off` is that of `near`.
 
     Up to second order: an angle is turned by two operations, whose constant is rounded, too, and the difference is one
@@ -204,7 +204,7 @@ def test_policies_command_what_they_do_in_python(
 @settings(max_examples=20)
 @given(drawn=filters())
 def test_filters_estimate_and_command_what_they_do_in_python(
-    drawn: tuple[Case, ls.OutputFeedbackPolicy], tmp_path_factory: pytest.TempPathFactory
+    drawn: tuple[Case, ls.types.OutputFeedbackPolicy], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """One step from any estimate, with a measurement or without; in double also a whole run."""
     case, policy = drawn
@@ -260,7 +260,7 @@ def test_filters_estimate_and_command_what_they_do_in_python(
 def test_what_python_refuses_is_refused_and_changes_nothing(
     drive_solution: ls.Solution, differential_drive: ls.Scenario, tmp_path: Path, kind: str
 ) -> None:
-    policy: ls.AffinePolicy | ls.OutputFeedbackPolicy = drive_solution.policy
+    policy: ls.AffinePolicy | ls.types.OutputFeedbackPolicy = drive_solution.policy
     if kind == "filter":
         stated = ls.uncertainty_of(differential_drive.plant(), [ls.disturbances.MeasurementNoise(0.01)])
         law = ls.OffsetFree(differential_drive.problem, drive_solution, stated, tolerate={"m": 0.1, "rad": 0.2})

@@ -348,7 +348,7 @@ def test_ctrl_c_keeps_what_there_is_and_says_how_far_it_came(
     assert (process.returncode, error.splitlines()[-1]) == (130, "lqrsim: stopped")
     assert re.search(says, printed)
     if name == "funnel":
-        funnel = ls.load(tmp_path / "funnel.npz", ls.Funnel)
+        funnel = ls.load(tmp_path / "funnel.npz", ls.types.Funnel)
         assert funnel.levels[0] > 0
         assert funnel.levels[-1] == 0
         assert funnel.reasons[-1] == says

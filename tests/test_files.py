@@ -49,7 +49,7 @@ def test_a_file_says_what_it_holds(saved: Path, drive_solution: ls.Solution, tmp
     with pytest.raises(ls.InputError, match="holds a 'lqrsim solution', want a 'lqrsim rollout'"):
         ls.load(saved, ls.Rollout)
     with pytest.raises(ls.InputError, match="holds a 'lqrsim policy', want a 'lqrsim output feedback policy'"):
-        ls.load(policy, ls.OutputFeedbackPolicy)
+        ls.load(policy, ls.types.OutputFeedbackPolicy)
     with pytest.raises(ls.InputError, match=r"kind: got .*, want one of ls.Solution, ls.Rollout"):
         ls.load(saved, ls.Trajectory)  # pyright: ignore[reportArgumentType, reportCallIssue]
     with pytest.raises(ls.InputError, match="a folder, want a file; the folder of a campaign is opened"):
@@ -628,7 +628,7 @@ def test_a_funnel_that_its_trials_do_not_show_is_refused(tmp_path: Path, drive_s
     least = next(k for k in range(1001) if stats.beta.ppf(0.05 / 2, k, 1001 - k) >= funnel.rate)
     assert least > 900
     path = ls.save(dataclasses.replace(funnel, successes=np.array([least, 1000])), tmp_path / "funnel.npz")
-    assert ls.load(path, ls.Funnel).successes[0] == least
+    assert ls.load(path, ls.types.Funnel).successes[0] == least
     for successes in (least - 1, 0):
         rewrite(path, successes=np.array([successes, 1000]))
         with pytest.raises(ls.InputError, match=rf"successes: got {successes} of 1000 trials, which do not show"):

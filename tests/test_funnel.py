@@ -116,14 +116,14 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
     assert found.digest == again.digest
     options["seed"] = 5
     assert found.digest != ls.funnel(ice, PLAN, **options).digest
-    read = ls.load(ls.save(found, tmp_path / "funnel.npz"), ls.Funnel)
+    read = ls.load(ls.save(found, tmp_path / "funnel.npz"), ls.types.Funnel)
     assert read.digest == found.digest
     for name in ("states", "family", "reasons", "rate", "confidence", "simulated", "seed", "options", "disturbances"):
         assert getattr(read, name) == getattr(found, name), name
     assert read.trials.tolist() == found.trials.tolist()
     assert read.summary() == found.summary()
     with pytest.raises(InputError, match="want a 'lqrsim funnel'"):
-        ls.load(ls.save(PLAN, tmp_path / "solution.npz"), ls.Funnel)
+        ls.load(ls.save(PLAN, tmp_path / "solution.npz"), ls.types.Funnel)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ class TestBegunLater:
 
 
 @pytest.fixture(scope="module")
-def funnel(quadrotor_solution: ls.Solution) -> ls.Funnel:
+def funnel(quadrotor_solution: ls.Solution) -> ls.types.Funnel:
     """About the packaged quadrotor's plan, of level 1 throughout, which nothing has certified."""
     found = ls.funnel(
         ls.scenarios.quadrotor().plant(), quadrotor_solution, knots=(0,), rate=0.5, confidence=0.5, failures=0,
@@ -299,7 +299,7 @@ def funnel(quadrotor_solution: ls.Solution) -> ls.Funnel:
     return replace(found, levels=np.array([1.0]))
 
 
-def test_its_picture(funnel: ls.Funnel, tmp_path: Path) -> None:
+def test_its_picture(funnel: ls.types.Funnel, tmp_path: Path) -> None:
     """The shadow on the position is as wide as the states on the boundary reach, in each direction."""
     rng = np.random.default_rng(0)
     points = rng.standard_normal((40_000, 12))
@@ -320,7 +320,7 @@ def test_its_picture(funnel: ls.Funnel, tmp_path: Path) -> None:
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--rate", "0.5", "--confidence", "0.6", "--failures", "1", "--knots", "140", "--disturbances", "calm"]
     assert main(["funnel", "quadrotor", *options, "--out", str(tmp_path)]) == 0
-    found = ls.load(tmp_path / "funnel.npz", ls.Funnel)
+    found = ls.load(tmp_path / "funnel.npz", ls.types.Funnel)
     said = capsys.readouterr().out
     assert found.summary() in said
     assert found.knots.tolist() == [140]
@@ -339,7 +339,9 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 class TestReplannerWhenLeft:
     """`Replanner(when=funnel)` solves where a trial is outside, and only there."""
 
-    def test_only_who_is_outside(self, quadrotor: ls.Scenario, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
+    def test_only_who_is_outside(
+        self, quadrotor: ls.Scenario, quadrotor_solution: Any, funnel: ls.types.Funnel
+    ) -> None:
         """Of runs that begin on and far off the plan, only the latter are solved for, at the first time they can be."""
         law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.0, when=funnel)
         begun = funnel.states_at(0, np.eye(12)[[0, 0]], 1.0)
@@ -367,7 +369,7 @@ class TestReplannerWhenLeft:
         assert first == second != []
         assert laws[0].digest != laws[1].digest
 
-    def test_bad_input(self, quadrotor: Any, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
+    def test_bad_input(self, quadrotor: Any, quadrotor_solution: Any, funnel: ls.types.Funnel) -> None:
         unchecked: Any = ls.Replanner
         moved = replace(funnel, plan=ls.Trajectory(funnel.plan.states + 1, funnel.plan.controls, funnel.plan.dt))
         for wrong, said in (

@@ -46,7 +46,7 @@ def random_shapes(solution: ls.Solution, size: int) -> np.ndarray:
     return factors @ factors.transpose(0, 2, 1) + 1e-3 * np.eye(size)
 
 
-def overlays_of(run: ls.Rollout, funnel: ls.Funnel) -> Overlays:
+def overlays_of(run: ls.Rollout, funnel: ls.types.Funnel) -> Overlays:
     return Overlays(RecordedTrial(run, 0), None, ("funnel",), Scale(1.0, 1.0), funnel)
 
 

@@ -109,7 +109,7 @@ def test_the_other_commands_run_it_too(
     assert main(["view", DRIVE, "--solution", str(stored)]) == 2
     few = ["--rate", "0.5", "--confidence", "0.5", "--knots", "149", "--failures", "0", "--out", str(tmp_path)]
     main(["funnel", DRIVE, "--solution", str(stored), *few])
-    shown.append(ls.load(tmp_path / "funnel.npz", ls.Funnel).plan)
+    shown.append(ls.load(tmp_path / "funnel.npz", ls.types.Funnel).plan)
     for solution in (left, str(stored)):
         shown.append(lqrsim.gym.Environment(DRIVE, solution=solution).solution.trajectory)
     assert len(shown) == 6

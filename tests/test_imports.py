@@ -196,3 +196,7 @@ def test_help_is_fast(command: str) -> None:
     *printed, imported = done.stdout.splitlines()
     assert "lqrsim" in printed[0]
     assert imported == "[]"
+
+
+def test_the_top_has_what_most_users_need_and_the_rest_has_rooms() -> None:
+    assert len(lqrsim.__all__) <= 70

@@ -17,7 +17,7 @@ from scipy.stats import binom, chi2
 import lqrsim as ls
 from lqrsim.control.kalman import RESOLUTION, kalman_filter
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.disturbances import Unknown
+from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
 NOISE = {"measurement": 0.1, "start": 0.3, "control": 0.2}
@@ -38,7 +38,7 @@ CASES = (
 
 def law_of(system: Linear, case: int, *, record: bool = True, **noise: float) -> ls.OffsetFree:
     unknowns, lag, sensors = CASES[case]
-    uncertainty = ls.Uncertainty(unknowns=unknowns, lag=lag, **(NOISE | noise))  # type: ignore[arg-type]
+    uncertainty = Uncertainty(unknowns=unknowns, lag=lag, **(NOISE | noise))  # type: ignore[arg-type]
     return ls.OffsetFree(
         system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors, memory=5.0,
         record=record,
@@ -192,7 +192,7 @@ def test_a_wrong_noise_is_found_out() -> None:
 def test_covariances_stay_positive_without_any_noise() -> None:
     """Sensors without noise make a singular matrix: nothing is less than zero beyond rounding, and nothing is lost."""
     system = linear(np.diag([0.5, -1.0]), [[1.0], [2.0]], [[1.0], [0.0]], controls=np.ones((100, 1)))
-    uncertainty = ls.Uncertainty(unknowns=[CONSTANT], start=[1.0, 1e-6], lag=0.05)
+    uncertainty = Uncertainty(unknowns=[CONSTANT], start=[1.0, 1e-6], lag=0.05)
     filtered = kalman_filter(PlanModel.of(system.problem.dynamics, system.plan, uncertainty))
     for covariance in (*filtered.predicted, *filtered.corrected):
         assert np.linalg.eigvalsh(covariance).min() > -1e-14
@@ -231,7 +231,7 @@ def test_each_trial_of_a_batch_has_the_bits_that_it_has_alone(case: int) -> None
 
 def test_so_has_the_quadrotor(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     unknowns = [Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [Unknown("mass", 0.02)]
-    uncertainty = ls.Uncertainty(unknowns=unknowns, measurement=0.01, start=0.01, lag=0.02)
+    uncertainty = Uncertainty(unknowns=unknowns, measurement=0.01, start=0.01, lag=0.02)
     law = ls.OffsetFree(
         quadrotor.problem, quadrotor_solution, uncertainty, tolerate={"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
     )
@@ -249,7 +249,7 @@ def test_so_has_the_quadrotor(quadrotor: ls.Scenario, quadrotor_solution: ls.Sol
 
 def test_what_is_recorded_has_gaps_where_nothing_came() -> None:
     system = double_integrator(steps=6)
-    uncertainty = ls.Uncertainty(unknowns=[CONSTANT], latency=2, **NOISE)  # type: ignore[arg-type]
+    uncertainty = Uncertainty(unknowns=[CONSTANT], latency=2, **NOISE)  # type: ignore[arg-type]
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     run = law.start(2)
     shown = np.random.default_rng(0).normal(size=(6, 2, 2))
@@ -313,7 +313,7 @@ def test_exact_and_redundant_sensors_lose_no_digits(name: str, noise: float) -> 
     system = linear(
         [[0.3, 1.0], [-0.5, -0.2]], [[0.1], [1.0]], [[0.0], [0.7]], controls=np.cos(np.arange(4.0))[:, None]
     )
-    uncertainty = ls.Uncertainty(unknowns=unknowns, start=[1.0, 1e-3], lag=0.06, measurement=noise, control=1e-2)
+    uncertainty = Uncertainty(unknowns=unknowns, start=[1.0, 1e-3], lag=0.06, measurement=noise, control=1e-2)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors)
     bare = PlanModel.of(system.problem.dynamics, system.plan, uncertainty, law.model.sensor)
     for model in (law.model, bare):  # with and without the least errors that OffsetFree assumes

@@ -140,4 +140,4 @@ class TestReplanner:
     def test_chances_of_collision_are_for_what_stands_still(self) -> None:
         stated = problem(ACROSS, weight=1.0)
         with pytest.raises(ls.InputError, match="got obstacles that move, want none"):
-            ls.smooth_chance_constrained(stated, ls.Uncertainty(start=0.01), chance=0.01)
+            ls.smooth_chance_constrained(stated, ls.disturbances.Uncertainty(start=0.01), chance=0.01)

@@ -20,6 +20,7 @@ from lqrsim.disturbances import (
     MeasurementDropouts,
     MeasurementLatency,
     MeasurementNoise,
+    Uncertainty,
     Unknown,
 )
 from lqrsim.errors import Array
@@ -65,7 +66,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     """Without noise each command is the law's of the true state when it acts, to 1e-9."""
     steps = 30
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
-    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, latency=latency, delay=delay)
+    uncertainty = Uncertainty(unknowns=[PUSH], start=0.3, latency=latency, delay=delay)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
     late = [MeasurementLatency(latency), ControlDelay(delay)]
     effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
@@ -87,7 +88,7 @@ def test_lost_measurements_are_predicted() -> None:
     """Half of them get lost, in bursts: without noise the estimate stays that of the true state, to 1e-9."""
     steps = 40
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
-    uncertainty = ls.Uncertainty(start=0.3, loss=0.5)
+    uncertainty = Uncertainty(start=0.3, loss=0.5)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     dropouts = MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
     states, _, begun = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
@@ -119,7 +120,7 @@ def test_nothing_winds_up_at_the_limits() -> None:
     errors, estimates, at_limit = {}, {}, None
     for name, limits in (("clipped", (-limit, limit)), ("unclipped", (-1e6, 1e6))):
         system = double_integrator(controls=np.zeros((steps, 1)), limits=limits)
-        uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.5, measurement=0.01)
+        uncertainty = Uncertainty(unknowns=[PUSH], start=0.5, measurement=0.01)
         law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.1, effort=1.0, record=True)
         states, commands, begun = run(system, law, [], off=far, push=push, limit=limit)
         estimates[name], errors[name] = begun.estimates[:, 0, -1], states[:, 0, 0]
@@ -159,7 +160,7 @@ def test_steady_disturbances_leave_no_error(
     """
     unknowns = [Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [Unknown("mass", 0.05)]
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
-    uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
+    uncertainty = Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
     law = ls.OffsetFree(quadrotor.problem, standing, uncertainty, tolerate=TOLERATE)
     rollout = ls.simulate(quadrotor.plant(), standing, controller=law, disturbances=[disturbance])
     error = rollout.tracking_error[0]
@@ -170,7 +171,7 @@ def test_steady_disturbances_leave_no_error(
 def test_after_the_horizon_the_last_laws_stay_in_force() -> None:
     """For as long again as the plan is: a start that is off is forgotten, and a push is held."""
     system = double_integrator(controls=np.zeros((30, 1)))
-    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, measurement=0.01, latency=1)
+    uncertainty = Uncertainty(unknowns=[PUSH], start=0.3, measurement=0.01, latency=1)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     begun, x = law.start(2), np.array([[0.3, -0.2], [-0.1, 0.4]])
     late = x
@@ -188,7 +189,7 @@ def diverging(quadrotor: ls.Scenario) -> tuple[ls.Solution, ls.OffsetFree, list[
     """It believes that it knows nothing of its drag: estimates of it that are negative make predictions explode."""
     plan, uncertainty = (
         hover(),
-        ls.Uncertainty(unknowns=[Unknown("drag", 5.0)], measurement=0.02, start=0.01),
+        Uncertainty(unknowns=[Unknown("drag", 5.0)], measurement=0.02, start=0.01),
     )
     law = ls.OffsetFree(quadrotor.problem, plan, uncertainty, tolerate=TOLERATE)
     return plan, law, [MeasurementNoise(0.02), ForceNoise(1.0)]
@@ -249,21 +250,21 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ({"record": "yes"}, "OffsetFree: record: got 'yes', want"),
         ({"uncertainty": {"start": 0.1}}, "OffsetFree: uncertainty: got {'start': 0.1}, want an Uncertainty"),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[Unknown("gain of rotor_7", 0.1)])},
+            {"uncertainty": Uncertainty(unknowns=[Unknown("gain of rotor_7", 0.1)])},
             "Uncertainty: unknowns: got 'gain of rotor_7', want one of: mass",
         ),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
+            {"uncertainty": Uncertainty(unknowns=[Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
             "OffsetFree: unknowns: got force_x, which no measurement sees (rx, ry, rz), want sensors",
         ),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
+            {"uncertainty": Uncertainty(unknowns=[Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
             "OffsetFree: unknowns: got wind_x and wind_y, which no measurement sees (z), want sensors",
         ),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_a_line(quadrotor: ls.Scenario, options: dict, says: str) -> None:
-    given = {"uncertainty": ls.Uncertainty(start=0.1, measurement=0.01), "tolerate": TOLERATE} | options
+    given = {"uncertainty": Uncertainty(start=0.1, measurement=0.01), "tolerate": TOLERATE} | options
     with pytest.raises(ls.InputError) as caught:
         ls.OffsetFree(quadrotor.problem, hover(), **given)
     assert says in str(caught.value)
@@ -274,9 +275,7 @@ def test_what_does_not_fit_is_refused_in_a_line(quadrotor: ls.Scenario, options:
 def test_what_has_no_spread_is_no_reason_to_refuse(quadrotor: ls.Scenario) -> None:
     """A Dryden wind of strength 0 changes nothing, and nobody wants to see it."""
     calm = Unknown("wind_x", 0.0, time_constant=1.0, order=2)
-    law = ls.OffsetFree(
-        quadrotor.problem, hover(), ls.Uncertainty(unknowns=[calm], measurement=0.01), tolerate=TOLERATE
-    )
+    law = ls.OffsetFree(quadrotor.problem, hover(), Uncertainty(unknowns=[calm], measurement=0.01), tolerate=TOLERATE)
     assert np.isfinite(law.gain).all()
 
 
@@ -286,10 +285,10 @@ def test_the_digest_is_of_all_that_the_controls_depend_on() -> None:
     late = [{"latency": 1}, {"delay": 1}, {"lag": 0.1}, {"command_loss": 0.1}]
     changes = [{}, *late, {"measurement": 0.2}, {"unknowns": []}]
     for change in changes:
-        uncertainty = ls.Uncertainty(**(base | change))  # type: ignore[arg-type]
+        uncertainty = Uncertainty(**(base | change))  # type: ignore[arg-type]
         digests.add(ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=1.0).digest)
     limited = double_integrator(steps=5, limits=(-1.0, 1.0))
-    uncertainty = ls.Uncertainty(**base)  # type: ignore[arg-type]
+    uncertainty = Uncertainty(**base)  # type: ignore[arg-type]
     for sensors in (None, ("s0",), [[1.0, DT]]):
         law = ls.OffsetFree(limited.problem, limited.solution, uncertainty, tolerate=0.5, effort=1.0, sensors=sensors)
         digests.add(law.digest)

@@ -27,11 +27,11 @@ SIDES = '<geom name="beside" type="plane" size="1 1 1" pos="0 0.9 0" zaxis="0 -1
 FLOOR = '<geom name="floor" type="plane" size="4 4 1" pos="0 0 -1.2"/>'
 
 
-def space(names: tuple[str, ...], **fields: object) -> ls.Coordinates:
+def space(names: tuple[str, ...], **fields: object) -> ls.types.Coordinates:
     """Coordinates with a position of these names, and an angle, which is all that there is without any."""
     count = len(names)
     units = ("m",) * count + ("rad",)
-    return ls.Coordinates(names=(*names, "angle"), units=units, position=tuple(range(count)), **fields)  # pyright: ignore
+    return ls.types.Coordinates(names=(*names, "angle"), units=units, position=tuple(range(count)), **fields)  # pyright: ignore
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from linear_plans import DT, double_integrator, law_of, linear
 from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
-from lqrsim.disturbances import Unknown
+from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
 same = import_module("robustness.files").same
@@ -67,7 +67,7 @@ def test_class_page_and_compiled_controller_agree_on_a_linear_system(
     )
     law = law_of(system, **options)
     policy = ls.load(ls.save(law.policy, "policy.npz"))
-    assert isinstance(policy, ls.OutputFeedbackPolicy)
+    assert isinstance(policy, ls.types.OutputFeedbackPolicy)
     names, control = page(), law.start(1).control
     elsewhere, z, found = names["z"], policy.start(), []
     sensors = options.get("sensors")
@@ -92,7 +92,7 @@ def test_angles_are_taken_nearest(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     scenario = ls.scenarios.differential_drive()
     solution = ls.smooth(scenario.problem)
-    uncertainty = ls.Uncertainty(measurement=0.01, start=0.01, control=0.01)
+    uncertainty = Uncertainty(measurement=0.01, start=0.01, control=0.01)
     law = ls.OffsetFree(scenario.problem, solution, uncertainty, tolerate={"m": 0.05, "rad": 0.1})
     policy = law.policy
     ls.save(policy, "policy.npz")
@@ -139,7 +139,7 @@ def test_on_the_quadrotor_they_are_close(quadrotor: ls.Scenario, quadrotor_solut
     unknowns = [Unknown(f"wind_{axis}", 0.5, time_constant=1.0) for axis in "xyz"]
     unknowns += [Unknown("mass", 0.01)] + [Unknown(f"gain of rotor_{i}", 0.04) for i in (1, 2, 3, 4)]
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
-    uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured, control=0.037, lag=0.024)
+    uncertainty = Uncertainty(unknowns=unknowns, start=0.01, measurement=measured, control=0.037, lag=0.024)
     law = ls.OffsetFree(
         quadrotor.problem, quadrotor_solution, uncertainty,
         tolerate={"m": 0.1, "m/s": 0.5, "rad": 0.3, "rad/s": 2.0},
@@ -200,7 +200,7 @@ def test_the_hash_is_what_the_page_says(saved: Path) -> None:
 def test_a_spoilt_policy_gets_one_line(saved: Path, changes: dict[str, Any], message: str) -> None:
     rewrite(saved, **changes)
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load(saved, ls.OutputFeedbackPolicy)
+        ls.load(saved, ls.types.OutputFeedbackPolicy)
     assert "\n" not in str(caught.value)
 
 
@@ -209,7 +209,7 @@ def test_a_smaller_state_than_the_robots_is_refused(saved: Path) -> None:
     cut |= {"input": lambda a: a[:, :1], "drift": lambda a: a[:, :1], "nominal": lambda a: a[:, :1]}
     rewrite(saved, **{name: (lambda a, part=part: part(a).copy()) for name, part in cut.items()})
     with pytest.raises(ls.InputError, match=r"nominal: got shape \(12, 1\), want at least one row, of 2 states"):
-        ls.load(saved, ls.OutputFeedbackPolicy)
+        ls.load(saved, ls.types.OutputFeedbackPolicy)
 
 
 def test_every_flipped_bit_is_harmless(saved: Path, law: ls.OffsetFree) -> None:

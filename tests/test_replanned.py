@@ -9,7 +9,7 @@ import pytest
 from linear_plans import DT, Linear, double_integrator, linear
 
 import lqrsim as ls
-from lqrsim.disturbances import ForceNoise, MeanWind, MeasurementNoise, Unknown
+from lqrsim.disturbances import ForceNoise, MeanWind, MeasurementNoise, Uncertainty, Unknown
 from lqrsim.errors import Array
 
 PUSH = Unknown("d0", 0.5)
@@ -22,13 +22,13 @@ def rocking() -> Linear:
     return double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(STEPS) / 4)[:, None])
 
 
-def stated(*unknowns: Unknown, lag: float = 0.0, latency: int = 0, delay: int = 0) -> ls.Uncertainty:
-    return ls.Uncertainty(
+def stated(*unknowns: Unknown, lag: float = 0.0, latency: int = 0, delay: int = 0) -> Uncertainty:
+    return Uncertainty(
         unknowns=unknowns, start=0.3, measurement=0.1, control=0.2, lag=lag, latency=latency, delay=delay
     )
 
 
-def replanned(system: Linear, uncertainty: ls.Uncertainty, every: float | None = AGAIN * DT) -> ls.OffsetFree:
+def replanned(system: Linear, uncertainty: Uncertainty, every: float | None = AGAIN * DT) -> ls.OffsetFree:
     return ls.OffsetFree(
         system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True, replan_every=every,
         replan_always=True,
@@ -154,7 +154,7 @@ def flown() -> tuple[ls.Solution, ls.OffsetFree]:
     assert solution.success
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
     unknowns = [Unknown(f"wind_{axis}", 1.5) for axis in "xyz"]
-    uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
+    uncertainty = Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
     law = ls.OffsetFree(
         problem, solution, uncertainty, tolerate=TOLERATE, record=True, replan_every=1.0, replan_always=True
     )

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import (
     LONGEST,
     InputError,
@@ -403,8 +404,11 @@ class Biting:
             lambda: ls.check_derivatives(lq.Dynamics(enormous, states={"x": "m"}, controls={"u": "N"}, level="plain")),
             "enormous(x, u, p): got ",
         ),
-        (lambda: ls.Uncertainty(model_error=DEEP), "Uncertainty: model_error: got "),
-        (lambda: ls.Uncertainty(start={"m": -1.0}), "Uncertainty: start: 'm': got -1.0, want a finite number >= 0"),
+        (lambda: Uncertainty(model_error=DEEP), "Uncertainty: model_error: got "),
+        (
+            lambda: Uncertainty(start={"m": -1.0}),
+            "Uncertainty: start: 'm': got -1.0, want a finite number >= 0",
+        ),
         (lambda: ls.rotations.vector_rate((1e300, 1e300, 1e300), (0.0, 0.0, 1.0)), "r: got a rotation vector whose"),
         (lambda: ls.rotations.rotate((0.0, 0.0, 10**400), (0.0, 0.0, 1.0)), "r: got "),
         (lambda: ls.rotations.vector_rate((0.0, 0.0, 1.0), (0.0, 0.0, 10**400)), "w: got "),

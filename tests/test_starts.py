@@ -96,7 +96,7 @@ def test_everything_that_solves_a_scenario_begins_with_its_start(
     assert keeps_left(seen(monkeypatch, reference))
     few = ["--rate", "0.5", "--confidence", "0.5", "--knots", "149", "--out", out]
     main(["funnel", reference, *few])
-    assert keeps_left(ls.load(f"{out}/funnel.npz", ls.Funnel).plan)
+    assert keeps_left(ls.load(f"{out}/funnel.npz", ls.types.Funnel).plan)
     assert keeps_left(lqrsim.gym.Environment(reference).solution.trajectory)
     main(["demo", "--robots", reference, "--no-video", "--out", out])
     assert keeps_left(ls.load(f"{out}/by_function/solution.npz", ls.Solution).trajectory)

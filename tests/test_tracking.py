@@ -16,6 +16,7 @@ import lqrsim as ls
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
 # States, controls, pushes; unknowns; whether the actuators lag. Sizes compile, numbers do not.
@@ -35,7 +36,7 @@ UNKNOWNS = {
 }
 
 
-def drawn(structure: int, seed: int, *, unstable: bool, steps: int = 8) -> tuple[Linear, ls.Uncertainty]:
+def drawn(structure: int, seed: int, *, unstable: bool, steps: int = 8) -> tuple[Linear, Uncertainty]:
     """A system of that structure about a plan that moves."""
     n, m, k, names, lags = STRUCTURES[structure]
     rng = np.random.default_rng(seed)
@@ -44,15 +45,13 @@ def drawn(structure: int, seed: int, *, unstable: bool, steps: int = 8) -> tuple
         rates, rng.normal(size=(n, m)), rng.normal(size=(n, k)), start=rng.normal(size=n),
         controls=rng.normal(size=(steps, m)),
     )  # fmt: skip
-    return system, ls.Uncertainty(unknowns=[UNKNOWNS[name] for name in names], lag=0.06 if lags else 0.0)
+    return system, Uncertainty(unknowns=[UNKNOWNS[name] for name in names], lag=0.06 if lags else 0.0)
 
 
 class Oracle:
     """The run that follows from commands (T, m), stated as absolute numbers, and its cost as a sum of squares."""
 
-    def __init__(
-        self, system: Linear, uncertainty: ls.Uncertainty, weights: Weights, *, persistent: bool = False
-    ) -> None:
+    def __init__(self, system: Linear, uncertainty: Uncertainty, weights: Weights, *, persistent: bool = False) -> None:
         self.system, self.weights = system, weights
         self.persistent = persistent  # whether what disturbs the robot goes on as it is
         m = system.B.shape[1]
@@ -307,12 +306,18 @@ def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
         ({"tolerate": 1.0, "effort": 1.0, "at_end": 0.0}, "at_end: got 0.0, want"),
         ({"uncertainty": 0.1, "effort": 1.0}, "track: uncertainty: got 0.1, want an Uncertainty"),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[ls.disturbances.Unknown("wind_x", 1.0)]), "effort": 1.0},
+            {
+                "uncertainty": Uncertainty(unknowns=[ls.disturbances.Unknown("wind_x", 1.0)]),
+                "effort": 1.0,
+            },
             "Uncertainty: unknowns: got 'wind_x', want one of: a00",
         ),
-        ({"uncertainty": ls.Uncertainty(start={"rad": 1.0}), "effort": 1.0}, "start: got 'rad', want one of: s0, s1"),
         (
-            {"uncertainty": ls.Uncertainty(measurement=[1.0]), "effort": 1.0},
+            {"uncertainty": Uncertainty(start={"rad": 1.0}), "effort": 1.0},
+            "start: got 'rad', want one of: s0, s1",
+        ),
+        (
+            {"uncertainty": Uncertainty(measurement=[1.0]), "effort": 1.0},
             "Uncertainty: measurement: got 1 numbers, want 2: s0",
         ),
     ],
@@ -340,11 +345,14 @@ def test_what_does_not_fit_is_refused_in_a_line(options: dict, says: str) -> Non
             "Unknown: drift: got 0.1 with a time constant",
         ),
         (lambda: ls.disturbances.Unknown({}, 1.0), "Unknown: of: got no name"),
-        (lambda: ls.Uncertainty(lag=-0.1), "Uncertainty: lag: got -0.1"),
-        (lambda: ls.Uncertainty(loss=1.5), "Uncertainty: loss: got 1.5"),
-        (lambda: ls.Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
-        (lambda: ls.Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
-        (lambda: ls.Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)), "Uncertainty: unknowns: got"),  # type: ignore[arg-type]
+        (lambda: Uncertainty(lag=-0.1), "Uncertainty: lag: got -0.1"),
+        (lambda: Uncertainty(loss=1.5), "Uncertainty: loss: got 1.5"),
+        (lambda: Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
+        (lambda: Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
+        (
+            lambda: Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)),
+            "Uncertainty: unknowns: got",
+        ),  # type: ignore[arg-type]
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:

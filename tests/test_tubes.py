@@ -18,6 +18,7 @@ from lqrsim.control.controllers import Feedback
 from lqrsim.control.linear_loop import LinearLoop, limited
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import SampledLoop, sample_loop
+from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
 
@@ -145,7 +146,7 @@ def test_two_obstacles_and_one_that_is_displaced() -> None:
 
 
 def simulated(
-    system: Linear, control: Any, uncertainty: ls.Uncertainty, trials: int, rng: np.random.Generator
+    system: Linear, control: Any, uncertainty: Uncertainty, trials: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """States (T+1, K, n) and applied commands (T, K, m) of a NumPy run under exactly what is stated: d0 is constant."""
     low, high = (
@@ -169,7 +170,7 @@ def simulated(
     return np.array(states), np.array(applied)
 
 
-STATED = ls.Uncertainty(unknowns=[ls.disturbances.Unknown("d0", 0.3)], start=0.1, control=0.2, measurement=0.02)
+STATED = Uncertainty(unknowns=[ls.disturbances.Unknown("d0", 0.3)], start=0.1, control=0.2, measurement=0.02)
 
 
 def weave(limit: float) -> Linear:
@@ -221,7 +222,7 @@ def test_the_error_of_the_estimate_is_the_filters_where_that_is_told_the_truth()
     """To rounding, if the least errors that a filter assumes are stated: what is stated wins where it is larger."""
     system = weave(1e6)
 
-    def law_for(stated: ls.Uncertainty) -> ls.OffsetFree:
+    def law_for(stated: Uncertainty) -> ls.OffsetFree:
         return ls.OffsetFree(system.problem, system.solution, stated, tolerate=0.3, effort=0.5, memory=1e9)
 
     assumed = law_for(STATED).model.uncertainty
@@ -235,7 +236,7 @@ def test_the_error_of_the_estimate_is_the_filters_where_that_is_told_the_truth()
 @pytest.mark.parametrize("field", ["latency", "delay"])
 def test_moments_of_what_is_late_need_samples(field: str) -> None:
     system = double_integrator(steps=5)
-    late = ls.Uncertainty(**{field: 2})  # type: ignore[arg-type]
+    late = Uncertainty(**{field: 2})  # type: ignore[arg-type]
     with pytest.raises(ls.InputError, match=f"samples: got 0 and a {field} of 2 control periods, which the moments do"):
         ls.predict_tube(system.problem, system.solution, late, samples=0)
 
@@ -399,9 +400,7 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
         states.append(dynamics.step(states[-1], control, dt))
     plan = ls.Trajectory(np.array(states), controls, dt)
     names = ["wind_x", "force_z", "torque_y", "mass", "gain of rotor_2", "offset of rotor_3"]
-    model = PlanModel.of(
-        dynamics, plan, ls.Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names])
-    )
+    model = PlanModel.of(dynamics, plan, Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names]))
     h = 1e-4
     for t in range(3):
         for i, name in enumerate(names):

@@ -88,13 +88,13 @@ def named(uncertainty):
 def test_each_disturbance_is_in_numbers_or_left_out_by_name_and_nothing_at_strength_zero(plant_of, one):
     plant, stated = plant_of(one), ls.uncertainty_of(plant_of(one), [one])
     if one in IN_WORDS:
-        assert stated == ls.Uncertainty()
+        assert stated == ls.disturbances.Uncertainty()
         assert re.fullmatch(rf"{re.escape(one.describe(plant))}: .+", stated.left_out[0])
     else:
-        assert stated != ls.Uncertainty()
+        assert stated != ls.disturbances.Uncertainty()
         assert stated.left_out == ()
     none = ls.uncertainty_of(plant, [one.scaled(0.0)])
-    assert (none, none.left_out) == (ls.Uncertainty(), ())
+    assert (none, none.left_out) == (ls.disturbances.Uncertainty(), ())
 
 
 def test_no_kind_is_forgotten():
@@ -273,7 +273,7 @@ def test_what_the_robot_does_not_declare_is_left_out_by_name(arena):
             MassMismatch(0.1),
         ],
     )
-    assert stated == ls.Uncertainty()
+    assert stated == ls.disturbances.Uncertainty()
     missing = [re.search(r"have no (.*)$", words) for words in stated.left_out]
     assert [one and one[1] for one in missing] == ["force_x, force_y, force_z", "torque_z", "mass"]
 
@@ -312,11 +312,11 @@ class OwnInNumbers(Own):
 
 def test_those_of_ones_own(cage):
     assert ls.uncertainty_of(cage, [Own()]).left_out == ("Own(told=None): Own does not override `uncertainty`",)
-    told = ls.Uncertainty(unknowns=[Unknown("force_x", 0.2)])
+    told = ls.disturbances.Uncertainty(unknowns=[Unknown("force_x", 0.2)])
     assert ls.uncertainty_of(cage, [OwnInNumbers(told)]) == told
     with pytest.raises(InputError, match=r"^OwnInNumbers: uncertainty: got 3, want a method that returns"):
         ls.uncertainty_of(cage, [OwnInNumbers(3)])
-    wrong = ls.Uncertainty(unknowns=[Unknown("forse_x", 0.2)])
+    wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("forse_x", 0.2)])
     with pytest.raises(InputError, match=r"^Uncertainty: unknowns: got 'forse_x', want .*force_x"):
         ls.uncertainty_of(cage, [OwnInNumbers(wrong)])
 

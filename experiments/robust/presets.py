@@ -54,7 +54,7 @@ def measure(config: Config) -> dict[str, Any]:
 
 
 def laws(
-    scenario: ls.Scenario, plan: ls.Solution, safe: ls.types.SafePlan, stated: ls.Uncertainty, preset: str
+    scenario: ls.Scenario, plan: ls.Solution, safe: ls.types.SafePlan, stated: ls.disturbances.Uncertainty, preset: str
 ) -> dict[str, tuple[ls.Solution, ControllerLike | None]]:
     """Name -> plan and what flies it."""
     problem = scenario.problem

@@ -90,8 +90,8 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
 
     Args:
       path: path of a file that `save` wrote.
-      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy`, `ls.Funnel`
-        or `ls.stress.FailureCertificate`. By default, any.
+      kind: the required kind: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.types.OutputFeedbackPolicy`,
+        `ls.types.Funnel` or `ls.stress.FailureCertificate`. By default, any.
 
     Raises:
       InputError: the file is missing, damaged, of another version or of another kind.

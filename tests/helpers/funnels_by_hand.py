@@ -10,11 +10,11 @@ import lqrsim as ls
 
 def funnel_by_hand(
     solution: ls.Solution, shape: npt.ArrayLike, *, knots: Sequence[int] = (0,), levels: Sequence[float] = (1.0,)
-) -> ls.Funnel:
+) -> ls.types.Funnel:
     """A funnel of the first d states, with one shape (d, d) or one per knot (T+1, d, d)."""
     shape, space = np.asarray(shape, dtype=float), solution.policy.state_coordinates
     tried = 1000 * (np.asarray(levels) > 0)  # enough to show any rate that is asked for
-    return ls.Funnel(
+    return ls.types.Funnel(
         plan=solution.trajectory, state_coordinates=space, control_coordinates=solution.policy.control_coordinates,
         states=space.names[: shape.shape[-1]], family="given",
         shape=np.broadcast_to(shape, (solution.trajectory.steps + 1, *shape.shape[-2:])),

@@ -132,7 +132,7 @@ def law_of(
     """Output feedback for the double integrator, with noise; the options are those of Uncertainty, and `sensors`."""
     sensors = options.pop("sensors", None)
     stated: dict[str, Any] = {"unknowns": unknowns, "start": 0.3, "measurement": 0.1, "control": 0.2}
-    uncertainty = ls.Uncertainty(**(stated | options))
+    uncertainty = ls.disturbances.Uncertainty(**(stated | options))
     return ls.OffsetFree(
         system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors, record=True
     )

@@ -10,7 +10,7 @@ import lqrsim as ls
 
 LENGTH, RADIUS, HEIGHT = 0.4, 0.03, 0.1  # m, of each link, and where the plane is
 INERTIA, DAMPING = 0.05, 0.5  # kg m^2, of each joint's motor, which is most of what moves; N m s
-LINK = ls.Capsule(LENGTH, RADIUS, 0.003)
+LINK = ls.types.Capsule(LENGTH, RADIUS, 0.003)
 POSTS = """
     <geom name="near post" type="capsule" size="0.04 0.2" pos="0.55 0.45 0.1"/>
     <geom name="far post" type="cylinder" size="0.05 0.3" pos="0.2 -0.95 0.2"/>

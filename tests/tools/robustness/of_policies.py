@@ -13,7 +13,7 @@ from robustness.place import Place
 
 def policies(place: Place) -> dict[str, tuple[Any, ...]]:
     unknown = Unknown("gain of left", 0.05)
-    uncertainty = ls.Uncertainty(unknowns=[unknown], start=0.01, measurement=0.01, control=0.01)
+    uncertainty = ls.disturbances.Uncertainty(unknowns=[unknown], start=0.01, measurement=0.01, control=0.01)
     common = {"problem": place.problem, "solution": place.solution, "uncertainty": uncertainty}
     chosen = {"tolerate": {"m": 0.05, "rad": 0.1}, "effort": 0.1, "at_end": 0.2}
     law = ls.OffsetFree(**common, **chosen)

@@ -77,7 +77,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     )
     world, box = place.scenario.scene.world, ls.Obstacle("box", "box", np.zeros(3), np.eye(3), np.ones(3))
     term = ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0]).bind(cart)
-    limits = ls.Coordinates(
+    limits = ls.types.Coordinates(
         names=("x", "y", "angle"),
         units=("m", "m", "rad"),
         position=(0, 1),
@@ -151,7 +151,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "CollisionSpheres.centres": ({"self": balls, "dynamics": cart, "states": [[0.1, 0.2]]},),
         "SphereCenters": ({field.name: getattr(places, field.name) for field in dataclasses.fields(places)},),
         "Capsule": ({"length": 0.4, "radius": 0.03, "tolerance": 0.002},),
-        "Capsule.between": ({"self": ls.Capsule(0.4, 0.1, 0.02), "start": (0, 0, 0), "end": [1.0, 2.0, 3.0]},),
+        "Capsule.between": ({"self": ls.types.Capsule(0.4, 0.1, 0.02), "start": (0, 0, 0), "end": [1.0, 2.0, 3.0]},),
         "SymbolicCost": ({"function": bowl, "parameters": {"a": 1.0}, "convex": True},),
         "FunctionCost": ({
             "function": bowl, "derivatives": slope, "depends_on": ("x", "force"), "parameters": {"a": 1.0},

@@ -71,7 +71,7 @@ class Steering(ls.Controller):
         return self._parts[2]
 
 
-class SteeringRun(ls.ControllerRun):
+class SteeringRun(ls.types.ControllerRun):
     def __init__(self, control: Any) -> None:
         self._control = control
 
