@@ -108,7 +108,7 @@ def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: flo
     """
     cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
     changed: dict[str, Any] = {"stage_cost": cost}
-    narrow = Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.2}, measurement=0.01)
+    narrow = Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.8}, measurement=0.01)
     asked = ls.Problem(**(fields(problem) | changed))
     plan = ls.smooth_chance_constrained(asked, narrow, chance=1e-3, controller=tracked)
     assert 0.5e-3 <= plan.tube.collision_chance <= 1e-3

@@ -30,7 +30,8 @@ def test_scripts_explain_themselves(
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")
     assert not ended.value.code
-    assert "--quick" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "--quick" in printed or script.stem == "print_numbers"  # which runs others in full
 
 
 def benchmark(*arguments: str) -> dict[str, Any]:

@@ -413,7 +413,7 @@ class Biting:
         (lambda: ls.rotations.rotate((0.0, 0.0, 10**400), (0.0, 0.0, 1.0)), "r: got "),
         (lambda: ls.rotations.vector_rate((0.0, 0.0, 1.0), (0.0, 0.0, 10**400)), "w: got "),
         (lambda: lq.SiteCost("tip", position=np.zeros(3), weight=[[1.0, 2.0], [3.0]]), "SiteCost: weight: got "),
-        (lambda: lq.Capsule(0.4, 0.1, 0.02).between((0, 0, 0), itertools.count()), "between: got "),
+        (lambda: lq.types.Capsule(0.4, 0.1, 0.02).between((0, 0, 0), itertools.count()), "between: got "),
         (lambda: ls.stress.FunnelCheck(0, DEEP, rate(1, 2), np.ones(2, dtype=bool)), "FunnelCheck: level: got "),
         (lambda: ls.stress.ComparedPlan("", DEEP, np.ones(2, dtype=bool)), "ComparedPlan: solution: got "),
         (lambda: ls.types.ReplanRecord(**RECORD | {"reason": DEEP}), "ReplanRecord: reason: got "),

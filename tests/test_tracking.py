@@ -350,9 +350,9 @@ def test_what_does_not_fit_is_refused_in_a_line(options: dict, says: str) -> Non
         (lambda: Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
         (lambda: Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
         (
-            lambda: Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)),
+            lambda: Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)),  # type: ignore[arg-type]
             "Uncertainty: unknowns: got",
-        ),  # type: ignore[arg-type]
+        ),
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:

@@ -17,8 +17,6 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
 ) -> None:
     problem, plant = differential_drive.problem, differential_drive.plant()
     cases = {
-        "latency": ([NOISE, MeasurementLatency(2)], None),
-        "delay": ([NOISE, ControlDelay(1)], None),
         "an OffsetFree or an AffinePolicy": (
             [NOISE],
             ls.Replanner(problem, drive_solution, every=1.0),
@@ -35,6 +33,20 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
         assert word in line
         assert "\n" not in line
     assert tube_under(problem, drive_solution, plant, []) == (None, "")
+
+
+def test_latency_and_delay_are_in_the_sampled_trials(
+    differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    """A law that is late follows worse: each tube is wider than that of the same noise in time."""
+    problem, plant = differential_drive.problem, differential_drive.plant()
+    now, _ = tube_under(problem, drive_solution, plant, [NOISE])
+    assert now is not None
+    for late in (MeasurementLatency(2), ControlDelay(1)):
+        tube, _ = tube_under(problem, drive_solution, plant, [NOISE, late])
+        assert tube is not None
+        assert tube.samples > 0
+        assert tube.position_covariance[:, 0, 0].max() > now.position_covariance[:, 0, 0].max()
 
 
 def test_what_is_left_out_is_named_and_the_rest_is_predicted(

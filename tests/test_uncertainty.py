@@ -143,8 +143,7 @@ def blown(plant, wind, trials, steps):
     """Winds as they are drawn, in m/s, (trials, steps, 3)."""
     plan = Trajectory(np.zeros((steps + 1, 12)), np.zeros((steps, 4)), DT)
     effect = wind.start(plant, plan, [np.random.default_rng((7, trial)) for trial in range(trials)])
-    forces = np.stack([effect.force(step, np.zeros((trials, 12))) for step in range(steps)], axis=1)
-    return forces / plant.robot.drag
+    return np.stack([effect.wind(step, np.zeros((trials, 12))) for step in range(steps)], axis=1)
 
 
 def covariance_of(unknowns, lag):

@@ -35,8 +35,6 @@ SCRIPTS = (
     "noise_aware",
     "funnels",
     "solver_league",
-    "other_simulators",
-    "adaptive_quad_bench",
 )
 
 TIDYING = 20.0  # s

@@ -47,12 +47,12 @@ class SampledLoop:
     farthest: Array
 
     def chance(self, predicted: float) -> float:
-        """The chance of collision by these trials and a prediction."""
+        """The chance of collision by these trials and a prediction; above 0 unless that is 0 and no trial collides."""
         trials, found = len(self.collided), int(self.collided.sum())
         low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
         high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
         if not low <= predicted <= high:
-            return found / trials
+            return (found + 0.5) / (trials + 1)  # Jeffreys' estimate: no number of trials shows a chance of 0
         return (PRIOR + found) / (PRIOR / predicted + trials) if predicted else 0.0
 
 

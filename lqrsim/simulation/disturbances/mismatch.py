@@ -155,7 +155,11 @@ class Payload(Disturbance):
         return f"a load of {self.mass:g} kg on {self.body}"
 
     def scaled(self, strength: float) -> "Payload":
-        """The same with `strength` times the mass."""
+        """The same with another mass.
+
+        Args:
+          strength: factor of the mass, at least 0.
+        """
         return replace(self, mass=times(self, self.mass, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
