@@ -52,7 +52,7 @@ class SampledLoop:
         low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
         high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
         if not low <= predicted <= high:
-            return (found + 0.5) / (trials + 1)  # Jeffreys' estimate: no number of trials shows a chance of 0
+            return max(found, 0.5) / trials  # no number of trials shows a chance of 0
         return (PRIOR + found) / (PRIOR / predicted + trials) if predicted else 0.0
 
 
