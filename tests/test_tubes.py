@@ -337,7 +337,7 @@ def test_the_nearest_obstacle_of_each_trial_is_where_it_was_displaced_to() -> No
 @pytest.mark.parametrize("collided", [0, 1, 7, 40, 1000])
 @pytest.mark.parametrize("predicted", [0.0, 1e-9, 1e-3, 0.05, 0.9])
 def test_a_chance_is_between_the_predicted_and_the_counted_one(collided: int, predicted: float) -> None:
-    """And the counted one, where none counts as a half, if an exact interval of 95 % does not have the predicted one."""
+    """And the counted one, none as a half, where an exact interval of 95 % does not have the predicted one."""
     trials = 1000
     hit = np.arange(trials) < collided
     none = np.zeros((0, 0))
