@@ -145,7 +145,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         camera = "overview" if isinstance(task, FamilyTask) else camera_of(robot)
         render_still(
             config, row, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption"),
-            title=task.name,
+            titles=(task.name,),
         )  # fmt: skip
     return row
 
