@@ -2,8 +2,8 @@
 
 The moments of `linear_loop.py` are those of small deviations. A robot whose commands stay at their limits leaves its
 plan, where its dynamics are others. Here the nonlinear dynamics run, with limits, lag, delays, and lost commands and
-measurements: a trial takes a tenth of the time that it takes in MuJoCo. A seed draws the same numbers for all plans and
-laws, so that two of them are compared on the same trials.
+measurements, without MuJoCo. A seed draws the same numbers for all plans and laws, so that two of them are compared on
+the same trials.
 """
 
 from collections import deque
@@ -47,7 +47,7 @@ class SampledLoop:
     farthest: Array
 
     def chance(self, predicted: float) -> float:
-        """The chance of collision by these trials and a prediction; above 0 unless that is 0 and no trial collides."""
+        """The chance of collision by these trials and a prediction; 0 only if that is 0 and no trial collides."""
         trials, found = len(self.collided), int(self.collided.sum())
         low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
         high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
