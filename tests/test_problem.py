@@ -213,3 +213,105 @@ def test_a_prior_may_be_about_a_trajectory(differential_drive: ls.Scenario) -> N
 
 def test_a_control_cost_is_about_no_control_unless_told() -> None:
     np.testing.assert_array_equal(ls.ControlCost([[2.0, 0.1], [0.1, 1.0]]).about, np.zeros(2))
+
+
+WEIGHTS = st.dictionaries(st.sampled_from([*STATES, *STATES.values()]), st.floats(0.0, 100.0), min_size=1)
+
+
+def in_order(given: dict[str, float]) -> list[float]:
+    """By hand: a name wins over a unit, and the rest are 0."""
+    return [given.get(name, given.get(unit, 0.0)) for name, unit in STATES.items()]
+
+
+@settings(max_examples=50, deadline=None)
+@given(weight=WEIGHTS, about=WEIGHTS, start=WEIGHTS, effort=st.floats(0.1, 10.0), unit=st.booleans(), push=WEIGHTS)
+def test_numbers_by_name_or_unit_are_those_in_order(
+    weight: dict, about: dict, start: dict, effort: float, unit: bool, push: dict
+) -> None:
+    key = "N" if unit else "force"
+    named = ls.Problem(**{
+        **FIELDS,
+        "initial": ls.FixedState(start),
+        "stage_cost": ls.ControlCost({key: effort}, about={key: 1.0}),
+        "final_cost": ls.QuadraticCost(weight, about=about),
+        "control_limits": {key: (-effort, 2 * effort)},
+    })  # fmt: skip
+    listed = ls.Problem(**{
+        **FIELDS,
+        "initial": ls.FixedState(in_order(start)),
+        "stage_cost": ls.ControlCost([effort], about=[1.0]),
+        "final_cost": ls.QuadraticCost(in_order(weight), about=in_order(about)),
+        "control_limits": (-effort, 2 * effort),
+    })  # fmt: skip
+    assert named.digest == listed.digest
+    np.testing.assert_array_equal(named.goal, listed.goal)
+    np.testing.assert_array_equal(named.start, in_order(start))
+    np.testing.assert_array_equal(named.nominal_control, [1.0])
+    again = named.with_costs(final_cost=ls.QuadraticCost(push, about=about))
+    np.testing.assert_array_equal(again.goal, in_order(about))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: {"initial": ls.FixedState(spee=1.0)},
+            "got 'spee', want one of: x, y, speed.*did you mean speed",
+        ),
+        (lambda: {"initial": ls.FixedState({"x": 1.0}, x=2.0)}, "FixedState: got 'x' twice"),
+        (lambda: {"initial": ls.FixedState()}, "FixedState: got nothing, want a number by name of a state"),
+        (
+            lambda: {"final_cost": ls.QuadraticCost({"kg": 1.0}, about={})},
+            "got 'kg', want one of: x, y, speed, m",
+        ),
+        (lambda: {"final_cost": ls.QuadraticCost({"x": -1.0}, about={})}, "weight: got smallest eigenvalue -1"),
+        (
+            lambda: {"final_cost": ls.QuadraticCost({"x": np.nan}, about={})},
+            "'x': got nan, want a finite number",
+        ),
+        (lambda: {"final_cost": ls.QuadraticCost({"x": 1.0}, about=[0.0])}, r"about: got shape \(1,\), want \(3,\)"),
+        (lambda: {"stage_cost": ls.ControlCost({})}, "ControlCost: weight: got none for force, want one for each"),
+        (lambda: {"control_limits": {"push": (0, 1)}}, "control_limits: got 'push', want one of: force, N"),
+        (lambda: {"control_limits": {"force": 1.0}}, "control_limits: 'force': got shape"),
+        (lambda: {"control_limits": {"force": (1.0, -1.0)}}, "control_limits: got 1 to -1 for force, want the first"),
+    ],
+)
+def test_wrong_names_get_one_line(make: Callable[[], dict], message: str) -> None:
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.Problem(**{**FIELDS, **make()})
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_by_name_are_in_no_order_before_a_problem() -> None:
+    with pytest.raises(ls.InputError, match="QuadraticCost: got numbers by name, want the one of a Problem"):
+        ls.QuadraticCost({"x": 1.0}, about={}).weight.any()
+    with pytest.raises(ls.InputError, match="FixedState: got numbers by name, want that of a Problem"):
+        ls.FixedState(x=1.0).numbers.any()
+
+
+SHUFFLED = st.permutations(["count", "index", "names", "v", "x"])  # attributes of tuples are names, too
+
+
+@settings(max_examples=20, deadline=None)
+@given(states=SHUFFLED, controls=st.permutations(["turn", "push"]), seed=st.integers(0, 2**16))
+def test_formulas_know_states_and_controls_by_name(states: list[str], controls: list[str], seed: int) -> None:
+    """The same system with its states in any order: its rates by name do not depend on the order, to the last bit."""
+
+    def rates(x: Any, u: Any, p: Any) -> list[Any]:
+        found = {"count": x.v * u.turn, "index": p.gain * x.x, "names": x.count + x.index, "v": u.push, "x": x.names}
+        assert x[1:3] == (x[1], x[2])
+        assert getattr(x[1:3], states[1]) is x[1]
+        return [found[name] for name in states]
+
+    dynamics = ls.Dynamics(
+        rates, states=dict.fromkeys(states, "m"), controls=dict.fromkeys(controls, "N"), parameters={"gain": 3.0}
+    )
+    at = dict(zip([*states, *controls], np.random.default_rng(seed).normal(size=7), strict=True))
+    found = dict(zip(states, dynamics.rate([at[one] for one in states], [at[one] for one in controls]), strict=True))
+    assert found == {
+        "count": at["v"] * at["turn"], "index": 3.0 * at["x"], "names": at["count"] + at["index"], "v": at["push"],
+        "x": at["names"],
+    }  # fmt: skip
+    wrong = ls.Dynamics(lambda x, u, p: [x.speed], states={"v": "m/s"}, controls={"u": "N"})
+    with pytest.raises(ls.InputError, match="got 'speed', want one of: v"):
+        wrong.rate([0.0], [0.0])

@@ -54,7 +54,7 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
         along = constraints.points(plan)
         missed = max((one.violation(along) for one in constraints.of(problem)), default=0.0)
     motion = float(np.abs(arrived - states[1:]).max())
-    start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
+    start = float(np.abs(states[0] - problem.initial.numbers).max())
     low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
     limits = float(np.maximum(low - controls, controls - high).max())
     shortest, longest = (problem.steps * problem.dt,) * 2 if problem.duration is None else problem.duration
@@ -72,7 +72,7 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
 def rolled_out(problem: ls.Problem, controls: Array) -> Array:
     """States (T+1, n) that the controls (T, m) lead to."""
     assert isinstance(problem.initial, ls.FixedState)
-    states = [np.array(problem.initial.state, dtype=float)]
+    states = [problem.initial.numbers.copy()]
     for control in controls:
         states.append(_step(problem, states[-1], control, problem.dt))
     return np.array(states)

@@ -92,7 +92,7 @@ def parameters(problem: ls.Problem) -> Array:
     """The numbers that `Formulas` take, in their order: the start first."""
     if not isinstance(problem.initial, ls.FixedState):
         raise NotImplementedError("a start that is not given exactly")
-    found = [np.asarray(problem.initial.state), np.array(list(problem.dynamics.parameters.values()))]
+    found = [problem.initial.numbers, np.array(list(problem.dynamics.parameters.values()))]
     for one in (*terms_of(problem.stage_cost), *terms_of(problem.final_cost)):
         if isinstance(one, ls.QuadraticCost | ls.ControlCost):
             found.append(one.about)

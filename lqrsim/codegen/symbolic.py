@@ -27,6 +27,30 @@ class Parameters(SimpleNamespace):
         raise InputError(f"parameter: got {name!r}, want one of: {', '.join(vars(self)) or '(there are none)'}")
 
 
+class Vector(tuple[Any, ...]):
+    """The `x` or `u` of `f(x, u, p)`: symbols by their place, `x[1]`, or by their names, `x.speed`."""
+
+    names: tuple[str, ...]
+
+    def __new__(cls, symbols: Iterable[Any], names: Sequence[str]) -> "Vector":
+        made = super().__new__(cls, symbols)
+        made.names = tuple(names)
+        return made
+
+    def __getattribute__(self, name: str) -> Any:  # first the names: a state may be called `count`
+        names = super().__getattribute__("__dict__").get("names", ())
+        return self[names.index(name)] if name in names else super().__getattribute__(name)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise InputError(f"name: got {name!r}, want one of: {', '.join(self.names) or '(there are none)'}")
+
+    def __getitem__(self, place: Any) -> Any:
+        found = super().__getitem__(place)
+        return Vector(found, self.__dict__["names"][place]) if isinstance(place, slice) else found
+
+
 def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]:
     """The parameters as floats. Raises InputError unless each is finite and its name can be written `p.name`."""
     if parameters is None:
@@ -85,8 +109,8 @@ def _writers() -> str:
 
 def trace(
     function: Callable[..., Any],
-    states: int,
-    controls: int | None,
+    states: Sequence[str],
+    controls: Sequence[str] | None,
     parameters: Sequence[str],
     *,
     constants: Mapping[str, float] | None = None,
@@ -94,7 +118,7 @@ def trace(
     """Call `function(x, u, p)` with symbols.
 
     Args:
-      function: the user's. states: size of x. controls: size of u; None for a `function(x, p)`.
+      function: the user's. states: names of x. controls: names of u; None for a `function(x, p)`.
       parameters: names in p. constants: further attributes of p, with numbers in place of symbols.
 
     Returns:
@@ -105,13 +129,13 @@ def trace(
     """
     import sympy
 
-    x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
-    u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls or 0)]
+    x = [sympy.Symbol(f"x{i}", real=True) for i in range(len(states))]
+    u = [sympy.Symbol(f"u{i}", real=True) for i in range(len(controls or ()))]
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
     for constant, value in (constants or {}).items():  # Integers, so that x + 0 and 1 * x simplify to x
         setattr(p, constant, sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(value))
-    given = (tuple(x), p) if controls is None else (tuple(x), tuple(u), p)
-    of, counted = ("x", "") if controls is None else ("x, u", f" and {controls} in u")
+    given = (Vector(x, states), p) if controls is None else (Vector(x, states), Vector(u, controls), p)
+    of, counted = ("x", "") if controls is None else ("x, u", f" and {len(u)} in u")
     called = f"{getattr(function, '__qualname__', repr(function))}({of}, p)"
     try:
         returned = function(*given)
@@ -119,7 +143,7 @@ def trace(
         raise InputError(f"{called}: {error}") from None
     except Exception as error:  # whatever a user's function may raise becomes one line
         raise InputError(
-            f"{called}: got {type(error).__name__} ({error}) when called with symbols, {states} in x{counted},"
+            f"{called}: got {type(error).__name__} ({error}) when called with symbols, {len(x)} in x{counted},"
             " want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
             " for NumPy's functions and for branches there is level='compiled' or 'plain'"
         ) from None

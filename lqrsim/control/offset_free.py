@@ -17,11 +17,11 @@ from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.tracking import Prediction, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
-from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
+from lqrsim.control.uncertainty import Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution

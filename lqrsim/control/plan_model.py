@@ -70,7 +70,7 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     if sensors is None:
         sensors = space.names
     if callable(sensors):
-        return _symbolic(sensors, len(space))
+        return _symbolic(sensors, space.names)
     if isinstance(sensors, str):
         raise InputError(f"sensors: got {excerpt(sensors)}, want a tuple of names: ({excerpt(sensors)},)")
     listed: Any = sensors
@@ -96,13 +96,13 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     )
 
 
-def _symbolic(function: Callable[[Any, Any, Any], Any], states: int) -> Sensor:
+def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -> Sensor:
     """The sensor of a formula of the state."""
     check_signature(function, ("x", "u", "p"))
     of = name_of(function)
 
     def make() -> dict[str, Any]:
-        values, x, _ = symbolic.trace(function, states, 0, [])
+        values, x, _ = symbolic.trace(function, states, (), [])
         slopes = {(i, j): value.diff(xj) for i, value in enumerate(values) for j, xj in enumerate(x)}
         slopes = {f"out[{i}, {j}]": slope for (i, j), slope in slopes.items() if slope != 0}
         assigned = {f"out[{i}]": value for i, value in enumerate(values)}

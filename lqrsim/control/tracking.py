@@ -20,9 +20,10 @@ from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.linear_loop import LinearLoop, limited
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import AT_END, Averse, Weights, check_plan, effort_of, tracking_laws
-from lqrsim.control.uncertainty import PerEntry, Uncertainty
+from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 

@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.uncertainty import PerEntry, per_entry
+from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.solution import Solution
 
 CONTROL_SHARE = 0.25  # of the range between its limits that a control may be changed by, by default

@@ -24,10 +24,7 @@ from lqrsim.errors import (
     real,
 )
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.results.coordinates import Coordinates
-
-# A number for all, one for each, or by name or by unit: {"m": 0.05, "m/s": 0.2}, {"x": 0.05}.
-PerEntry = float | Sequence[float] | Mapping[str, float]
+from lqrsim.results.coordinates import Coordinates, PerEntry
 
 MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to its own
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
@@ -230,19 +227,11 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
       InputError: a name or unit that there is not, another number of them, or one that is out of range.
     """
     if isinstance(numbers, Mapping):
-        units = list(dict.fromkeys(unit for unit in space.units if unit))
-        values = np.full(len(space), np.nan)
-        for of in (units, list(space.names)):
-            for name, value in numbers.items():
-                check_name(field, name, [*space.names, *units])
-                if name in of:
-                    value = check_number(f"{field}: {name}", value)
-                    chosen = space.names if of is not units else space.units
-                    values[[i for i, one in enumerate(chosen) if one == name]] = value
-        missing = [name for name, value in zip(space.names, values, strict=True) if np.isnan(value)]
+        given = space._by_name(field, numbers, check_number)
+        missing = [name for i, name in enumerate(space.names) if i not in given]
         if missing and above is not None:
             raise InputError(f"{field}: got none for {', '.join(missing)}, want one for each state, by name or unit")
-        values = np.nan_to_num(values)
+        values = np.array([given.get(i, 0.0) for i in range(len(space))])
     elif real(field, numbers).ndim == 0:
         values = np.full(len(space), check_number(field, numbers))
     else:

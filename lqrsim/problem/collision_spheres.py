@@ -185,16 +185,18 @@ class CollisionSpheres:
         """
         if self.level != "symbolic":
             return self._bind_functions(dynamics)
-        n, constants = len(dynamics.state_coordinates), dynamics.constants
-        details = ("balls", n, len(self), tuple(dynamics.parameters), *constants.items())
+        states, constants = dynamics.state_coordinates.names, dynamics.constants
+        details = ("balls", states, len(self), tuple(dynamics.parameters), *constants.items())
         made = symbolic.kept(
-            self.function, details, lambda: self._trace(n, dynamics.parameters, constants),
+            self.function, details, lambda: self._trace(states, dynamics.parameters, constants),
             source=str, size=int, depends_on=list,
         )  # fmt: skip
         self._check_plane(made["size"], dynamics.state_coordinates)
         return SphereCenters(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
 
-    def _trace(self, n: int, parameters: Mapping[str, float], constants: Mapping[str, float]) -> dict[str, Any]:
+    def _trace(
+        self, states: Sequence[str], parameters: Mapping[str, float], constants: Mapping[str, float]
+    ) -> dict[str, Any]:
         sizes: set[int] = set()
 
         @functools.wraps(self.function)
@@ -203,7 +205,7 @@ class CollisionSpheres:
             sizes.update(len(point) for point in points)
             return [entry for point in points for entry in point]
 
-        entries, x, _ = symbolic.trace(listed, n, None, list(parameters), constants=constants)
+        entries, x, _ = symbolic.trace(listed, states, None, list(parameters), constants=constants)
         import sympy
 
         (size,) = sizes

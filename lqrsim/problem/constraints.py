@@ -153,9 +153,11 @@ class SymbolicConstraint(Constraint):
         return f"{name_of(self.function)}(x, u, p)"
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        details = ("constraint", n, m, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, m), source=str, rows=int, with_control=list)
+        names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        details = ("constraint", *names, tuple(self.parameters))
+        made = symbolic.kept(
+            self.function, details, lambda: self._trace(*names), source=str, rows=int, with_control=list
+        )
         with_control, rows = made["with_control"], made["rows"]
         if self.at == "final" and with_control:
             raise InputError(
@@ -177,8 +179,8 @@ class SymbolicConstraint(Constraint):
             final_only=self.at == "final",
         )
 
-    def _trace(self, n: int, m: int) -> dict[str, Any]:
-        traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
+    def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
         if not traced:
             raise InputError(f"{self.name}: got no entries, want at least one: each must be nonnegative, or zero")
         parts, choices = [], {"value": [], "slope": []}
@@ -218,7 +220,7 @@ class GoalState(Constraint):
     def __init__(self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, **named: float) -> None:
         self.goal: Array | dict[str, float]
         if goal is None or named or isinstance(goal, Mapping):
-            self.goal = _by_name("GoalState", goal, named, "a number", check_number)
+            self.goal = by_name("GoalState", goal, named, "a number", check_number)
         else:
             self.goal = check_array("GoalState: goal", goal, (None,))
 
@@ -260,7 +262,7 @@ class StateBounds(Constraint):
     def __init__(
         self, bounds: Mapping[str, tuple[float, float]] | None = None, /, **named: tuple[float, float]
     ) -> None:
-        self.bounds = _by_name("StateBounds", bounds, named, "(low, high)", _bound)
+        self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_to_goal(dynamics, {}, 0)
@@ -348,7 +350,7 @@ def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: s
     return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)
 
 
-def _by_name(
+def by_name(
     who: str, given: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
 ) -> dict[str, _Value]:
     """What is given for names of states, in a dictionary or by keyword. Raises InputError."""

@@ -4,12 +4,13 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
+import copy
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
@@ -39,6 +40,7 @@ from lqrsim.kernels import differences, distance_cost, limit_cost, obstacle_cost
 from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import PerEntry
 from lqrsim.scenes.world import World
 
 FAR = 16.0  # over the sharpness of an ObstacleCost: from where on geoms cost nothing, and before it exp(-FAR)
@@ -111,6 +113,10 @@ class Cost(abc.ABC):
         """This cost for a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
 
+    def _in(self, dynamics: Dynamics) -> "Cost":
+        """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
+        return self
+
     def __add__(self, other: "Cost") -> "CostSum":
         return CostSum((*terms_of(self), *terms_of(other)))
 
@@ -136,41 +142,111 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
     return (cost,)
 
 
-class QuadraticCost(Cost):
-    """`1/2 (x - about)' weight (x - about)`.
+def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
+    """The cost with numbers by name in the order of a system; itself where it has none.
 
-    Args:
-      weight: (n, n) symmetric positive semidefinite, or its diagonal (n,).
-      about: (n,) the state where it is zero.
+    Raises:
+      InputError: a term does not fit the system, or it is no cost.
     """
+    terms = terms_of(cost, field)
+    found = tuple(term._in(dynamics) for term in terms)
+    return cost if all(map(operator.is_, terms, found)) else CostSum(found)
 
-    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike) -> None:
-        self.weight = check_weight("QuadraticCost: weight", weight)
-        self.about = check_array("QuadraticCost: about", about, (len(self.weight),))
+
+class _SquareCost(Cost):
+    """`1/2 (z - about)' weight (z - about)` of the states or the controls."""
+
+    controls: ClassVar[bool]
+
+    def __init__(self, weight: PerEntry, about: PerEntry | None) -> None:
+        self._stated = {"weight": weight, "about": about}
+        self._numbers: tuple[Array, Array] | None = None
+        if not any(isinstance(numbers, Mapping) for numbers in self._stated.values()):
+            self._numbers = self._checked(weight, about)
+
+    def _checked(self, weight: Any, about: Any) -> tuple[Array, Array]:
+        weight = check_weight(f"{self.name}: weight", weight, definite=self.controls)
+        about = np.zeros(len(weight)) if about is None else about
+        return weight, check_array(f"{self.name}: about", about, (len(weight),))
+
+    @property
+    def weight(self) -> Array:
+        """The weight matrix. PerEntry by name are in no order before a Problem has the cost."""
+        return self._known[0]
+
+    @property
+    def about(self) -> Array:
+        """Where it is zero. PerEntry by name are in no order before a Problem has the cost."""
+        return self._known[1]
+
+    @property
+    def _known(self) -> tuple[Array, Array]:
+        if self._numbers is None:
+            raise InputError(f"{self.name}: got numbers by name, want the one of a Problem, as problem.final_cost")
+        return self._numbers
+
+    def _in(self, dynamics: Dynamics) -> "_SquareCost":
+        space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
+        if self._numbers is None:
+            weight = self._stated["weight"]
+            if self.controls and isinstance(weight, Mapping):
+                weighed = space._by_name(f"{self.name}: weight", weight, check_number)
+                missing = [name for i, name in enumerate(space.names) if i not in weighed]
+                if missing:
+                    raise InputError(
+                        f"{self.name}: weight: got none for {', '.join(missing)}, want one for each control"
+                    )
+            found = {
+                field: space._numbers(f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
+                for field, given in self._stated.items()
+            }
+            other = copy.copy(self)
+            other._numbers = self._checked(**found)
+            return other._in(dynamics)
+        if len(self.weight) != len(space):
+            kind = "controls" if self.controls else "states"
+            raise InputError(
+                f"{self.name}: weight: got size {len(self.weight)}, want {len(space)}, the number of {kind}"
+            )
+        return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
-        return CostTerm(source_of(quadratic_cost, CONTROL=0), np.concatenate([self.about, self.weight.ravel()]))
+        weight, about = self._in(dynamics)._known
+        kernel = source_of(quadratic_cost, CONTROL=int(self.controls))
+        return CostTerm(kernel, np.concatenate([about, weight.ravel()]), uses_control=self.controls)
 
 
-class ControlCost(Cost):
+class QuadraticCost(_SquareCost):
+    """`1/2 (x - about)' weight (x - about)`.
+
+        ls.QuadraticCost({"x": 100, "y": 100, "m/s": 10}, about={"x": 2.0})
+
+    Args:
+      weight: (n, n) symmetric positive semidefinite, or its diagonal (n,), or a dictionary of name or unit of a state:
+        number; states without one have no weight.
+      about: (n,) the state where it is zero, or a dictionary of name or unit: number; the others are 0.
+    """
+
+    controls = False
+
+    def __init__(self, weight: PerEntry, *, about: PerEntry) -> None:
+        super().__init__(weight, about)
+
+
+class ControlCost(_SquareCost):
     """`1/2 (u - about)' weight (u - about)`.
 
     Args:
-      weight: (m, m) symmetric positive definite, or its diagonal (m,).
-      about: (m,) the nominal control, where it is zero; the solvers start from it unless told otherwise. By default no
-        control at all, (0, ..., 0).
+      weight: (m, m) symmetric positive definite, or its diagonal (m,), or a dictionary of name or unit of a control:
+        number, with one for each control.
+      about: (m,) the nominal control, where it is zero, or a dictionary of name or unit: number; the solvers start from
+        it unless told otherwise. By default, and for controls without a number, 0.
     """
 
-    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike | None = None) -> None:
-        self.weight = check_weight("ControlCost: weight", weight, definite=True)
-        about = np.zeros(len(self.weight)) if about is None else about
-        self.about = check_array("ControlCost: about", about, (len(self.weight),))
+    controls = True
 
-    def bind(self, dynamics: Dynamics) -> CostTerm:
-        _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
-        numbers = np.concatenate([self.about, self.weight.ravel()])
-        return CostTerm(source_of(quadratic_cost, CONTROL=1), numbers, uses_control=True)
+    def __init__(self, weight: PerEntry, *, about: PerEntry | None = None) -> None:
+        super().__init__(weight, about)
 
 
 class LimitCost(Cost):
@@ -325,10 +401,10 @@ class SymbolicCost(Cost):
         return f"{name_of(self.function)}(x, u, p)"
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        details = ("cost", n, m, tuple(self.parameters))
+        names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        details = ("cost", *names, tuple(self.parameters))
         made = symbolic.kept(
-            self.function, details, lambda: self._trace(n, m), source=str, nonconvex_in=list, uses_control=bool
+            self.function, details, lambda: self._trace(*names), source=str, nonconvex_in=list, uses_control=bool
         )
         return CostTerm(
             made["source"],
@@ -337,8 +413,8 @@ class SymbolicCost(Cost):
             uses_control=made["uses_control"],
         )
 
-    def _trace(self, n: int, m: int) -> dict[str, Any]:
-        traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
+    def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
         if len(traced) != 1:
             raise InputError(f"{self.name}: got {len(traced)} entries, want one: the cost")
         cost, z = traced[0], [*x, *u]
@@ -424,8 +500,3 @@ class FunctionCost(Cost):
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
-
-
-def _check_size(field: str, weight: Array, want: int, what: str) -> None:
-    if len(weight) != want:
-        raise InputError(f"{field}: got size {len(weight)}, want {want}, the number of {what}")

@@ -24,12 +24,10 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
-    numbers_of,
 )
 from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, Limits
 
-Limits = tuple[npt.ArrayLike, npt.ArrayLike]
 # Most operations of a formula that is differentiated twice, which then takes about five seconds.
 LONGEST = 1500
 
@@ -41,8 +39,7 @@ class Dynamics:
 
         def pendulum(x, u, p):
             from sympy import sin
-            angle, speed = x
-            return [speed, u[0] / p.inertia - p.gravity / p.length * sin(angle)]
+            return [x.speed, u.torque / p.inertia - p.gravity / p.length * sin(x.angle)]
 
         ls.Dynamics(
             pendulum,
@@ -59,7 +56,7 @@ class Dynamics:
 
     Args:
       f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
-        attributes.
+        attributes, and so have x and u states and controls where they are symbols: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
@@ -74,7 +71,8 @@ class Dynamics:
       offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
-      control_limits: lowest and highest control, numbers or (m,); the actuators' range, for execution.
+      control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
+        (lowest, highest), as `{"force": (-2, 2)}`; the actuators' range, for execution.
       jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
         that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
@@ -135,7 +133,6 @@ class Dynamics:
             if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
                 raise InputError(f"rotation_vectors: got {excerpt(tuple(triple))}, want three neighbouring states")
             starts.append(indices[0])
-        low, high = _limits_of(control_limits, len(controls))
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
         if jacobian is not None and self.level == "symbolic":
@@ -158,12 +155,8 @@ class Dynamics:
             angles=tuple(index("angles", name) for name in angles),
             rotation_vectors=tuple(starts),
         )
-        self.control_coordinates = Coordinates(
-            names=tuple(controls),
-            units=tuple(controls.values()),
-            low=tuple(low),
-            high=tuple(high),
-        )
+        space = Coordinates(names=tuple(controls), units=tuple(controls.values()))
+        self.control_coordinates = space if control_limits is None else space.limited(control_limits)
         # At once and not when first needed: several threads may need them, and addresses are not to change.
         self.functions = self._functions()
 
@@ -301,9 +294,13 @@ class Dynamics:
         """The disturbances that are taken for granted."""
         return {name: value for name, value in self.disturbances.items() if name not in self.parameters}
 
+    def _traced(self) -> tuple[list[Any], list[Any], list[Any]]:
+        names = self.state_coordinates.names, self.control_coordinates.names
+        return symbolic.trace(self.f, *names, list(self.parameters), constants=self.constants)
+
     def _trace(self) -> str:
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self.constants)
+        n = len(self.state_coordinates)
+        rates, x, u = self._traced()
         if len(rates) != n:
             states = ", ".join(self.state_coordinates.names)
             raise InputError(f"{self.name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")
@@ -328,7 +325,7 @@ class Dynamics:
         import sympy
 
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self.constants)
+        rates, x, u = self._traced()
         if sum(sympy.count_ops(rate) for rate in rates) > LONGEST:
             return {"source": "", "support": []}
         z = [*x, *u]
@@ -461,16 +458,3 @@ def _parameters_of(
     if twice:
         raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
     return (own if level == "symbolic" else own | unknown), unknown
-
-
-def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
-    """The lowest and the highest value of each of this number of controls. Raises InputError for anything but such a
-    pair.
-    """
-    limits = control_limits if control_limits is not None else (-np.inf, np.inf)
-    try:
-        low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)
-    except Exception:  # no pair, no numbers, another number of them
-        wanted = f"(lowest, highest), each a number or ({count},)"
-        raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
-    return low, high

@@ -177,7 +177,7 @@ class Noise:
           InputError: the noise does not fit the system.
         """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
-        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        n = len(dynamics.state_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
             if len(self.matrix) != n:
@@ -187,17 +187,20 @@ class Noise:
             return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
         if self.level != "symbolic":
             return self._bind_function(dynamics, numbers)
-        details = ("noise", n, m, self.size, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, m), source=str, rows=list, active=list)
+        names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        details = ("noise", *names, self.size, tuple(self.parameters))
+        made = symbolic.kept(self.function, details, lambda: self._trace(*names), source=str, rows=list, active=list)
         source = text_source(made["source"], self.name)
         return NoiseTerm(source, numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
 
-    def _trace(self, n: int, m: int) -> dict[str, Any]:
+    def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
+        n = len(states)
+
         @functools.wraps(self.function)
         def listed(x: Any, u: Any, p: Any) -> list[Any]:
             return [entry for row in self._rows(self.function(x, u, p), n) for entry in row]
 
-        entries, x, u = symbolic.trace(listed, n, m, list(self.parameters))
+        entries, x, u = symbolic.trace(listed, states, controls, list(self.parameters))
         import sympy
 
         strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)  # after the parameters, and without a name

@@ -1,7 +1,7 @@
 """The optimal control problem of Eqs. (1)-(2), in discrete time."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,34 +22,58 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_spheres import evaluate
-from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
-from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
+from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, by_name, goals_of
+from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 
 TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class FixedState:
-    """An initial state (n,) that is given exactly, in place of an initial cost.
+    """An initial state that is given exactly, in place of an initial cost.
+
+        ls.FixedState(x=1.0, heading=np.pi)
+
+    Args:
+      state: (n,) in the states' units, or a dictionary of name or unit: number; states without one are 0.
+      **named: name of a state -> number, which says the same as a dictionary.
 
     Attributes:
-      state: (n,).
+      state: the numbers, by name until a Problem has it.
 
     Raises:
-      InputError: not finite numbers (n,).
+      InputError: not finite numbers (n,), none at all, or a state that is named twice.
     """
 
-    state: npt.ArrayLike
+    state: PerEntry
 
-    def __post_init__(self) -> None:
-        state = check_array("FixedState: state", self.state, (None,))
-        if not len(state):
-            raise InputError("FixedState: state: got no numbers, want one a state")
-        object.__setattr__(self, "state", state)
+    def __init__(self, state: PerEntry | None = None, /, **named: float) -> None:
+        if state is None or named or isinstance(state, Mapping):
+            found = by_name("FixedState", state, named, "a number", check_number)
+        else:
+            found = check_array("FixedState: state", state, (None,))
+            if not len(found):
+                raise InputError("FixedState: state: got no numbers, want one a state")
+        object.__setattr__(self, "state", found)
+
+    @property
+    def numbers(self) -> Array:
+        """The state (n,). PerEntry by name are in no order before a Problem has it."""
+        if isinstance(self.state, Mapping):
+            raise InputError("FixedState: got numbers by name, want that of a Problem, as problem.initial")
+        return np.asarray(self.state)
+
+    def _in(self, dynamics: Dynamics) -> "FixedState":
+        """The state with numbers by name in the order of a system. Raises InputError if it does not fit."""
+        space = dynamics.state_coordinates
+        if isinstance(self.state, Mapping):
+            return FixedState(space._numbers("FixedState", self.state))
+        check_array("initial: FixedState", self.state, (len(space),))
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +87,9 @@ class Problem:
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
-      control_limits: (lowest, highest) control, each a number or (m,); by default the actuators' range. Infinite ones
-        plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
+      control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
+        (lowest, highest); by default the actuators' range. Infinite ones plan as if there were none. Plan and policy
+        keep them exactly, and the policy keeps the actuators', too.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
       begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
@@ -89,7 +114,7 @@ class Problem:
     initial: Cost | FixedState
     stage_cost: Cost
     final_cost: Cost
-    control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
+    control_limits: Limits | None = None
     constraints: Sequence[Constraint] = ()
     begin: float = 0.0
     noise: Noise | None = None
@@ -109,10 +134,13 @@ class Problem:
             raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
         self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
+        for name in ("stage_cost", "final_cost", "initial"):
+            given, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
+            object.__setattr__(self, name, given._in(self.dynamics) if fixed else in_system(given, self.dynamics, name))
         costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
-            state = check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
             # A zero cost, with which fixed and soft starts share compiled code.
+            state = self.initial.numbers
             costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
         else:
             costs["initial"] = terms_of(self.initial, "initial")
@@ -133,13 +161,7 @@ class Problem:
         self._check_duration()
         controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
-            try:
-                low, high = self.control_limits
-            except Exception:  # no pair, or what raises whatever it likes as one
-                raise InputError(
-                    f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
-                ) from None
-            limited = controls.limited(low, high)
+            limited = controls.limited(self.control_limits)
             _check_within_reach(limited, controls)
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
             object.__setattr__(self, "_controls", (limited, limited.within(controls)))
@@ -201,7 +223,7 @@ class Problem:
           InputError: a cost does not belong to the system.
         """
         given = {"stage_cost": stage_cost, "final_cost": final_cost}
-        costs = {name: cost for name, cost in given.items() if cost is not None}
+        costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
         terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
         return self._with(**costs, _terms=self._terms | terms)
 
@@ -241,7 +263,7 @@ class Problem:
     def start(self) -> Array | None:
         """The state (n,) that the initial cost or FixedState asks for; None where it names none."""
         if isinstance(self.initial, FixedState):
-            return np.asarray(self.initial.state)
+            return self.initial.numbers
         abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
         return abouts[0] if len(abouts) == 1 else None
 
@@ -333,7 +355,7 @@ class Problem:
             parts.append(self.dynamics.fixed)
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
-            parts.append(np.asarray(self.initial.state))
+            parts.append(self.initial.numbers)
         for name in ("initial", "stage_cost", "final_cost"):
             for term in self.terms(name):
                 parts += [term.code.digest, term.data]

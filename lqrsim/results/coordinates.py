@@ -1,7 +1,9 @@
 """The meaning of a state or control vector: names, units, limits, and which entries wrap."""
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,13 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.scenes.world import PLANES, SPACE
+
+_Value = TypeVar("_Value")
+
+# One for each entry, or by name or by unit: {"m": 0.05, "m/s": 0.2}, {"x": 0.05}.
+PerEntry = npt.ArrayLike | Mapping[str, float]
+# (lowest, highest), each a number or one for each entry; or such a pair by name or unit: {"N": (0, 2)}.
+Limits = tuple[npt.ArrayLike, npt.ArrayLike] | Mapping[str, tuple[float, float]]
 
 _FROM_ABOVE = ("xy", "yx")
 _UPWARD = ("height", "altitude", "elevation", "vertical")  # such a name does not fit a plane seen from above
@@ -216,28 +225,74 @@ class Coordinates:
         """
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
-    def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
-        """The same coordinates with other limits, each a number or one for each entry.
+    def _by_name(
+        self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
+    ) -> dict[int, _Value]:
+        """What is given by name or by unit, by the index of the entry; a name wins over a unit.
 
         Args:
-          low: lower limits, a number or (n,).
-          high: upper limits, a number or (n,).
+          field: of the message.
+          given: name of an entry, or a unit -> what is said of it, or of all entries in this unit.
+          check: a function of a field and a value, which returns the value, or raises.
+
+        Returns:
+          Index of each entry that is named -> what `check` returned.
 
         Raises:
-          InputError: a limit is not a number, or the lower is not below the upper.
+          InputError: there is no such name or unit.
         """
-        try:
-            sides = [np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in (low, high)]
-        except ValueError:
-            raise InputError(
-                f"control_limits: got {excerpt((low, high))}, want (lowest, highest), each a number or ({len(self)},)"
-            ) from None
-        for name, lowest, highest in zip(self.names, *sides, strict=True):
+        units, found = set(self.units) - {""} - set(self.names), {}
+        for key in sorted(given, key=lambda key: key not in units):  # units first, so that names win
+            check_name(field, key, [*self.names, *sorted(units)])
+            value = check(f"{field}: {excerpt(key)}", given[key])
+            told = self.units if key in units else self.names
+            found |= {i: value for i, one in enumerate(told) if one == key}
+        return found
+
+    def _numbers(self, field: str, given: Mapping[str, float]) -> Array:
+        """Numbers by name or by unit as an array (n,), 0 where none is given.
+
+        Args:
+          field: of the message.
+          given: name of an entry, or a unit -> number.
+
+        Returns:
+          (n,).
+
+        Raises:
+          InputError: there is no such name or unit, or a number is not finite.
+        """
+        out = np.zeros(len(self))
+        for i, number in self._by_name(field, given, check_number).items():
+            out[i] = number
+        return out
+
+    def limited(self, limits: Limits) -> "Coordinates":
+        """The same coordinates with other limits.
+
+        Args:
+          limits: (lowest, highest), each a number or (n,); or a dictionary of name or unit: (lowest, highest), which
+            leaves the other entries their limits.
+
+        Raises:
+          InputError: a limit is not a number, the lower is not below the upper, or there is no such name.
+        """
+        if isinstance(limits, Mapping):
+            low, high = np.array(self.low), np.array(self.high)
+            for i, pair in self._by_name("control_limits", limits, _pair).items():
+                low[i], high[i] = pair
+        else:
+            try:
+                low, high = (np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in limits)
+            except Exception:  # no pair, no numbers, another number of them
+                wanted = f"(lowest, highest), each a number or ({len(self)},), or such pairs by name"
+                raise InputError(f"control_limits: got {excerpt(limits)}, want {wanted}") from None
+        for name, lowest, highest in zip(self.names, low, high, strict=True):
             if not lowest < highest:
                 raise InputError(
                     f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second"
                 )
-        return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
+        return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def within(self, other: "Coordinates") -> "Coordinates":
         """The same coordinates with the narrower of both limits.
@@ -261,6 +316,12 @@ class Coordinates:
           vector: (..., n).
         """
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
+
+
+def _pair(field: str, given: object) -> tuple[float, float]:
+    """(lowest, highest), which may be infinite."""
+    low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
+    return low, high
 
 
 def _letter(name: str) -> str:

@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lqrsim.control.uncertainty import PerEntry, per_entry
+from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
+from lqrsim.results.coordinates import PerEntry
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenarios.packaged import Scenario
 

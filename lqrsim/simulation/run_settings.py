@@ -130,7 +130,7 @@ def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinate
     # A command that the robot clips is at a limit, whatever limits the policy assumed.
     own = dynamics.control_coordinates
     low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
-    return spaces[0], spaces[1].limited(low, high)
+    return spaces[0], spaces[1].limited((low, high))
 
 
 def _check_plan(given: Plan, plant: Plant) -> None:

@@ -83,7 +83,7 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
     cost, scale, motion, law, beyond, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
-        start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
+        start = float(np.abs(states[0] - problem.initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
     optimality = decrease / max(abs(cost), 1e-26 * scale, 1e-300) if np.isfinite(decrease) else np.inf

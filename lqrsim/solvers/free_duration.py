@@ -73,7 +73,7 @@ def with_duration(problem: Problem) -> Problem:
     stated, (low, high) = problem.steps * problem.dt, problem.duration
     initial = problem.initial
     if isinstance(initial, FixedState):
-        initial = FixedState(np.append(np.asarray(initial.state), stated))
+        initial = FixedState(np.append(initial.numbers, stated))
     else:
         initial = CostSum(tuple(_longer_cost(cost, n) for cost in terms_of(initial)))
     stage, final = (

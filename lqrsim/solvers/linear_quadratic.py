@@ -225,7 +225,7 @@ def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) ->
             raise InputError(
                 'initial: got a FixedState, want a Quadratic: the primal form has no fixed start; "dual" has'
             )
-        return np.zeros((n, n)), check_array("initial: state", initial.state, (n,)), 0.0
+        return np.zeros((n, n)), check_array("initial: state", initial.numbers, (n,)), 0.0
     hessian, gradient, constant = check_end("initial", initial, n)
     if form == "primal":
         return hessian, gradient, constant

@@ -136,9 +136,22 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Coordinates.of_world": ({"self": place.space, "points": np.zeros((4, 3))},),
         "Coordinates.nearest": ({"self": limits, **there},),
         "Coordinates.difference": ({"self": limits, **there},),
-        "Coordinates.limited": ({"self": limits, "low": -1.0, "high": (1.0, 2.0, 3.0)},),
+        "Coordinates.limited": ({"self": limits, "limits": (-1.0, (1.0, 2.0, 3.0))},),
+        "Coordinates.limited by name": (
+            {"call": limits.limited, "limits": {limits.names[0]: (-1.0, 1.0)}},
+        ),
         "Coordinates.within": ({"self": limits, "other": limits},),
         "Coordinates.clip": ({"self": limits, "vector": [2.0, 0.0, 0.0]},),
+        "QuadraticCost by name": ({
+            "call": lambda weight, about: dataclasses.replace(
+                place.problem, final_cost=ls.QuadraticCost(weight, about=about)
+            ),
+            "weight": {"m": 1.0}, "about": {place.space.names[0]: 0.5},
+        },),
+        "ControlCost by name": ({
+            "call": lambda weight: dataclasses.replace(place.problem, stage_cost=ls.ControlCost(weight)),
+            "weight": {"m/s": 1.0},
+        },),
         "QuadraticCost": ({"weight": [1.0, 2.0], "about": [0.0, 0.0]},),
         "ControlCost": ({"weight": [[1.0]], "about": [0.0]},),
         "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
@@ -190,7 +203,8 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "SiteConstraint": ({
             "site": "tool", "position": np.zeros(3), "orientation": [1.0, 0, 0, 0], "at": "final",
         },),
-        "FixedState": ({"state": [0.0, 1.0]},),
+        "FixedState": ({"call": lambda state, v: ls.FixedState(state, v=v), "state": {"x": 0.0}, "v": 1.0},),
+        "FixedState of a state": ({"call": lambda state: ls.FixedState(state), "state": [0.0, 1.0]},),
         "Problem": (stated | {
             "control_limits": (-0.4, 0.4), "constraints": [], "noise": ls.Noise(np.eye(3)), "risk": 0.1,
         },),
