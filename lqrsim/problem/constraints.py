@@ -113,7 +113,7 @@ class SymbolicConstraint(Constraint):
     """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
 
         def slower_than_2(x, u, p):  # a planar speed, in m/s
-            return p.speed**2 - x[2] ** 2 - x[3] ** 2
+            return p.speed**2 - x.vx**2 - x.vy**2
 
         ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 

@@ -77,7 +77,7 @@ class Noise:
     Gusts that grow with the speed of a drone:
 
         def shaken(x, u, p):
-            speed = sqrt(x[3] ** 2 + x[4] ** 2 + 1e-6)
+            speed = sqrt(x.vx**2 + x.vy**2 + 1e-6)
             return [[0, 0], ..., [p.gust * speed, 0], ...]     # a row a state, an entry for each number in w
 
         ls.Noise(shaken, size=2, parameters={"gust": 0.02})

@@ -36,9 +36,9 @@ class MyRobot(ls.Robot):
         """The rate of the state under a control; lqrsim derives the derivatives."""
 
         def rate(x: Any, u: Any, p: Any) -> list[Any]:
-            _, _, vx, vy = x
-            force = [u[0] + p.force_x - p.damping * vx, u[1] + p.force_y - p.damping * vy]
-            return [vx, vy, force[0] / p.mass, force[1] / p.mass]
+            force_x = u.push_x + p.force_x - p.damping * x.vx
+            force_y = u.push_y + p.force_y - p.damping * x.vy
+            return [x.vx, x.vy, force_x / p.mass, force_y / p.mass]
 
         return ls.Dynamics(
             rate,
