@@ -19,7 +19,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
-from lqrsim.view.decorative_geoms import RIM
+from lqrsim.view.overlays import RIM
 from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 from lqrsim.view.video_metadata import Pane, VideoMetadata
 

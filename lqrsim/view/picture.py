@@ -16,12 +16,10 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import gl
 from lqrsim.view.cameras import CameraView, camera_view, leaves_room_for_captions
-from lqrsim.view.captions import Caption, Legend
-from lqrsim.view.decorative_geoms import draw_mark, mark_radius
+from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
-from lqrsim.view.overlays import Overlays, common_scale
+from lqrsim.view.overlays import Overlays, common_scale, draw_mark, mark_radius
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import Pane
 
 FADED_OPACITY = 0.10  # of a geom that hides the robot

@@ -14,7 +14,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
+from lqrsim.view.overlays import PLAN_RGB, decorate
 from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
