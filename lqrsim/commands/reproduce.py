@@ -167,7 +167,7 @@ def results_page(saved: Mapping[str, Any]) -> str:
 
 
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
-    """How many statements hold, in words."""
+    """How many statements hold, as text."""
     counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
     said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."

@@ -142,7 +142,7 @@ class Task:
         return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
 
     def trials(self, seed: int, following: int, options: Any) -> EpisodeTrials:
-        """The trials for the options of a `reset`; by default they begin with number `following`.
+        """The trials for the options of a `reset`; the first is number `following` by default.
 
         Raises:
           InputError: an option is unknown or invalid.
@@ -335,7 +335,7 @@ class Episode:
         return Moment(self.observations, rewards, *self._ended_at.copy())
 
     def rollout(self) -> Rollout:
-        """The records so far, as `simulate` has them; NaN after now."""
+        """The records so far, in the form of `simulate`; NaN from now on."""
         return self._loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:

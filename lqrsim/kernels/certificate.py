@@ -145,7 +145,7 @@ def predicted_decrease(step, stage, gain, S, room, costate):
 
 
 def singular_semidefinite(matrix):
-    """Whether a control block (M, M) is positive semidefinite to rounding: definite with a little on its diagonal."""
+    """Whether a control block (M, M) is positive semidefinite up to rounding: definite with more on its diagonal."""
     block, size = stack(M, M), 1e-300
     for i in range(M):
         size = max(size, abs(matrix[i, i]))

@@ -138,7 +138,7 @@ def failure(good, model):
 
 
 def cycling(log, done):
-    """Whether the costs repeat to rounding: then they always will.
+    """Whether the costs repeat, up to rounding: then they always will.
 
     A cycle must repeat twice; one that the iterations still approach does not count. A cost that stays the same is a
     cycle, too: iterations that have not converged by then never will.

@@ -4,6 +4,7 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ from lqrsim.codegen.user_functions import (
     UserFunction,
     axes_of,
     check_depends_on,
+    check_derivative,
     check_signature,
     level_of,
     name_of,
@@ -28,7 +30,6 @@ from lqrsim.errors import (
     check_array,
     check_count,
     check_flag,
-    check_function,
     check_items,
     check_name,
     check_number,
@@ -41,7 +42,7 @@ from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, che
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
-FAR = 16.0  # over the sharpness of an ObstacleCost: from where on geoms cost nothing, and before it exp(-FAR)
+FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
 
 
 @dataclass(frozen=True)
@@ -248,10 +249,9 @@ class ObstacleCost(Cost):
         Args:
           weight: cost of touching one obstacle, with one ball, for one step.
         """
-        radius = self.radius if self.balls is None and self.geoms is None else None
-        return ObstacleCost(
-            self.world, radius=radius, balls=self.balls, geoms=self.geoms, sharpness=self.sharpness, weight=weight
-        )
+        other = copy.copy(self)
+        other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+        return other
 
     @property
     def moving(self) -> bool:
@@ -396,9 +396,9 @@ class FunctionCost(Cost):
         self.parameters = symbolic.check_parameters(parameters)
         check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
-            check_function("FunctionCost: derivatives", derivatives, "a function of (x, u, p, gradient, hessian)")
-            level_of(derivatives, self.level)
-            check_signature(derivatives, ("x", "u", "p", "gradient", "hessian"))
+            check_derivative(
+                "FunctionCost: derivatives", derivatives, function, self.level, "x, u, p, gradient, hessian"
+            )
 
     @property
     def name(self) -> str:

@@ -137,7 +137,7 @@ class DerivativeCheck:
     """How far derivatives are from central differences, where they are furthest.
 
     Attributes:
-      what: which derivative: `df/dx of ...`, say.
+      what: name of the derivative, such as `df/dx of ...`.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
       row: the name of the output at that entry.
       column: the name of the input at that entry.

@@ -48,7 +48,7 @@ class FixedState:
     def __post_init__(self) -> None:
         state = check_array("FixedState: state", self.state, (None,))
         if not len(state):
-            raise InputError("FixedState: state: got no numbers, want one a state")
+            raise InputError("FixedState: state: got no numbers, want one per state")
         object.__setattr__(self, "state", state)
 
 
@@ -67,7 +67,7 @@ class Problem:
         plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
-      begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
+      begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
       noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
         worked out to second order about the plan. None for none.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
@@ -135,7 +135,7 @@ class Problem:
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
-            except Exception:  # no pair, or what raises whatever it likes as one
+            except Exception:  # no pair, or an object that raises anything
                 raise InputError(
                     f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
                 ) from None

@@ -79,7 +79,7 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
 
 
 def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
-    """Whether states and frames are one motion."""
+    """Whether states and frames show the same motion."""
     times, _ = frames_at_states(rollout, trial)
     found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
     apart = np.linalg.norm(found - wanted, axis=1).max()

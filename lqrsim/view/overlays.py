@@ -61,7 +61,7 @@ class DrawnFunnel:
     Attributes:
       certified: its ellipsoids at knots that have a level, if there are any.
       between: some ellipsoids of interpolated levels, if there are any.
-      said: (T+1) whether the run was in the funnel at each step, in words.
+      said: (T+1) whether the run was in the funnel at each step, as text.
     """
 
     certified: DrawnTube | None
@@ -79,7 +79,7 @@ def predicted(recorded: RecordedTrial) -> DrawnTube | None:
 
 
 def of_cost(recorded: RecordedTrial, solution: Solution | None) -> DrawnTube:
-    """The ellipsoids in which the solution's total cost is near its least."""
+    """The ellipsoids in which the solution's total cost is near its minimum."""
     run = recorded.rollout
     if solution is None:
         raise InputError("solution: got None with the overlay cost_tube, want the Solution that was run")
@@ -162,7 +162,7 @@ FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
-FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; no green, which is the mark's
+FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; not green, as the mark is
 SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than they are
 SEGMENTS = 120  # of a line, at most
 DOTS = 30  # latest measured states that are drawn

@@ -60,7 +60,7 @@ class Viewer(abc.ABC):
 
     Attributes:
       data: the state that is shown.
-      caption: the state in words, as lines.
+      caption: the state as lines of text.
       remark: further lines of the caption.
       wrench: force and torque (6,) of a drag.
       holds_goal: whether mouse and keys move the goal instead of the robot.
