@@ -223,7 +223,7 @@ def box_decrease(matrix, slope, lowest, highest, best):
     for i in range(M):
         best[i] = -slope[i]
         copy(matrix[i], M, factor[i])
-    if not cholesky(factor, M):  # at most what e'x decreases to the end of the box
+    if not cholesky(factor, M):  # an upper bound: the decrease of e'x within the box
         decrease = 0.0
         for i in range(M):
             if slope[i] != 0:

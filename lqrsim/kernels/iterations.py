@@ -82,7 +82,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             copy(work.guess.states[0], N, x_hat)
     for done in range(first, last):
         for i in range(N):
-            if fixed and x_hat[i] != work.start[i]:  # whatever ran before: each forward pass begins where it is given
+            if fixed and x_hat[i] != work.start[i]:  # whatever ran before, each pass begins at the given start
                 x_hat[i] = work.start[i]
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0

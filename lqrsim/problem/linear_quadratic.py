@@ -104,5 +104,5 @@ def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
     """() for ragged input, which has none."""
     try:
         return np.asarray(value).shape
-    except Exception:  # or raises whatever it likes when it is asked
+    except Exception:  # or an object that raises anything
         return ()

@@ -383,8 +383,8 @@ class Problem:
 
     @property
     def goal_inside(self) -> str:
-        """Where the goal is inside an obstacle of a cost or a Clearance, in words; empty where it is clear, or not a
-        place.
+        """The place of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if it is clear, or
+        is no place.
         """
         goal, clearances = self.weighed_goal, [one for one in self.constraints if isinstance(one, Clearance)]
         end = self.begin + self.steps * self.dt

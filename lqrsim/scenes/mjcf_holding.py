@@ -78,8 +78,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which what no actuator drives is at rest, and the largest force (N, N m) left on it.
 
-    Newton's method, with the least steps: contacts are springs, and of the free directions, such as along a floor, none
-    is moved in.
+    Newton's method, with the smallest steps: contacts are springs, and nothing moves in a free direction, such as along
+    a floor.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos

@@ -61,7 +61,7 @@ class Coupling:
     ratio: float
 
 
-UNNAMED = "unnamed_"  # what begins the name of a body, joint, geom or actuator that has none in the MJCF
+UNNAMED = "unnamed_"  # begins the names of bodies, joints, geoms and actuators without one in the MJCF
 
 
 def named(xml: str) -> str:

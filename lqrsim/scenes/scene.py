@@ -54,7 +54,7 @@ _MASSES = frozenset(("mass", "density", "viscosity", "diaginertia", "fullinertia
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 
-Choice = bool | Sequence[str] | Callable[[Any], bool]  # of obstacles; see `load_scene`
+Choice = bool | Sequence[str] | Callable[[Any], bool]  # a choice of obstacles; see `load_scene`
 
 
 @dataclass(frozen=True, eq=False)
