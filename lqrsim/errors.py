@@ -344,7 +344,7 @@ def format_error(error: BaseException) -> str:
     """An exception as one printable line for a message: its type and text."""
     try:
         text = " ".join(str(error).split())
-    except Exception:  # of its own __str__
+    except Exception:  # raised by its own __str__
         text = ""
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:500])
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

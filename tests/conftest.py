@@ -50,3 +50,13 @@ def drive_solution(differential_drive: ls.Scenario) -> ls.Solution:
 @pytest.fixture(scope="session")
 def quadrotor_solution(quadrotor: ls.Scenario) -> ls.Solution:
     return ls.smooth(quadrotor.problem)
+
+
+@pytest.fixture(scope="module")
+def arena() -> ls.Plant:
+    return ls.Plant(ls.DifferentialDrive(), ls.load_scene("arena"))
+
+
+@pytest.fixture(scope="module")
+def cage() -> ls.Plant:
+    return ls.Plant(ls.Quadrotor(), ls.load_scene("cage"))

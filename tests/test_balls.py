@@ -73,7 +73,7 @@ class TestCost:
             state = draw(seed)
             away = np.array([WORLD.distances(place) for place in in_numpy(state)]) - np.array(RADII)[:, None]
             wanted = WEIGHT * np.exp(-SHARPNESS * away).sum()
-            assert evaluate(term, ARM.dynamics, state, np.zeros(3))[0] == pytest.approx(wanted, rel=1e-12)
+            assert evaluate(term, state, np.zeros(3))[0] == pytest.approx(wanted, rel=1e-12)
 
     def test_gradient_and_hessian(self) -> None:
         """The gradient by differences; the Hessian is that in the places, by differences there, and their slopes."""
@@ -85,7 +85,7 @@ class TestCost:
 
         for seed in range(5):
             state = draw(seed)
-            _, gradient, hessian = evaluate(term, ARM.dynamics, state, np.zeros(3))
+            _, gradient, hessian = evaluate(term, state, np.zeros(3))
             moves = 1e-6 * np.eye(len(state))
             slope = [(cost(in_numpy(state + d)) - cost(in_numpy(state - d))) / 2e-6 for d in moves]
             np.testing.assert_allclose(gradient[:6], slope, rtol=1e-6, atol=1e-7)
@@ -160,9 +160,7 @@ class TestOneBallAtThePosition:
         one, other = (problem.terms("stage_cost")[1] for problem in pair)
         for _ in range(10):
             x, u = 2 * rng.normal(size=4), rng.normal(size=2)
-            for mine, theirs in zip(
-                evaluate(one, pair[0].dynamics, x, u), evaluate(other, pair[1].dynamics, x, u), strict=True
-            ):
+            for mine, theirs in zip(evaluate(one, x, u), evaluate(other, x, u), strict=True):
                 np.testing.assert_allclose(theirs, mine, rtol=1e-12, atol=1e-12)
 
     @pytest.mark.long
@@ -206,7 +204,7 @@ class TestLevels:
         )
         assert ours.nonconvex_in == theirs.nonconvex_in
         state = draw(1)
-        pairs = (evaluate(term, ARM.dynamics, state, np.zeros(3)) for term in (ours, theirs))
+        pairs = (evaluate(term, state, np.zeros(3)) for term in (ours, theirs))
         for mine, symbolic in zip(*pairs, strict=True):
             np.testing.assert_allclose(mine, symbolic, rtol=1e-12 if with_jacobian else 1e-8, atol=1e-9)
         found = balls.centres(ARM.dynamics, np.array([state, 2 * state]))

@@ -13,7 +13,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.decorative_geoms import MARK_RGB, draw_mark, mark_radius
+from lqrsim.view.overlays import MARK_RGB, draw_mark, mark_radius
 from lqrsim.view.render import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
 

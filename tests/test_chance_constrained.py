@@ -175,7 +175,7 @@ def fields(problem: ls.Problem) -> dict[str, Any]:
     ("margin", "wanted"),
     [
         (np.zeros(7), "got 7 numbers, want one, or one for each of 41 knots"),
-        (np.zeros((41, 3)), "got 3 numbers for a knot, want 1, one an obstacle: pillar"),
+        (np.zeros((41, 3)), "got 3 numbers for a knot, want 1, one per obstacle: pillar"),
         (np.zeros(0), "got no numbers"),
     ],
 )

@@ -29,16 +29,6 @@ NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
 RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
 
 
-@pytest.fixture(scope="module")
-def arena():
-    return Plant(DifferentialDrive(), load_scene("arena"))
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
-
-
 def test_undisturbed_quadrotor_keeps_to_its_plan_within_a_micrometre(cage):
     rollout = simulate(cage, hover())
     assert rollout.tracking_error.max() < 1e-6

@@ -7,24 +7,10 @@ from scipy import stats
 from tracking import hover, weave
 
 from lqrsim.errors import InputError
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import ControlNoise, ControlOffset, ForceNoise, MeasurementNoise, Push
-from lqrsim.simulation.plant import Plant
 
 TRIALS = 40
-
-
-@pytest.fixture(scope="module")
-def arena():
-    return Plant(DifferentialDrive(), load_scene("arena"))
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
 
 
 def test_control_noise(arena, cage):

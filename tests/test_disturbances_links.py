@@ -7,9 +7,6 @@ from scipy.integrate import solve_ivp
 from tracking import hover, track
 
 from lqrsim.errors import InputError
-from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import (
     ActuatorLoss,
@@ -25,20 +22,9 @@ from lqrsim.simulation.disturbances import (
     Saturation,
     TorqueNoise,
 )
-from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30
 RESTLESS = MeasurementNoise(1e-3)  # so that no two states or commands are equal
-
-
-@pytest.fixture(scope="module")
-def arena():
-    return Plant(DifferentialDrive(), load_scene("arena"))
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
 
 
 def test_torque_noise_turns_by_torque_over_inertia(cage):

@@ -30,16 +30,6 @@ from lqrsim.simulation.plant import Plant
 DT = 1 / 30
 
 
-@pytest.fixture(scope="module")
-def arena():
-    return Plant(DifferentialDrive(), load_scene("arena"))
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
-
-
 def altered(plant, mismatch, trials=400):
     """The simulations of a mismatch, without running them."""
     physics = MujocoPhysics(plant, trials, 1, contacts=True, threads=1)

@@ -9,7 +9,6 @@ from tracking import hover, weave
 from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.differential_drive import DifferentialDrive
-from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Dryden, Gusts, MeanWind
@@ -17,11 +16,6 @@ from lqrsim.simulation.disturbances.wind import first_order, second_order
 from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
 
 
 def blown(plant, wind, trials, steps, seed=0):

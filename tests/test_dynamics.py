@@ -243,7 +243,11 @@ FIELDS = {
         (_pendulum, {"states": ["angle", "speed"]}, "states: got .*, want a dictionary of name: unit"),
         (_pendulum, {"control_limits": ("a", "b")}, r"control_limits: got .*, want \(lowest, highest\), each a number"),
         (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, plain"),
-        (_pendulum, {"control_limits": (1.0, -1.0)}, "control_limits: got 1 to -1 for torque, want the first below the second"),
+        (
+            _pendulum,
+            {"control_limits": (1.0, -1.0)},
+            "control_limits: got 1 to -1 for torque, want the first below",
+        ),
     ],
 )
 def test_bad_dynamics_get_one_line(function, fields: dict, message: str) -> None:

@@ -137,7 +137,7 @@ def test_derivatives_of_costs_of_every_level(name: str) -> None:
     dynamics = DYNAMICS["symbolic"]
     term = COSTS[name].bind(dynamics)
     x, u = np.array([1.2, -0.3]), np.array([0.4])
-    value, gradient, hessian = evaluate(term, dynamics, x, u)
+    value, gradient, hessian = evaluate(term, x, u)
     wanted_gradient, wanted_hessian = np.zeros(3), np.zeros((3, 3))
     p = type("P", (), HEIGHT["parameters"])
     bump_derivatives(x, u, p, wanted_gradient, wanted_hessian)
@@ -381,7 +381,7 @@ def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
     cost = ls.SymbolicCost(hinge)
     for x in ([0.7, -0.4], [-0.7, 0.4]):
         term = cost.bind(DYNAMICS["symbolic"])
-        value, gradient, hessian = evaluate(term, DYNAMICS["symbolic"], np.array(x), np.zeros(1))
+        value, gradient, hessian = evaluate(term, np.array(x), np.zeros(1))
         a, b = x
         assert value == pytest.approx(max(a, 0) ** 2 + abs(b) ** 3 + abs(b), rel=1e-14)
         np.testing.assert_allclose(gradient[:2], [2 * max(a, 0), 3 * b * abs(b) + np.sign(b)], rtol=0, atol=1e-12)

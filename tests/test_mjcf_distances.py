@@ -123,7 +123,7 @@ def test_costs_and_constraints_have_the_derivatives_of_what_they_say(own: str) -
     assert all(check.good for check in checks), checks
     (_, term) = problem.terms("stage_cost")
     state = robot.at(elbow=0.3, x=0.1)
-    value = evaluate(term, robot.dynamics, state, np.zeros(1))[0]
+    value = evaluate(term, state, np.zeros(1))[0]
     bodies = {"hull", "upper", "fore"}
     rows = [one for one in term.functions if one.is_memory]
     assert len(rows) == 1
@@ -213,15 +213,15 @@ def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     mujoco.mju_mat2Quat(apart, data.site("tool").xmat)
     mujoco.mju_subQuat(turn, apart, orientation)
     cost = ls.SiteCost("tool", position=wanted, orientation=orientation, weight=(1, 2, 3), turn_weight=4.0)
-    value, gradient, _ = evaluate(cost.bind(robot.dynamics), robot.dynamics, state, np.zeros(1))
+    value, gradient, _ = evaluate(cost.bind(robot.dynamics), state, np.zeros(1))
     expected = 0.5 * np.array([1, 2, 3]) @ (own - wanted) ** 2 + 2.0 * turn @ turn
     np.testing.assert_allclose(value, expected, rtol=1e-9)
     if np.linalg.norm(turn) > 3.0:
         return  # half a turn off there are two ways back
     term, h = cost.bind(robot.dynamics), 1e-6
     slopes = [
-        (evaluate(term, robot.dynamics, state + h * e, np.zeros(1))[0]
-         - evaluate(term, robot.dynamics, state - h * e, np.zeros(1))[0]) / (2 * h) for e in np.eye(n)
+        (evaluate(term, state + h * e, np.zeros(1))[0]
+         - evaluate(term, state - h * e, np.zeros(1))[0]) / (2 * h) for e in np.eye(n)
     ]  # fmt: skip
     np.testing.assert_allclose(gradient[:n], slopes, rtol=0, atol=1e-6 * (1 + np.abs(gradient).max()))
 

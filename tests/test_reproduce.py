@@ -17,8 +17,8 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import reproduce
+from lqrsim.commands.reproduce import results_page
 from lqrsim.disturbances import InitialStateError, MotorLag
-from lqrsim.reports.paper import results_page
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "experiments"

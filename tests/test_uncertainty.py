@@ -42,7 +42,6 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
@@ -62,16 +61,6 @@ IN_WORDS = [
     InertiaMismatch(0.1), MeasurementBias(0.005), Saturation(share=0.9),
     ActuatorLoss(at=0.2, remaining=0.7), Push((0.1, 0.0, 0.0), at=0.1), FrictionMismatch(0.1),
 ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def cage():
-    return Plant(Quadrotor(), load_scene("cage"))
-
-
-@pytest.fixture(scope="module")
-def arena():
-    return Plant(DifferentialDrive(), load_scene("arena"))
 
 
 @pytest.fixture(scope="module")

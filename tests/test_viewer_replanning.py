@@ -21,7 +21,7 @@ from viewers import Recorder, said, said_after, viewing
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.view import viewer
-from lqrsim.view.decorative_geoms import PLAN_RGB
+from lqrsim.view.overlays import PLAN_RGB
 from lqrsim.view.viewer import MovableGoal, model_with_goal
 from lqrsim.view.viewer_base import PUSHES
 

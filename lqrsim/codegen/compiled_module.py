@@ -186,7 +186,7 @@ def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
     """The CompiledModule of a source and sizes, one per process.
 
     Args:
-      source: the functions. what: as for CompiledModule. **sizes: of those in `kernels/declarations.py`.
+      source: the functions. what: as for CompiledModule. **sizes: some of those in `kernels/declarations.py`.
     """
     with compiling:  # also because Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)

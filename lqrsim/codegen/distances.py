@@ -1,4 +1,4 @@
-"""Distances of points to the obstacles of a world, compiled."""
+"""Distances of points to the obstacles of a world, by compiled code."""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ from lqrsim.scenes.world import World
 
 
 def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
-    """Distances (...) of points (..., 2 or 3) to the nearest obstacle: `world_seen.distance(points)`, compiled."""
+    """Distances (...) of points (..., 2 or 3) to the nearest obstacle; a compiled `world_seen.distance(points)`."""
     points = np.asarray(points, dtype=np.float64)
     flat = points.reshape(1, points[..., 0].size, points.shape[-1])
     still = np.zeros((1, len(world_seen), 3))

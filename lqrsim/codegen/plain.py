@@ -42,7 +42,7 @@ def plain_functions(
 def _run(
     function: ScopedFunction, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
 ) -> Callable[..., Any]:
-    """The Python function of a kernel; `made` has those that exist already."""
+    """The Python function of a kernel; `made` has those that were made before."""
     key = id(function.scope), function.node.name
     if key in made:
         return made[key]

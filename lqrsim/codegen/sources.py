@@ -96,7 +96,7 @@ def text_source(text: str, what: str = "source") -> Source:
 
 
 def check_source(field: str, source: object, functions: Mapping[str, int]) -> Source:
-    """The Source of a text, or the one given.
+    """The Source of a text; a Source is returned as it is.
 
     Functions of math are named without a module in it: cos, not math.cos or np.cos.
 

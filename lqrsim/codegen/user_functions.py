@@ -27,7 +27,7 @@ from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
-from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt
 from lqrsim.machine import instruction_set
 from lqrsim.results.archive import sha256
 
@@ -49,7 +49,7 @@ def compiled(
     Args:
       function: a numba function, or one that numba can compile.
       adapter: source of `adapter`, which calls it by the name `function`.
-      names: others that the adapter uses, among them the named tuple `Parameters`. what: how messages call it.
+      names: others that the adapter uses, among them the named tuple `Parameters`. what: its name in messages.
 
     Returns:
       The object that must be kept alive, and the address.
@@ -164,7 +164,7 @@ def level_of(function: Any, asked: str | None) -> str:
 
 
 def name_of(function: Any) -> str:
-    """How messages call a function."""
+    """The name of a function in messages."""
     plain = getattr(function, "py_func", function)
     name = getattr(plain, "__qualname__", None)
     return name if isinstance(name, str) and name else type(plain).__name__
@@ -243,7 +243,7 @@ class UserFunction:
           The returned values as one vector, or the arrays that it wrote.
 
         Raises:
-          InputError: it fails, or returns something else than it should.
+          InputError: it fails, or does not return what it should.
         """
         plain = getattr(self.function, "py_func", self.function)
         if not self.held:  # before the first call compiles its helpers
@@ -438,6 +438,16 @@ def axes_of(
     wanted = names if depends_on is None else depends_on
     axes = tuple(sorted({names.index(check_name(f"{who}: depends_on", name, names)) for name in wanted}))
     return axes, tuple((i, name) for i, name in enumerate(names) if i not in axes)
+
+
+def check_derivative(field: str, derivative: Any, function: Any, level: str, arguments: str) -> None:
+    """Raises InputError unless a derivative takes these arguments, and its function's level lets it have one."""
+    if level == "symbolic":
+        got = f"one for {name_of(function)}, which is symbolic"
+        raise InputError(f"{field}: got {got}, want none (it is derived) or level='compiled' or 'plain'")
+    check_function(field, derivative, f"a function of ({arguments})")
+    level_of(derivative, level)
+    check_signature(derivative, arguments.split(", "))
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:

@@ -28,7 +28,7 @@ class Bridge:
     odometry: Annotated[str | None, optional("TOPIC", "Topic of the states, a nav_msgs/msg/Odometry.")] = None
     joints: Annotated[str | None, optional("TOPIC", "Topic of the states, a sensor_msgs/msg/JointState.")] = None
     names: Annotated[tuple[str, ...], optional("STATE=NAME ...")] = ()
-    """What states are called in the messages, if otherwise: theta=heading."""
+    """Names of states in the messages, where they differ: theta=heading."""
     safe: Annotated[tuple[float, ...], optional("CONTROL ...")] = ()
     """The command for a robot that nobody controls any more: one number for each control. There is no default."""
     seconds: Annotated[float | None, optional("SECONDS", "How long to run. By default the plan's horizon.")] = None

@@ -105,21 +105,17 @@ class Solve:
             problem = replace(problem, constraints=[*problem.constraints, kept])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)
-        options: dict[str, object] = {"stop": self.stop}
-        if self.tolerance is not None:
-            options["tolerance"] = self.tolerance
+        of_smooth = {
+            "--finish": self.finish == "none",
+            "--starts": self.starts is not None,
+            "--paper-start": self.paper_start,
+        }
+        if self.solver != "smooth" and (wrong := [name for name, given in of_smooth.items() if given]):
+            raise InputError(f"{', '.join(wrong)}: got it for {self.solver}, want it with --solver smooth")
+        given = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
+        options = {"stop": self.stop, **{name: value for name, value in given.items() if value is not None}}
         if self.finish == "none":
-            if self.solver != "smooth":
-                raise InputError(f"--finish: got it for {self.solver}, want it with --solver smooth")
             options["finish"] = None
-        if self.max_iterations is not None:
-            options["max_iterations"] = self.max_iterations
-        if self.time_limit is not None:
-            options["time_limit"] = self.time_limit
-        if (self.starts is not None or self.paper_start) and self.solver != "smooth":
-            raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
-        if self.starts is not None:
-            options["starts"] = self.starts
         scenario = replace(scenario, problem=problem, start=self._start(scenario))
         solved = console.solve(scenario, self.solver, **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))

@@ -126,7 +126,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
 
     def _info(self, episode: Episode) -> dict[str, Any]:
         info: dict[str, Any] = {
-            "seed": episode.trials.seed, "trial": episode.trials.first, "time": episode.time,
+            "seed": episode.seed, "trial": episode.first, "time": episode.time,
             "state": episode.states[0], "clearance": float(episode.clearance[0]),
         }  # fmt: skip
         if episode.ended[0]:
@@ -244,9 +244,9 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         raise InputError("render: got a batch, want an Environment, or lqrsim.render(rollout()) with frames=True")
 
     def _info(self, episode: Episode) -> dict[str, Any]:
-        numbers = episode.trials.first + np.arange(self.num_envs)
+        numbers = episode.first + np.arange(self.num_envs)
         return {
-            "seed": episode.trials.seed, "trial": numbers, "time": episode.time, "state": episode.states,
+            "seed": episode.seed, "trial": numbers, "time": episode.time, "state": episode.states,
             "clearance": episode.clearance, "outcome": episode.outcomes.copy(),
             "is_success": episode.outcomes == "reached",
         }  # fmt: skip

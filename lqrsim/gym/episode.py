@@ -46,15 +46,6 @@ ACTIONS = ("normalized", "controls")
 RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
-@dataclass(frozen=True, kw_only=True)
-class EpisodeTrials:
-    """The trials of an episode: number `first` of a seed and those after it, with their disturbances."""
-
-    seed: int
-    first: int
-    disturbances: tuple[Disturbance, ...]
-
-
 class Task:
     """The task of an environment. The arguments are those of `Environment`.
 
@@ -141,8 +132,8 @@ class Task:
             found += disturbance_set(one, self.scenario) if isinstance(one, str) else (one,)
         return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
 
-    def trials(self, seed: int, following: int, options: Any) -> EpisodeTrials:
-        """The trials for the options of a `reset`; by default they begin with number `following`.
+    def trials(self, following: int, options: Any) -> tuple[int, tuple[Disturbance, ...]]:
+        """The first trial for the options of a `reset`, by default `following`, and the disturbances.
 
         Raises:
           InputError: an option is unknown or invalid.
@@ -156,10 +147,9 @@ class Task:
         if "preset" not in given and "disturbances" not in given:
             if "strength" in given:
                 raise InputError("options: got strength alone, want it with disturbances or preset")
-            return EpisodeTrials(seed=seed, first=first, disturbances=self._disturbances)
+            return first, self._disturbances
         disturbances = given.get("disturbances", given.get("preset"))
-        disturbances = self.disturbances_of(disturbances, given.get("strength", 1.0))
-        return EpisodeTrials(seed=seed, first=first, disturbances=disturbances)
+        return first, self.disturbances_of(disturbances, given.get("strength", 1.0))
 
 
 def reset_options(options: Any) -> dict[str, Any]:
@@ -244,9 +234,10 @@ class Resettable:
         elif self._seed is None:
             self._seed = int(random.integers(2**63))
         assert self._seed is not None
-        trials = self.task.trials(self._seed, self._next_trial, options)
-        self._episode = Episode(self.task, trials, count, frames=frames, threads=threads)
-        self._next_trial = trials.first + count
+        first, disturbances = self.task.trials(self._next_trial, options)
+        settings = {"seed": self._seed, "first_trial": first, "frames": frames, "threads": threads}
+        self._episode = Episode(self.task, disturbances, count, **settings)
+        self._next_trial = first + count
         return self._episode
 
     def _current(self) -> "Episode":
@@ -259,16 +250,20 @@ class Episode:
     """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
     Attributes:
+      seed, first: of the trials, numbers `first` to `first + K - 1` of this seed.
       ended: (K,) whether each episode has ended. outcomes: (K,) how; empty for those still running.
     """
 
-    def __init__(self, task: Task, trials: EpisodeTrials, count: int, *, frames: bool, threads: int | None) -> None:
-        self.task, self.trials = task, trials
+    def __init__(
+        self, task: Task, disturbances: tuple[Disturbance, ...], count: int, *, seed: int, first_trial: int,
+        frames: bool, threads: int | None,
+    ) -> None:  # fmt: skip
+        self.task, self.seed, self.first = task, seed, first_trial
         dynamics = task.plant.robot.dynamics
         commanded = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
         settings = RunSettings(
-            plant=task.plant, plan=task.solution, disturbances=trials.disturbances, controller=commanded,
-            seed=trials.seed, trials=count, first_trial=trials.first, frames=frames, contacts=True, threads=threads,
+            plant=task.plant, plan=task.solution, disturbances=disturbances, controller=commanded,
+            seed=seed, trials=count, first_trial=first_trial, frames=frames, contacts=True, threads=threads,
             generators=None, progress=None, watch=None, **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, settings.trajectory
@@ -335,7 +330,7 @@ class Episode:
         return Moment(self.observations, rewards, *self._ended_at.copy())
 
     def rollout(self) -> Rollout:
-        """The records so far, as `simulate` has them; NaN after now."""
+        """The records so far, in the form of `simulate`; NaN from now on."""
         return self._loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:

@@ -1,1 +1,1 @@
-"""All that is compiled, in a subset of Python that `codegen/language.py` writes down; read `declarations.py` first."""
+"""What is compiled, in the subset of Python that `codegen/language.py` defines; read `declarations.py` first."""

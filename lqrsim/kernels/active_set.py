@@ -128,7 +128,7 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
 
     Args:
       free: (N,) 0 for the states that the start fixes, else 1. share: of the projected Hessian of the cost.
-      scale: cost that multipliers are relative to.
+      scale: the cost relative to which multipliers are measured.
       weight: on the distance of a held row from its target, relative to its size; times `price` for constraints.
       models: StageModels. gaps: (T, N). active: ActiveRows, written.
       policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.

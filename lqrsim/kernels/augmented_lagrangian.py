@@ -10,7 +10,7 @@ the tolerance to which the constraint is solved, so that a plan within the toler
 constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where its
 force would be. Only the part `mu n n'` of its curvature is used, with n the gradient of d: the rest can be negative.
 
-`multipliers` is one array a constraint: mu (0 where the constraint does not act yet), the number of values at a step,
+`multipliers` is one array per constraint: mu (0 where the constraint does not act yet), the number of values at a step,
 the first step at which they act, the tolerance, the price (infinite where there is none), and from HEADER on lambda,
 step by step.
 

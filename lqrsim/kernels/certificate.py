@@ -145,7 +145,7 @@ def predicted_decrease(step, stage, gain, S, room, costate):
 
 
 def singular_semidefinite(matrix):
-    """Whether a control block (M, M) is positive semidefinite to rounding: definite with a little on its diagonal."""
+    """Whether a control block (M, M) is positive semidefinite up to rounding: definite with more on its diagonal."""
     block, size = stack(M, M), 1e-300
     for i in range(M):
         size = max(size, abs(matrix[i, i]))
@@ -223,7 +223,7 @@ def box_decrease(matrix, slope, lowest, highest, best):
     for i in range(M):
         best[i] = -slope[i]
         copy(matrix[i], M, factor[i])
-    if not cholesky(factor, M):  # at most what e'x decreases to the end of the box
+    if not cholesky(factor, M):  # an upper bound: the decrease of e'x within the box
         decrease = 0.0
         for i in range(M):
             if slope[i] != 0:

@@ -3,10 +3,11 @@
 The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
 Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
 
-From AT on, `data` has the number of steps with margins, the number of margins a step, the number of obstacles, and the
-number of steps with a table of obstacles; then each ball's radius, the margins and the tables, step by step. The last
-margins and the last table hold from their step on. A row is an obstacle, for the first ball, then for the next; it has
-margin number `row` modulo the margins a step. AT is 0 for a point, and for balls what `places` reads comes before.
+From AT on, `data` has the number of steps with margins, the number of margins per step, the number of obstacles, and
+the number of steps with a table of obstacles; then each ball's radius, the margins and the tables, step by step. The
+last margins and the last table hold from their step on. A row is an obstacle, for the first ball, then for the next; it
+has margin number `row` modulo the margins per step. AT is 0 for a point, and for balls what `places` reads comes
+before.
 """
 
 from lqrsim.kernels.declarations import ROW, N, stack

@@ -3,7 +3,7 @@
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
 The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the
 forward pass fixes the same ones; and wherever a control is applied, it is clamped. Where that settles, each control
-minimises the remaining cost within its limits: the first-order conditions, to rounding, without a penalty or a
+minimises the remaining cost within its limits: the first-order conditions, up to rounding, without a penalty or a
 multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 
@@ -69,7 +69,7 @@ def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
     low, high = limits.low, limits.high
     u, outward = stack(M), stack(M)
     decrease, constant = 0.0, 0.0
-    for last in range(2):  # one call in the text, because it takes long to compile
+    for last in range(2):  # a loop, so that the long function is compiled once
         decrease = minimize_control(stage.hessian, stage.gradient, gain, feedforward, hessian, gradient)
         if last == 1 or not decrease >= 0:
             break

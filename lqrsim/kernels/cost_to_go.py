@@ -2,11 +2,13 @@
 
 Paper: Eqs. (9)-(13), in discrete time. The step is linear and the cost quadratic in z = (x, u):
 
-    x_{t+1} = J z + c cost_t = 1/2 z'Hz + h'z + k v_{t+1} = 1/2 x'S1 x + s1'x + k1
+    x_{t+1} = J z + c
+    cost_t  = 1/2 z'Hz + h'z + k
+    v_{t+1} = 1/2 x'S1 x + s1'x + k1
 
 Their sum is again quadratic in z, with the paper's blocks for x and u:
 
-    G = H + J'S1 J = [D C'; C E] g = h + J'(S1 c + s1) = (d, e)
+    G = H + J'S1 J = [D C'; C E],    g = h + J'(S1 c + s1) = (d, e)
 
 The control u = L x + l minimises it, and leaves the cost-to-go v_t = 1/2 x'Sx + s'x + constant:
 

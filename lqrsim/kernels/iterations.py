@@ -82,7 +82,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             copy(work.guess.states[0], N, x_hat)
     for done in range(first, last):
         for i in range(N):
-            if fixed and x_hat[i] != work.start[i]:  # whatever ran before: each forward pass begins where it is given
+            if fixed and x_hat[i] != work.start[i]:  # whatever ran before, each pass begins at the given start
                 x_hat[i] = work.start[i]
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
@@ -138,7 +138,7 @@ def failure(good, model):
 
 
 def cycling(log, done):
-    """Whether the costs repeat to rounding: then they always will.
+    """Whether the costs repeat, up to rounding: then they always will.
 
     A cycle must repeat twice; one that the iterations still approach does not count. A cost that stays the same is a
     cycle, too: iterations that have not converged by then never will.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 Arrays = Any  # an ndarray for Python, a pointer for compiled code
-StructuredArray = npt.NDArray[np.void]  # of one of the dtypes at the end
+StructuredArray = npt.NDArray[np.void]  # whose dtype is one of those at the end
 
 
 class Limits(NamedTuple):

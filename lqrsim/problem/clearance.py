@@ -1,5 +1,7 @@
 """The constraint that a robot keeps clear of obstacles."""
 
+import copy
+
 import numpy as np
 import numpy.typing as npt
 
@@ -44,13 +46,7 @@ class Clearance(Constraint):
             raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
         self.world, self.balls, self.geoms = world, balls, geoms
         self.radius = check_outline("Clearance", radius, balls, geoms)
-        given = real("Clearance: margin", margin)
-        if given.ndim == 0:
-            self.margin: float | Array = check_number("Clearance: margin", margin)
-        else:
-            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
-            if not self.margin.size:
-                raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
+        self.margin = _checked_margin(margin)
 
     def ahead(self, steps: int) -> "Clearance":
         steps = check_count("steps", steps, at_least=0)
@@ -59,13 +55,10 @@ class Clearance(Constraint):
         return self._keeping(self.margin[min(steps, len(self.margin) - 1) :])
 
     def _keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
-        """The same constraint with another margin.
-
-        Args:
-          margin: as of a Clearance.
-        """
-        radius = self.radius if self.balls is None and self.geoms is None else None
-        return Clearance(self.world, radius=radius, balls=self.balls, geoms=self.geoms, margin=margin)
+        """The same constraint with another margin."""
+        other = copy.copy(self)
+        other.margin = _checked_margin(margin)
+        return other
 
     @property
     def moving(self) -> bool:
@@ -81,7 +74,7 @@ class Clearance(Constraint):
             want = f"one, or one for each of {len(times)} knots"
             raise InputError(f"Clearance: margin: got {len(margins)} numbers, want {want}")
         if margins.shape[1] not in (1, len(world)):
-            want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
+            want = f"{len(world)}, one per obstacle: {', '.join(world.names)}"
             raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
         if self.geoms is not None:
             return _bind_geoms(self.geoms, dynamics, world, margins)
@@ -111,6 +104,17 @@ class Clearance(Constraint):
             shared=3 * len(balls),
             functions=places.functions,
         )
+
+
+def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
+    """A number, or numbers (T+1,) or (T+1, O). Raises InputError for anything else."""
+    given = real("Clearance: margin", margin)
+    if given.ndim == 0:
+        return check_number("Clearance: margin", margin)
+    margins = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
+    if not margins.size:
+        raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
+    return margins
 
 
 def _bind_geoms(geoms: CollisionGeoms, dynamics: Dynamics, world: World, margins: Array) -> ConstraintTerm:

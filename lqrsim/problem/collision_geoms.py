@@ -17,7 +17,7 @@ from lqrsim.scenes.world import World
 class GeomDistances(Term):
     """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
 
-    The source defines `distances(x, data, out)`, which writes one number a row, and `distances_jacobian(x, data, out,
+    The source defines `distances(x, data, out)`, which writes one number per row, and `distances_jacobian(x, data, out,
     slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
 
     Attributes:

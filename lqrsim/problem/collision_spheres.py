@@ -16,6 +16,7 @@ from lqrsim.codegen.user_functions import (
     UserFunction,
     axes_of,
     check_depends_on,
+    check_derivative,
     check_signature,
     level_of,
     name_of,
@@ -28,7 +29,6 @@ from lqrsim.errors import (
     check_array,
     check_count,
     check_flag,
-    check_function,
     check_items,
     check_kind,
     check_number,
@@ -46,7 +46,7 @@ from lqrsim.scenes.world import SPACE, World
 class SphereCenters(Term):
     """Places of balls, made for one system: the source to compile, and its data.
 
-    The source defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
+    The source defines `places(x, data, out)`, which writes three coordinates per ball, ball by ball, and
     `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are not
     zero, to zeros.
 
@@ -102,7 +102,7 @@ class CollisionSpheres:
         parameters as attributes.
       radii: (K,) of the balls, in metres.
       names: names of the balls in messages; by default "ball 0", "ball 1", ....
-      sites: names of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that
+      sites: names of sites or geoms in the robot's MJCF, one per ball, None where there is none. A `Plant` checks that
         the middle of each is where the formula has it.
       jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
         to slopes (K, 3 or 2, n), which it gets as zeros. Without it they are central differences.
@@ -111,7 +111,7 @@ class CollisionSpheres:
       level: "symbolic", "compiled" or "plain"; by default compiled if `places` is a numba function, else symbolic.
 
     Raises:
-      InputError: a radius is negative, there are no balls, names are not one a ball and different, or the level does
+      InputError: a radius is negative, there are no balls, names are not one per ball and different, or the level does
         not fit the function. The result of `places` is checked when it is first needed.
     """
 
@@ -129,14 +129,7 @@ class CollisionSpheres:
         self.level = level_of(places, level)
         check_signature(places, ("x", "p"))
         if jacobian is not None:
-            if self.level == "symbolic":
-                wanted = "none (it is derived) or level='compiled' or 'plain'"
-                raise InputError(
-                    f"CollisionSpheres: jacobian: got one for {name_of(places)}, which is symbolic, want {wanted}"
-                )
-            check_function("CollisionSpheres: jacobian", jacobian, "a function of (x, p, slopes)")
-            level_of(jacobian, self.level)
-            check_signature(jacobian, ("x", "p", "slopes"))
+            check_derivative("CollisionSpheres: jacobian", jacobian, places, self.level, "x, p, slopes")
         self.function, self.jacobian = places, jacobian
         self._set_balls(radii, names, sites)
         self.depends_on = check_depends_on("CollisionSpheres", depends_on, "states")
@@ -145,15 +138,15 @@ class CollisionSpheres:
             raise InputError(f"CollisionSpheres: depends_on: got names for a symbolic function, want {wanted}")
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
-        """The attributes of each ball, checked."""
+        """Check and set the attributes of each ball."""
         self.radii = check_array("CollisionSpheres: radii", radii, (None,))
         count = len(self.radii)
         if not count:
-            raise InputError("CollisionSpheres: radii: got none, want one a ball, at least one")
+            raise InputError("CollisionSpheres: radii: got none, want one per ball, at least one")
         if (self.radii < 0).any():
             k = int(np.argmax(self.radii < 0))
             raise InputError(f"CollisionSpheres: radii: got {self.radii[k]:g} for ball {k}, want at least 0")
-        wanted = f"{count} different texts, one a ball"
+        wanted = f"{count} different texts, one per ball"
         self.names = tuple(f"ball {k}" for k in range(count))
         if names is not None:
             self.names = check_items("CollisionSpheres: names", names, str, wanted)
@@ -161,7 +154,7 @@ class CollisionSpheres:
                 raise InputError(f"CollisionSpheres: names: got {excerpt(self.names)}, want {wanted}")
         self.sites: tuple[str | None, ...] = (None,) * count
         if sites is not None:
-            wanted = f"{count} names of sites or geoms, one a ball, or None in place of one"
+            wanted = f"{count} names of sites or geoms, one per ball, or None in place of one"
             self.sites = check_items("CollisionSpheres: sites", sites, (str, type(None)), wanted)
             if len(self.sites) != count:
                 raise InputError(f"CollisionSpheres: sites: got {len(self.sites)}, want {wanted}")
@@ -293,7 +286,7 @@ class CollisionSpheres:
 def check_outline(
     field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
 ) -> float:
-    """The radius that is kept clear of obstacles, checked. For balls it is that of the largest, for geoms 0.
+    """Check the outline, and return the radius to keep clear of obstacles: of balls the largest, for geoms 0.
 
     Raises:
       InputError: it is negative, these are no balls or geoms, or it is not one of the three.
@@ -313,7 +306,7 @@ def check_outline(
 def bind_outline(
     field: str, balls: CollisionSpheres | None, dynamics: Dynamics, world: World
 ) -> tuple[SphereCenters | None, World]:
-    """The balls' places, None for a robot that is one at its position, and the world as they see it.
+    """The balls' places (None for a robot that is a single ball at its position), and the world in their coordinates.
 
     Raises:
       InputError: there are neither balls nor a position, or the balls do not fit the dynamics.
@@ -329,7 +322,7 @@ def bind_outline(
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
-    """Places of this number of balls, compiled: (..., count, 3) at states (..., n), as `places` has it."""
+    """Places of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))

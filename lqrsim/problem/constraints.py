@@ -353,7 +353,7 @@ def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: s
 def by_name(
     who: str, given: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
 ) -> dict[str, _Value]:
-    """What is given for names of states, in a dictionary or by keyword. Raises InputError."""
+    """The values given for states by name, in a dictionary or by keyword. Raises InputError."""
     want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
     check_kind(who, given, (Mapping, type(None)), want)
     stated = dict(given or {})  # pyright: ignore[reportCallIssue, reportArgumentType]

@@ -19,6 +19,7 @@ from lqrsim.codegen.user_functions import (
     UserFunction,
     axes_of,
     check_depends_on,
+    check_derivative,
     check_signature,
     level_of,
     name_of,
@@ -29,7 +30,6 @@ from lqrsim.errors import (
     check_array,
     check_count,
     check_flag,
-    check_function,
     check_items,
     check_name,
     check_number,
@@ -43,7 +43,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.scenes.world import World
 
-FAR = 16.0  # over the sharpness of an ObstacleCost: from where on geoms cost nothing, and before it exp(-FAR)
+FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
 
 
 @dataclass(frozen=True)
@@ -171,12 +171,12 @@ class _SquareCost(Cost):
 
     @property
     def weight(self) -> Array:
-        """The weight matrix. PerEntry by name are in no order before a Problem has the cost."""
+        """The weight matrix. Numbers by name are in no order before a Problem has the cost."""
         return self._known[0]
 
     @property
     def about(self) -> Array:
-        """Where it is zero. PerEntry by name are in no order before a Problem has the cost."""
+        """Where it is zero. Numbers by name are in no order before a Problem has the cost."""
         return self._known[1]
 
     @property
@@ -324,10 +324,9 @@ class ObstacleCost(Cost):
         Args:
           weight: cost of touching one obstacle, with one ball, for one step.
         """
-        radius = self.radius if self.balls is None and self.geoms is None else None
-        return ObstacleCost(
-            self.world, radius=radius, balls=self.balls, geoms=self.geoms, sharpness=self.sharpness, weight=weight
-        )
+        other = copy.copy(self)
+        other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+        return other
 
     @property
     def moving(self) -> bool:
@@ -472,9 +471,9 @@ class FunctionCost(Cost):
         self.parameters = symbolic.check_parameters(parameters)
         check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
-            check_function("FunctionCost: derivatives", derivatives, "a function of (x, u, p, gradient, hessian)")
-            level_of(derivatives, self.level)
-            check_signature(derivatives, ("x", "u", "p", "gradient", "hessian"))
+            check_derivative(
+                "FunctionCost: derivatives", derivatives, function, self.level, "x, u, p, gradient, hessian"
+            )
 
     @property
     def name(self) -> str:

@@ -2,7 +2,8 @@
 doubt.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -64,7 +65,7 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
                     f" {column[j]}, {where}, want finite derivatives"
                 )
         for cost, term in _terms(problem):
-            value, gradient, hessian = evaluate(term, problem.dynamics, x, u)
+            value, gradient, hessian = evaluate(term, x, u)
             for what, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
                 if not np.isfinite(array).all():
                     entry = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
@@ -82,54 +83,49 @@ def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
             yield from ((f"{name}: {c.name}", t) for c, t in zip(terms_of(cost), problem.terms(name), strict=True))
 
 
-def evaluate(term: CostTerm, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
-    """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
-    n, m = len(x), len(u)
-    names, data = _run_plainly(term, n, m)
-    gradient, hessian = np.zeros(n + m), np.zeros((n + m, n + m))
-    return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
+def evaluate(term: CostTerm, x: Array, u: Array) -> tuple[float, Array, Array]:
+    """A cost term at a state (n,) and control (m,) in plain Python; see `PlainTerm.cost`."""
+    return PlainTerm(term, len(x), len(u)).cost(np.concatenate([x, u]))
 
 
-def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
-    """A term's functions as plain Python, and its data."""
-    first = term.functions[:1]
-    parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
-    wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
-    calls = plain_calls(term.functions, parameters)
-    names = plain_functions(term.code, {"N": n, "M": m, "W": n + m}, wanted, calls)
-    places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
-    return names, np.concatenate([places, term.data])
+class PlainTerm:
+    """A cost or constraint term in plain Python, at points z = (x, u)."""
 
+    def __init__(self, term: CostTerm | ConstraintTerm, states: int, controls: int) -> None:
+        self.shared = term.shared if isinstance(term, ConstraintTerm) else 0
+        self.states, self.size = states, states + controls
+        first = term.functions[:1]
+        parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
+        wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
+        sizes, calls = {"N": states, "M": controls, "W": self.size}, plain_calls(term.functions, parameters)
+        self._functions = plain_functions(term.code, sizes, wanted, calls)
+        places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
+        self._data = np.concatenate([places, term.data])
 
-def _constraints(
-    problem: Problem,
-) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
-    """The constraints' numbers in plain Python: the name of each in messages, its value and its slope (n+m,) at (x,
-    u)."""
-    n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
-    for term in problem.constraint_terms:
-        names, data = _run_plainly(term, n, m)
+    def cost(self, z: Array) -> tuple[float, Array, Array]:
+        """The cost, its gradient (n+m,) and its Hessian (n+m, n+m), before any projection."""
+        x, u = z[: self.states], z[self.states :]
+        gradient, hessian = np.zeros(self.size), np.zeros((self.size, self.size))
+        return float(self._functions["derivatives"](x, u, 1, self._data, hessian, gradient)), gradient, hessian
 
-        def given(x: Array, u: Array, term: ConstraintTerm = term, names: Any = names, data: Array = data) -> Any:
-            if not term.shared:
-                return x, u
-            at, moves = np.zeros(term.shared), np.zeros((term.shared, n))
-            names["places_jacobian"](x, data, at, moves)
-            return at, moves
+    def value(self, z: Array, row: int) -> float:
+        """One of the constraint's numbers."""
+        return float(self._functions["value"](*self._given(z), 1, row, self._data))
 
-        for row in range(term.rows):
+    def slope(self, z: Array, row: int) -> Array:
+        """The gradient (n+m,) of one of the constraint's numbers."""
+        gradient = np.zeros(self.size)
+        self._functions["slope"](*self._given(z), 1, row, self._data, gradient)
+        return gradient
 
-            def value(x: Array, u: Array, row: int = row, rest: Any = (given, names, data)) -> float:
-                given, names, data = rest
-                return float(names["value"](*given(x, u), 1, row, data))
-
-            def slope(x: Array, u: Array, row: int = row, rest: Any = (given, names, data)) -> Array:
-                given, names, data = rest
-                gradient = np.zeros(n + m)
-                names["slope"](*given(x, u), 1, row, data, gradient)
-                return gradient
-
-            yield term.describe(row), value, slope
+    def _given(self, z: Array) -> tuple[Array, Array]:
+        """State and control; or the numbers that all rows share and their derivatives, in place of them."""
+        x, u = z[: self.states], z[self.states :]
+        if not self.shared:
+            return x, u
+        at, moves = np.zeros(self.shared), np.zeros((self.shared, self.states))
+        self._functions["places_jacobian"](x, self._data, at, moves)
+        return at, moves
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,7 @@ class DerivativeCheck:
     """How far derivatives are from central differences, where they are furthest.
 
     Attributes:
-      what: which derivative: `df/dx of ...`, say.
+      what: name of the derivative, such as `df/dx of ...`.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
       row: the name of the output at that entry.
       column: the name of the input at that entry.
@@ -210,8 +206,11 @@ def check_derivatives(
     rng = np.random.default_rng(check_seed("seed", seed))
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
     found: dict[str, list[DerivativeCheck]] = {}
+    matrices = [_of_dynamics(dynamics, points)]
+    if isinstance(subject, Problem):
+        matrices += [_of_costs(subject, points), _of_constraints(subject, points)]
     with np.errstate(all="ignore"):
-        for matrix in _derivatives(subject, points):
+        for matrix in itertools.chain(*matrices):
             found.setdefault(matrix.what, []).append(_worst_entry(matrix, tolerance))
     return [
         max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
@@ -236,16 +235,6 @@ class _Derivative(NamedTuple):
     u: Array
 
 
-def _derivatives(subject: Problem | Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
-    """All derivatives of dynamics, costs and constraints at the points, each one after the other."""
-    if isinstance(subject, Dynamics):
-        yield from _of_dynamics(subject, points)
-        return
-    yield from _of_dynamics(subject.dynamics, points)
-    yield from _of_costs(subject, points)
-    yield from _of_constraints(subject, points)
-
-
 def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
@@ -259,35 +248,32 @@ def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> I
 
 
 def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
-    dynamics = problem.dynamics
-    names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
-    n = len(dynamics.state_coordinates)
+    states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
+    names = (*states, *controls)
     for cost, term in _terms(problem):
         if len(term.functions) == 1 and term.exact_hessian:
             continue  # without derivatives of its own, it has central differences already
-
-        def at(z: Array, term: CostTerm = term) -> tuple[float, Array, Array]:
-            return evaluate(term, dynamics, z[:n], z[n:])
-
+        plain = PlainTerm(term, len(states), len(controls))
         for x, u in points:
             z = np.concatenate([x, u])
-            _, gradient, hessian = at(z)
-            slope = _differences(lambda z, at=at: np.array([at(z)[0]]), z)
+            _, gradient, hessian = plain.cost(z)
+            slope = _differences(lambda z, plain=plain: np.array([plain.cost(z)[0]]), z)
             yield _Derivative(f"gradient of {cost}", ("cost",), names, gradient[None], slope, x, u)
-            if not term.exact_hessian:
-                continue
-            curvature = _differences(lambda z, at=at: at(z)[1], z)
-            yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
+            if term.exact_hessian:
+                curvature = _differences(lambda z, plain=plain: plain.cost(z)[1], z)
+                yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
 
 
 def _of_constraints(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
-    dynamics = problem.dynamics
-    names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
-    n = len(dynamics.state_coordinates)
-    for name, value, slope in _constraints(problem):
-        for x, u in points:
-            differences = _differences(lambda z, f=value: np.array([f(z[:n], z[n:])]), np.concatenate([x, u]))
-            yield _Derivative(f"slope of {name}", ("value",), names, slope(x, u)[None], differences, x, u)
+    states, controls = problem.dynamics.state_coordinates.names, problem.dynamics.control_coordinates.names
+    names = (*states, *controls)
+    for term in problem.constraint_terms:
+        plain = PlainTerm(term, len(states), len(controls))
+        for row, (x, u) in itertools.product(range(term.rows), points):
+            z = np.concatenate([x, u])
+            differences = _differences(lambda z, of=plain, row=row: np.array([of.value(z, row)]), z)
+            what, slope = f"slope of {term.describe(row)}", plain.slope(z, row)[None]
+            yield _Derivative(what, ("value",), names, slope, differences, x, u)
 
 
 def _worst_entry(matrix: _Derivative, tolerance: float) -> DerivativeCheck:

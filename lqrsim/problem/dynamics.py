@@ -13,13 +13,19 @@ from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, module_of
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of, plain_calls
+from lqrsim.codegen.user_functions import (
+    UserFunction,
+    check_derivative,
+    check_signature,
+    level_of,
+    name_of,
+    plain_calls,
+)
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
     check_count,
-    check_function,
     check_items,
     check_name,
     check_number,
@@ -49,13 +55,13 @@ class Dynamics:
 
     The same function can be stated at three levels, which differ in speed and in what the function may contain:
 
-      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default. compiled  a
-      numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
+      symbolic  called once with SymPy symbols; exact derivatives follow. The fastest, and the default.
+      compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
                 differences, good to some eight digits, and an iteration takes longer.
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
-      f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
+      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed; p has the parameters as
         attributes, and so have x and u states and controls where they are symbols: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
@@ -135,16 +141,9 @@ class Dynamics:
             starts.append(indices[0])
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
-        if jacobian is not None and self.level == "symbolic":
-            raise InputError(
-                f"jacobian: got one for {name_of(f)}, which is symbolic, want none (it is derived) or level='compiled'"
-                " or 'plain'"
-            )
         check_signature(f, ("x", "u", "p"))
         if jacobian is not None:
-            check_function("jacobian", jacobian, "a function of (x, u, p, fx, fu)")
-            level_of(jacobian, self.level)
-            check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
+            check_derivative("jacobian", jacobian, f, self.level, "x, u, p, fx, fu")
         self.parameters, self.disturbances = _parameters_of(parameters, disturbances, self.level)
         self.state_coordinates = Coordinates(
             names=names,
@@ -236,7 +235,7 @@ class Dynamics:
         return text_source(made["source"], f"{self.name}(x, u, p)")
 
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
-        """The same with softer contacts and limits, the softest first, and what they are called.
+        """The same dynamics with softer contacts and limits, each with its name, the softest first.
 
         Args:
           states: (T+1, n) of a plan; where nothing touches along it, there are none.
@@ -251,7 +250,7 @@ class Dynamics:
 
     @cached_property
     def compiled(self) -> CompiledModule:
-        """These, compiled."""
+        """The compiled module of `step_source`."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
 

@@ -48,7 +48,7 @@ class Stage:
     def __post_init__(self) -> None:
         shape = _shape(self.B)
         if len(shape) not in (2, 3):
-            raise InputError(f"Stage: B: got {excerpt(self.B)}, want an array (n, m) or, one a step, (T, n, m)")
+            raise InputError(f"Stage: B: got {excerpt(self.B)}, want an array (n, m) or, one per step, (T, n, m)")
         if 0 in shape:
             raise InputError(f"Stage: B: got shape {shape}, want at least one of each")
         n, m = shape[-2:]
@@ -104,5 +104,5 @@ def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
     """() for ragged input, which has none."""
     try:
         return np.asarray(value).shape
-    except Exception:  # or raises whatever it likes when it is asked
+    except Exception:  # or an object that raises anything
         return ()

@@ -78,7 +78,7 @@ class Noise:
 
         def shaken(x, u, p):
             speed = sqrt(x.vx**2 + x.vy**2 + 1e-6)
-            return [[0, 0], ..., [p.gust * speed, 0], ...]     # a row a state, an entry for each number in w
+            return [[0, 0], ..., [p.gust * speed, 0], ...]     # a row per state, an entry for each number in w
 
         ls.Noise(shaken, size=2, parameters={"gust": 0.02})
 
@@ -117,7 +117,7 @@ class Noise:
             check_signature(function, ("x", "u", "p"))
             self.size = check_count("Noise: size", size, at_most=MOST)
             if depends_on is not None and self.level == "symbolic":
-                raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want none: it is found out")
+                raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want none: it is derived")
             self.depends_on = check_depends_on("Noise", depends_on, "states and controls")
         else:
             self.matrix = check_array("Noise: function", function, (None, None))
@@ -181,7 +181,7 @@ class Noise:
         numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
             if len(self.matrix) != n:
-                raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one a state")
+                raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one per state")
             kernel = source_of(noise_kernel, COUNT=n, SIZE=self.size)
             source = kernel.filled(noise_values=(kernel, "constant_values"), noise_slopes=(kernel, "constant_slopes"))
             return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
@@ -225,7 +225,7 @@ class Noise:
 
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
         """The result of the function, as n rows. Raises InputError for another shape."""
-        wanted = f"{n} rows, one a state, of {self.size} entries"
+        wanted = f"{n} rows, one per state, of {self.size} entries"
         if returned is None:
             raise InputError(f"got None, want {wanted}: is a return missing?")
         listed = returned.tolist() if hasattr(returned, "tolist") else returned

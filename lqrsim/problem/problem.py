@@ -57,12 +57,12 @@ class FixedState:
         else:
             found = check_array("FixedState: state", state, (None,))
             if not len(found):
-                raise InputError("FixedState: state: got no numbers, want one a state")
+                raise InputError("FixedState: state: got no numbers, want one per state")
         object.__setattr__(self, "state", found)
 
     @property
     def numbers(self) -> Array:
-        """The state (n,). PerEntry by name are in no order before a Problem has it."""
+        """The state (n,). Numbers by name are in no order before a Problem has it."""
         if isinstance(self.state, Mapping):
             raise InputError("FixedState: got numbers by name, want that of a Problem, as problem.initial")
         return np.asarray(self.state)
@@ -92,7 +92,7 @@ class Problem:
         keep them exactly, and the policy keeps the actuators', too.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
-      begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
+      begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
       noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
         worked out to second order about the plan. None for none.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
@@ -405,8 +405,8 @@ class Problem:
 
     @property
     def goal_inside(self) -> str:
-        """Where the goal is inside an obstacle of a cost or a Clearance, in words; empty where it is clear, or not a
-        place.
+        """The place of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if it is clear, or
+        is no place.
         """
         goal, clearances = self.weighed_goal, [one for one in self.constraints if isinstance(one, Clearance)]
         end = self.begin + self.steps * self.dt

@@ -1,8 +1,4 @@
-"""The figures of a stress test: success and tracking error over strength, with bands.
-
-The videos of a report: the worst trial of each policy and sweep, repeated and rendered, as text for the page.
-
-The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
+"""The report of a stress test: one self-contained page with tables, curves and videos of the worst trials."""
 
 import base64
 import json
@@ -10,7 +6,9 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files as packaged
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_path
-from lqrsim.reports import tables
-from lqrsim.results.goal import tracking_unit
+from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
@@ -32,6 +29,7 @@ from lqrsim.stress.analysis import Success
 from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.stress.statistics import Estimate
 from lqrsim.view import gl, style
 from lqrsim.view.style import RUNS
 
@@ -112,8 +110,8 @@ FPS = 15
 def videos_of_worst(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
     """A remark on all videos, and then each video."""
     chosen = [
-        next((one for one in tables.worst_trials(table, group) if one.outcome != "error"), None)
-        for group in tables.policies_and_sweeps(table)
+        next((one for one in worst_trials(table, group) if one.outcome != "error"), None)
+        for group in policies_and_sweeps(table)
     ]
     chosen = [one for one in chosen if one is not None][:count]
     problem = ""
@@ -250,24 +248,24 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
         "facts": _facts(results, table, scenario),
         "commands": commands,
         "asked": json.dumps(manifest.get("campaign"), indent=2, ensure_ascii=False),
-        "breaks": tables.breaks_table(table),
+        "breaks": breaks_table(table),
         "breaks_note": f"The lowest tested strength at which the 95 % interval of the success rate is entirely"
-        f" below {100 * tables.BROKEN_BELOW:g} %, in ascending order.",
+        f" below {100 * BROKEN_BELOW:g} %, in ascending order.",
         "success_note": f"A trial succeeds if it ends within {_reach(results, scenario)}, without a collision"
         " until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are Wilson's."
         " If nothing is random all trials are the same run, and there is no interval.",
-        "compared": tables.comparison_tables(whole, tracking_unit(tables.state_coordinates(scenario))),
+        "compared": comparison_tables(whole, tracking_unit(scenario.problem.dynamics.state_coordinates)),
         "compared_note": "Trials of the same number have the same random numbers for all policies. Policies differ in"
         " the trials in which only one of them succeeded: p is from McNemar's exact test, corrected for the number of"
         " comparisons on this page (Holm). Differences are first minus second, with 95 % intervals: Tango's score"
         " interval for success, Student's for the rms of trials in which both succeeded. If nothing is random there is"
         " nothing to compare.",
-        "modes": tables.failure_table(table),
-        "measures": tables.measure_tables(table, scenario),
+        "modes": failure_table(table),
+        "measures": measure_tables(table, scenario),
         "measures_note": "Median, and 5 to 95 % quantiles in parentheses, until a trial collides or diverges. Final"
         " error, distance from the goal and cost are those of trials that ran to the end.",
-        "worst": tables.worst_table(table, tracking_unit(tables.state_coordinates(scenario))),
-        "worst_note": f"Of each policy and sweep the {tables.WORST_EACH} worst. {analysis.RANKING}",
+        "worst": worst_table(table, tracking_unit(scenario.problem.dynamics.state_coordinates)),
+        "worst_note": f"Of each policy and sweep the {WORST_EACH} worst. {analysis.RANKING}",
     }
 
 
@@ -292,7 +290,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
         "Policies": [
-            ", ".join(tables.policies(table)),
+            ", ".join(policies(table)),
             *([manifest["left_out"]] if manifest.get("left_out") else []),
             *manifest["remarks"],
         ],
@@ -302,7 +300,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f" numbers in each combination, of seed {campaign.seed}."
         ],
     }
-    if designed := [policy for policy in tables.policies(table) if policy in DESIGNED]:
+    if designed := [policy for policy in policies(table) if policy in DESIGNED]:
         disturbances = design_disturbances(scenario, campaign.design_disturbances)
         unknown = uncertainty_of(scenario.plant(), disturbances).left_out
         facts["Design disturbances"] = [
@@ -324,7 +322,7 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
 def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campaign, folder: Path) -> dict[str, Any]:
     """The figures and the table of one sweep."""
     policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
-    unit = tracking_unit(tables.state_coordinates(scenario))
+    unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     curves = {policy: analysis.degradation(table, policy, name) for policy in policies}
     errors = {
         policy: {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
@@ -354,7 +352,7 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
                 alt=f"Median tracking error ({unit}) over strength. {medians}.",
             ),
         ],
-        "success": tables.success_table(name, curves),
+        "success": success_table(name, curves),
     }
 
 
@@ -362,3 +360,161 @@ def _picture(path: Path, *, caption: str, alt: str) -> dict[str, Any]:
     with Image.open(path) as image:
         width, height = image.size
     return {"data": base64_text(path), "width": width, "height": height, "caption": caption, "alt": alt}
+
+
+BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
+WORST_EACH = 3  # trials that are listed for each policy and sweep
+
+
+@dataclass(frozen=True)
+class PageTable:
+    """A table of the page."""
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def policies(table: analysis.Table) -> list[str]:
+    """The names of the policies, in the order of the campaign."""
+    return list(dict.fromkeys(cell.policy for cell in table))
+
+
+def breaks_table(table: analysis.Table) -> PageTable:
+    """The strength at which each policy breaks in each sweep."""
+    rows = [
+        [
+            one.policy, one.sweep, "not at any" if one.strength is None else f"{one.strength:g}",
+            "" if one.success is None else _percent(one.success),
+        ]
+        for one in analysis.breaks(table, below=BROKEN_BELOW)
+    ]  # fmt: skip
+    return PageTable("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
+
+
+def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
+    """A share with its interval, if that has a width."""
+    if one.low == one.high:
+        return f"{scale * one.value:.1f}{unit}"
+    return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
+
+
+def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
+    """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is that of tracking errors."""
+    found = analysis.comparisons(table)
+    factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+    head = (
+        "strength", "only the first", "only the second", "p", "difference in success (%)", "both reached",
+        f"difference in rms ({unit})",
+    )  # fmt: skip
+    groups = dict.fromkeys((one.first.sweep, one.first.policy, one.second.policy) for one in found)
+    return [
+        PageTable(
+            f"{sweep}: {first} against {second}",
+            head,
+            [
+                [
+                    f"{one.first.strength:g}", str(one.pairs.only_first), str(one.pairs.only_second),
+                    f"{one.adjusted:.2g}", _percent(one.success, unit=""), str(one.both),
+                    "" if one.rms is None else _between(one.rms.value, one.rms.low, one.rms.high, factor),
+                ]
+                for one in found
+                if (one.first.sweep, one.first.policy, one.second.policy) == (sweep, first, second)
+            ],
+        )
+        for sweep, first, second in groups
+    ]  # fmt: skip
+
+
+def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
+    if not np.isfinite(value):
+        return "none" if np.isnan(value) else "infinite"
+    return f"{scale * value:.3g}" if low == high else f"{scale * value:.3g} ({scale * low:.3g} to {scale * high:.3g})"
+
+
+def failure_table(table: analysis.Table) -> PageTable:
+    """The numbers of failures of each kind in each cell, and the obstacles that were hit."""
+    kinds = [outcome for outcome in OUTCOMES if outcome != "reached"]
+    rows = []
+    for cell, outcomes in table.items():
+        modes = analysis.modes(outcomes)
+        counts = [sum(n for (outcome, _), n in modes.items() if outcome == kind) for kind in kinds]
+        hit = [f"{obstacle} {count}" for (_, obstacle), count in modes.items() if obstacle]
+        more = f", and {len(hit) - 4} more" if len(hit) > 4 else ""
+        if modes:
+            rows.append([*_cell_names(cell), str(len(outcomes)), *map(str, counts), ", ".join(hit[:4]) + more])
+    head = ("policy", "sweep", "strength", "trials", *kinds, "collided with")
+    return PageTable("Failures by how they ended, and the obstacles that were hit most", head, rows)
+
+
+def _cell_names(cell: Cell) -> list[str]:
+    return [cell.policy, cell.sweep, f"{cell.strength:g}"]
+
+
+def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]:
+    """Quantiles of all measures, a table for each sweep."""
+    units = dict(analysis.MEASURES)
+    of_controls = set(scenario.robot.dynamics.control_coordinates.units)
+    if len(of_controls) == 1:
+        unit = of_controls.pop()
+        units["effort"] = f"{unit}² s" if unit.isalpha() else f"({unit})² s"
+    units["saturated"] = "share of periods"
+    space = scenario.problem.dynamics.state_coordinates
+    units |= dict.fromkeys(("worst", "rms", "final"), tracking_unit(space))
+    units["goal"] = Target(space, scenario.problem.weighed_goal, np.zeros((1, len(space)))).unit
+    head = ["policy", "strength", *(f"{name} ({unit})" if unit else name for name, unit in units.items())]
+    tables = []
+    for sweep in dict.fromkeys(cell.sweep for cell in table):
+        rows = []
+        for cell, outcomes in table.items():
+            if cell.sweep == sweep:
+                quantiles = [analysis.quantiles(outcomes, name) for name in units]
+                values = [_between(middle, low, high) for low, middle, high in quantiles]
+                rows.append([cell.policy, f"{cell.strength:g}", *values])
+        tables.append(PageTable(sweep, head, rows))
+    return tables
+
+
+def policies_and_sweeps(table: analysis.Table) -> list[tuple[str, str]]:
+    """Policies and sweeps by breaking strength, alternating between policies."""
+    order = [(one.policy, one.sweep) for one in analysis.breaks(table, below=BROKEN_BELOW)]
+    turns = zip_longest(*([group for group in order if group[0] == policy] for policy in policies(table)))
+    return [group for turn in turns for group in turn if group is not None]
+
+
+def worst_trials(table: analysis.Table, group: tuple[str, str]) -> list[analysis.Trial]:
+    """The worst trials of a policy and a sweep, the worst first."""
+    return analysis.worst({cell: one for cell, one in table.items() if (cell.policy, cell.sweep) == group}, WORST_EACH)
+
+
+def worst_table(table: analysis.Table, unit: str) -> PageTable:
+    """The worst trials of each policy and sweep; `unit` is that of tracking errors."""
+    rows = [
+        [
+            *_cell_names(one.cell), str(one.trial), one.outcome, one.obstacle, f"{one.ended:.2f}",
+            f"{one.clearance:.3f}", f"{one.worst:.3f}",
+        ]
+        for group in policies_and_sweeps(table)
+        for one in worst_trials(table, group)
+    ]  # fmt: skip
+    head = (
+        "policy", "sweep", "strength", "trial", "outcome", "collided with", "ended (s)", "least clearance (m)",
+        f"largest error ({unit})",
+    )  # fmt: skip
+    return PageTable("Worst trials", head, rows)
+
+
+def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) -> PageTable:
+    """The numbers of trials of each policy that reached the goal, a row for each strength."""
+    points = [point for of_policy in curves.values() for point in of_policy]
+    strengths = sorted({point.cell.strength for point in points})
+    of_cell = {(point.cell.policy, point.cell.strength): point for point in points}
+    rows = [[f"{s:g}", *(_share(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
+    return PageTable(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
+
+
+def _share(point: analysis.Success | None) -> str:
+    if point is None:
+        return "not run"
+    count = f"{point.reached}/{point.trials}"
+    return f"{count}, deterministic: 1 run" if point.alike else f"{count}, {_percent(point.exact)}"

@@ -43,7 +43,7 @@ def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
 
 Arrays = dict[str, npt.NDArray[Any]]
 META, DIGEST = "meta", "sha256"
-UNFINISHED = ".unfinished-"  # how the name of a file begins that is still written
+UNFINISHED = ".unfinished-"  # beginning of the name of a file that is being written
 ABANDONED = 24 * 3600.0  # s after its last change; nothing takes so long to write
 
 # The most that is read, in bytes, or relative to the size of the file.

@@ -1,4 +1,4 @@
-"""A certificate: how often a policy fails, with all that it takes to measure it again. NumPy only."""
+"""A certificate: how often a policy fails, with everything that it takes to measure it again. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ class FailureCertificate:
       strength: factor by which they are scaled.
       policy: name of the policy.
       design_disturbances: name of the set for which it is designed, or None.
-      failure: what counts as one.
+      failure: the event that counts as a failure.
       goal_radius: as in `ReliabilityProblem`.
       goal_tolerance: likewise.
       disturbances: a description of each.
       model: hash of the simulated MJCF.
-      policy_digest: hash of all that the controls depend on.
+      policy_digest: hash of everything that the controls depend on.
       probability: the estimate.
       low: lower end of its interval.
       high: upper end.

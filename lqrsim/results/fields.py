@@ -1,4 +1,4 @@
-"""Checks of a record's fields by their annotations: said once, held when a record is made and when a file is read.
+"""Checks of a record's fields by their annotations, when a record is made and when a file is read.
 
     @dataclass(frozen=True)
     class Trajectory:
@@ -47,7 +47,7 @@ class Declared(NamedTuple):
     Attributes:
       kinds: the kinds that are allowed; `typing`'s names.
       dtype: type of an array, float64 or int64; None for anything else.
-      letters: the shape of an array, or the length of something else; empty where none is said.
+      letters: the shape of an array, or the length of something else; empty where none is given.
       longest: characters of a text that is one printable line; None for any text.
       optional: whether it may be None.
     """
@@ -112,7 +112,7 @@ def declared(annotation: Any) -> Declared:
 
 @cache
 def _in_order(kind: type) -> list[tuple[str, Declared]]:
-    """Records first, which say what sizes are, then arrays, then optional records and tuples of a length."""
+    """Records first, which define sizes, then arrays, then optional records and tuples of a length."""
 
     def order(item: tuple[str, Declared]) -> int:
         said = item[1]
@@ -229,7 +229,7 @@ def _array(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
 
 
 def _number(field: str, value: Any) -> float:
-    """A number, infinite ones and NaN too."""
+    """A number; it may be infinite or NaN."""
     if type(value) is float:
         return value
     array = real(field, value, "a number")

@@ -17,7 +17,7 @@ from lqrsim.results.value_functions import Quadratic
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A plan with its feedback law, and all that a next solve can begin with.
+    """A plan with its feedback law, and everything that a next solve can begin with.
 
     A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 

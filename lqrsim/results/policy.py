@@ -19,7 +19,7 @@ from lqrsim.results.solution_parts import HORIZONS, left_after
 
 @dataclass(frozen=True, kw_only=True)
 class AffinePolicy:
-    """The feedback law `u_t = gain_t x + offset_t`, with all that a robot needs to run it.
+    """The feedback law `u_t = gain_t x + offset_t`, with everything that a robot needs to run it.
 
     Calling it needs NumPy alone. Paper: Eq. (13); Eq. (19) for the inverse policy, which takes the state of *arrival*.
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import couplings_of
 
-_HELD = 1e-6  # of the largest force, what may be missed where a robot is said to be held
+_HELD = 1e-6  # share of the largest force that may be missing for a robot that counts as held
 _NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # steps at most, their halves, and m or rad of difference quotients
 _LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
 
@@ -78,8 +78,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which what no actuator drives is at rest, and the largest force (N, N m) left on it.
 
-    Newton's method, with the least steps: contacts are springs, and of the free directions, such as along a floor, none
-    is moved in.
+    Newton's method, with the smallest steps: contacts are springs, and nothing moves in a free direction, such as along
+    a floor.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos

@@ -24,7 +24,7 @@ class Joint:
     Attributes:
       name: its own. kind: free, ball, slide or hinge.
       qpos, dof: where its numbers begin in qpos and qvel. limits: of a slide or hinge, in m or rad; None without.
-      rest: its numbers in qpos when nothing else is said.
+      rest: its numbers in qpos by default.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Coupling:
     ratio: float
 
 
-UNNAMED = "unnamed_"  # what begins the name of a body, joint, geom or actuator that has none in the MJCF
+UNNAMED = "unnamed_"  # begins the names of bodies, joints, geoms and actuators without one in the MJCF
 
 
 def named(xml: str) -> str:
@@ -90,7 +90,7 @@ def lit(xml: str, model: mujoco.MjModel) -> str:
     """An MJCF with a camera and a light named overview, where it has none of the kind; the same text where it has both.
 
     Args:
-      xml: the MJCF. model: compiled from it, which says how large the whole is.
+      xml: the MJCF. model: compiled from it, for the size of the whole.
     """
     if (model.ncam and model.nlight) or "</mujoco>" not in xml:
         return xml

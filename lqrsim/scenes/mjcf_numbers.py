@@ -1,4 +1,4 @@
-"""The numbers of an MJCF that may be others: masses, damping, friction, gears; read from a model, changed in the text.
+"""The numbers of an MJCF that can be changed: masses, damping, friction, gears. Read from a model, changed in the text.
 
 The text is changed because MuJoCo derives other numbers when it compiles the text.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_number
 
-WHOLE = "mass"  # of all that moves
+WHOLE = "mass"  # of all moving bodies together
 _OF_JOINTS = ("damping", "stiffness", "armature", "frictionloss")
 _MEDIUM = ("density", "viscosity")
 _BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # of the rest: none is negative

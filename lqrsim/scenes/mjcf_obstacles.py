@@ -54,7 +54,7 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
     """The pairs whose distances matter: those that can touch, and all pairs of an obstacle that nothing can touch.
 
-    Such an obstacle was asked for by name, or by a rule.
+    The user has chosen such an obstacle by name or by a rule.
     """
     pairs = touching_pairs(model, obstacles)
     untouched = sorted(set(obstacles) - set(pairs[:, 1].tolist()))
@@ -102,7 +102,7 @@ def levers(model: mujoco.MjModel) -> Array:
 
 
 def _base(model: mujoco.MjModel) -> set[int]:
-    """The bodies that carry what moves, up to the world, and all that is fixed to the last of them."""
+    """The bodies that carry what moves, up to the world, and everything fixed to the last of them."""
     fixed, base, carriers = model.body_weldid == 0, set[int](), set[int]()
     for body in np.flatnonzero(~fixed).tolist():
         above = int(model.body_parentid[body])

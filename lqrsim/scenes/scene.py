@@ -54,7 +54,7 @@ _MASSES = frozenset(("mass", "density", "viscosity", "diaginertia", "fullinertia
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 
-Choice = bool | Sequence[str] | Callable[[Any], bool]  # of obstacles; see `load_scene`
+Choice = bool | Sequence[str] | Callable[[Any], bool]  # a choice of obstacles; see `load_scene`
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Scene:
         check_kind("Scene: world", self.world, World, "a World")
         object.__setattr__(self, "geoms", check_items("Scene: geoms", self.geoms, (int, np.integer), "ids of geoms"))
         if len(self.world) != len(self.geoms):
-            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {len(self.geoms)}, one a geom")
+            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {len(self.geoms)}, one per geom")
 
 
 def names() -> list[str]:
@@ -168,7 +168,7 @@ def scene_of(xml: str, name: str, model: mujoco.MjModel, geoms: Sequence[int], k
 
 
 def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int], what: str) -> list[int]:
-    """Ids of the geoms that are obstacles by a choice, as `load_scene` has it.
+    """Ids of the geoms that the `obstacles=` of `load_scene` chooses.
 
     Args:
       default: those with True. what: its name in messages.
@@ -265,7 +265,7 @@ def _check_elements(xml: str, what: str) -> None:
         for event, element in events:
             depth += 1 if event == "start" else -1
             if depth > DEEPEST:
-                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies")
+                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want less nesting")
             if element.tag == "replicate":
                 copies = [*copies, copies[-1] * _whole(element.get("count", ""))] if event == "start" else copies[:-1]
             if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", "replicate"):

@@ -22,7 +22,7 @@ OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One primitive; sizes and axes as MuJoCo has them.
+    """One primitive, with sizes and axes as in MuJoCo.
 
     Attributes:
       name: name of the geom in the MJCF.
@@ -72,7 +72,7 @@ class Obstacle:
         """This obstacle as `ROW` numbers.
 
         Raises:
-          InputError: it has no distance.
+          InputError: its kind has no distance.
         """
         if self.kind not in KINDS:
             raise InputError(
@@ -155,14 +155,14 @@ class World:
     def seen_by(self, plane: str, offset: float | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
 
-        In space ("xyz") it is this one. A plane has its two axes as x and y, in their order; its third axis is across.
+        A robot in space ("xyz") sees this world itself. A plane has its two axes as x and y, in their order; its third
+        axis is across.
 
-        With an offset, this world is cut there: distances are in space, from the points of the plane. The robot
-        is a ball, obstacles beside the plane do not touch it, and a floor is a wall. Without one, in a horizontal
-        plane,
-        it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to
-        the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
-        horizontal one that is the floor.
+        With an offset, this world is cut there: distances are in space, from the points of the plane. The robot is a
+        ball, obstacles beside the plane do not touch it, and a floor is a wall. Without one, in a horizontal plane, the
+        world is seen from above: the robot is as high as everything, upright obstacles reach from the floor to the sky,
+        and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the horizontal
+        one that is the floor.
 
         Args:
           plane: as in `Coordinates`.

@@ -231,9 +231,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
     for field in [*now, *before]:
         value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
-            raise InputError(
-                f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
-            )
+            raise InputError(f"{field}: got {excerpt(value)}, want {excerpt(was)}, as in {folder}, or another folder")
     for field, what in (("model", "MJCF or simulator"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
             raise InputError(f"scenario: got another {what} than {folder} was begun with, want another folder")

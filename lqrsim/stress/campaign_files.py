@@ -257,7 +257,7 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
-    """Hash of all that the rows depend on; the same when the same campaign is begun again."""
+    """Hash of everything that the rows depend on; the same when the same campaign is begun again."""
     fields = ("cells", "model", "problem", "start", "solution", "code", "versions")
     hashed = {name: manifest[name] for name in fields} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},

@@ -6,7 +6,7 @@ Weighed against libraries, for this machine:
   fault. A task that hangs cannot be stopped before Python 3.14.
 - pebble 5.2 has time limits and names the task of a killed worker. But its workers share one pipe and its lock: a
   worker that is killed while it sends a result keeps the lock, and after two minutes all other tasks are lost, too.
-  A worker that dies before it has read its arguments leaves the pool waiting for ever if they are larger than a pipe.
+  A worker that dies before it has read its arguments leaves the pool waiting forever if they are larger than a pipe.
 - A `LocalCluster` of dask repeats the work of dead workers, but it has no time limits either, does not say by which
   signal a worker ended, takes seconds to start, and is an extra to install.
 
@@ -119,7 +119,7 @@ class _Worker:
 
     It sends `STARTED` once it has imported the caller's script, then receives the job and the shard, and sends `READY`
     when it can begin. The job is not an argument of the process: Python writes arguments to a pipe whose other end it
-    keeps open, and if the process dies before it reads them, the writer waits for ever, deaf to Ctrl-C.
+    keeps open, and if the process dies before it reads them, the writer waits forever, deaf to Ctrl-C.
     """
 
     STARTED, READY = "started", "ready"

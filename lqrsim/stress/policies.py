@@ -83,7 +83,7 @@ def solve(
 ) -> dict[str, Solution]:
     """The solution that each policy runs, by the policy's name.
 
-    The policy of the solution for "track" is the tracking law. That of "offset_free" has the policy of "smooth".
+    The policy of the solution for "track" is the tracking law. That for "offset_free" keeps the policy of "smooth".
 
     Args:
       policies: some of POLICIES.

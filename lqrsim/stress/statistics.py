@@ -134,7 +134,7 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
 
 
 def _last(accepted: Callable[[float], bool], inside: float, outside: float) -> float:
-    """The last accepted number between `inside` and `outside`, by bisection to rounding."""
+    """The last accepted number between `inside` and `outside`, by bisection down to rounding."""
     for _ in range(60):
         middle = (inside + outside) / 2
         inside, outside = (middle, outside) if accepted(middle) else (inside, middle)

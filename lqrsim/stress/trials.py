@@ -120,7 +120,7 @@ class Job:
         return cls(trials.campaign.as_json(), digest, solutions, batch)
 
     def prepare(self) -> Trials:
-        """What runs the job's trials, kept in this process until another job comes."""
+        """The trials of this job, kept in this process until there is another job."""
         if self.run not in _prepared:
             _prepared.clear()
             scenario = resolve(self.campaign["scenario"])  # first: it may define disturbances

@@ -19,7 +19,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
-from lqrsim.view.decorative_geoms import RIM
+from lqrsim.view.overlays import RIM
 from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 from lqrsim.view.video_metadata import Pane, VideoMetadata
 
@@ -79,7 +79,7 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
 
 
 def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
-    """Whether states and frames are one motion."""
+    """Whether states and frames show the same motion."""
     times, _ = frames_at_states(rollout, trial)
     found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
     apart = np.linalg.norm(found - wanted, axis=1).max()

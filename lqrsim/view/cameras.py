@@ -107,7 +107,7 @@ def measuring(plane: str) -> tuple[str, ...]:
 def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
     span, forward = high - low, np.cross(up, right)
     height = max(float(abs(up) @ span), float(abs(right) @ span) / aspect)
-    # Far enough to have all of the surroundings in front.
+    # Far enough back that all surroundings are in front of it.
     position = 0.5 * (low + high) - (10 + 5 * float(span.max())) * forward
     vectors = (tuple(vector.tolist()) for vector in (position, forward, up))
     return Camera(name, *vectors, height=height)

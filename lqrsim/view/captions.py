@@ -1,17 +1,26 @@
-"""Captions of pictures: title, disturbances and readings of each run, and the legend of all."""
+"""Text on pictures: a caption of each run, with title, disturbances and readings, and the legend of all.
 
+Tiles of text are drawn with Pillow and blended into images (height, width, 3).
+"""
+
+import functools
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 
+import matplotlib
 import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
 
 from lqrsim.results.goal import OF_RANGE
-from lqrsim.view import text_tiles
 from lqrsim.view.options import Box
-from lqrsim.view.overlays import Overlays, Scale
+from lqrsim.view.overlays import Colour, Overlays, Scale, error_colours
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.text_tiles import Pixels
 
+Pixels = npt.NDArray[np.uint8]
+
+INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
 HEADER_SHARES = 0.4, 0.75  # of the height of a picture, for the header: above the picture, and over it
 LETTER_HEIGHTS = 44, 54  # lines of text in the height of a picture, and in the width of a narrow one
 
@@ -37,7 +46,7 @@ class Caption:
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
         # Readings keep their place: beside the title in a strip that is wide enough, otherwise in lines of their own.
         longest = self._readings_width(1)
-        bare_title = text_tiles.text_tile((title,), self.letter_height, width=0)
+        bare_title = text_tile((title,), self.letter_height, width=0)
         beside = not over and bare_title.shape[1] + longest < self.width
         most = len(self._readings(recorded.end))
         self.lines = next((count for count in range(1, most) if self._readings_width(count) <= self.width), most)
@@ -52,9 +61,9 @@ class Caption:
             words = what[:count] + ([f"{left} more disturbances" if count else f"{left} disturbances"] if left else [])
             lines = [title]
             for line in words if self.over else ["; ".join(words)]:
-                lines += text_tiles.wrap(line, self.letter_height, self.width - round(1.4 * self.letter_height))
+                lines += wrap(line, self.letter_height, self.width - round(1.4 * self.letter_height))
             width = box.width // 5 if self.over else self.width
-            tile = text_tiles.text_tile(tuple(lines), self.letter_height, width=width)
+            tile = text_tile(tuple(lines), self.letter_height, width=width)
             if tile.shape[0] <= HEADER_SHARES[self.over] * box.height:
                 break
         return tile
@@ -62,16 +71,16 @@ class Caption:
     def draw(self, area: Pixels, time: float) -> None:
         """Draw the caption into the run's part of the picture, in place."""
         margin = self.letter_height if self.over else 0
-        text_tiles.blend(area, self.header, left=margin, top=margin)
+        blend(area, self.header, left=margin, top=margin)
         readings = self._readings_tile(time)
         if self.place[0]:
             readings = readings[: round(1.85 * self.letter_height)]  # up to the next line
-        text_tiles.blend(area, readings, left=margin + self.place[0], top=margin + self.place[1])
+        blend(area, readings, left=margin + self.place[0], top=margin + self.place[1])
 
     def _readings_tile(self, time: float) -> Pixels:
         lines = tuple(self._readings(time)) if self.over else self._in_lines(time, self.lines)
         width = self.header.shape[1] if self.over else 0
-        return text_tiles.text_tile(lines, self.letter_height, width=width, bold=False)
+        return text_tile(lines, self.letter_height, width=width, bold=False)
 
     def _readings_width(self, lines: int) -> int:
         """The width in pixels of the readings in this number of lines, with room for longer numbers."""
@@ -79,7 +88,7 @@ class Caption:
         if (funnel := self.overlays.funnel) is not None:
             times.append(float(run.times[funnel.said.index(max(funnel.said, key=len))]))
         all_lines = (self._in_lines(time, lines) for time in times)
-        tiles = [text_tiles.text_tile(readings, self.letter_height, width=0, bold=False) for readings in all_lines]
+        tiles = [text_tile(readings, self.letter_height, width=0, bold=False) for readings in all_lines]
         return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
 
     def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
@@ -115,7 +124,7 @@ class Legend:
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
         named = dict(entry for one in overlays for entry in one.legend_entries())
         # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
-        entries: dict[str, text_tiles.Colour | None] = {
+        entries: dict[str, Colour | None] = {
             text: colour
             for text, colour in named.items()
             if not any(other != text and other.startswith(text) for other in named)
@@ -128,7 +137,7 @@ class Legend:
         letter_height = max(round(0.8 * _letter_height(*size)), 8)
         self.margin = letter_height if over else 0
         width = size[0] - 2 * self.margin
-        self.tile = text_tiles.legend_tile(tuple(entries.items()), letter_height, width) if entries else None
+        self.tile = legend_tile(tuple(entries.items()), letter_height, width) if entries else None
         self.height = 0 if self.tile is None else self.tile.shape[0] + self.tile.shape[0] % 2
 
     def draw(self, image: Pixels) -> None:
@@ -136,8 +145,81 @@ class Legend:
         if self.tile is not None:
             if not self.margin:
                 image[-self.height :] = 255
-            text_tiles.blend(image, self.tile, left=self.margin, bottom=self.margin)
+            blend(image, self.tile, left=self.margin, bottom=self.margin)
 
 
 def _letter_height(width: int, height: int) -> int:
     return max(round(min(height / LETTER_HEIGHTS[0], width / LETTER_HEIGHTS[1])), 9)
+
+
+@functools.lru_cache(maxsize=16)
+def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = True) -> Pixels:
+    """Lines of text on translucent paper, (h, w, 4), at least `width` pixels wide.
+
+    The letters are `height` pixels high; with `bold` the first line is bold.
+    """
+    fonts = [_font(height, bold=bold and number == 0) for number in range(len(lines))]
+    needed = max(font.getlength(line) for font, line in zip(fonts, lines, strict=True))
+    tile, draw = _blank_tile(max(needed + 1.4 * height, width), (1.5 * len(lines) + 0.7) * height)
+    for number, (font, line) in enumerate(zip(fonts, lines, strict=True)):
+        draw.text((0.7 * height, (0.4 + 1.5 * number) * height), line, font=font, fill=INK)
+    return np.asarray(tile)
+
+
+@functools.lru_cache(maxsize=16)
+def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
+    """A legend (h, w, 4) in rows of at most `width` pixels; the colour None is the map of the tracking error."""
+    font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
+    rows: list[list[tuple[float, str, Colour | None]]] = [[]]
+    x = widest = space
+    for name, colour in entries:
+        needed = font.getlength(name) + swatch + 3 * space
+        if rows[-1] and x + needed > width:
+            rows.append([])
+            x = space
+        rows[-1].append((x, name, colour))
+        x += needed
+        widest = max(widest, x)
+    tile, draw = _blank_tile(widest, (1.6 * len(rows) + 0.6) * height)
+    for number, row in enumerate(rows):
+        top = (1.6 * number + 0.45) * height
+        for left, name, colour in row:
+            for column in range(swatch):
+                shade = error_colours(np.array([column / swatch]))[0, :3] if colour is None else colour
+                place = (left + column, top + 0.45 * height, left + column, top + 0.95 * height)
+                draw.line(place, fill=tuple(round(255 * part) for part in shade))
+            draw.text((left + swatch + space, top), name, font=font, fill=INK)
+    return np.asarray(tile)
+
+
+def wrap(words: str, height: int, width: int) -> list[str]:
+    """The words in lines of at most `width` pixels, unless a word is longer, in letters `height` pixels high."""
+    font, lines = _font(height), [""]
+    for word in words.split():
+        longer = f"{lines[-1]} {word}" if lines[-1] else word
+        if lines[-1] and font.getlength(longer) > width:
+            lines.append(f"  {word}")
+        else:
+            lines[-1] = longer
+    return lines
+
+
+def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
+    """Blend a tile into the image, in place, at these distances in pixels from the left and the top or bottom."""
+    room = image.shape[0] - tile.shape[0]
+    start = max(top if top is not None else room - (bottom or 0), 0)
+    area = image[start : start + tile.shape[0], left : left + tile.shape[1]]
+    tile = tile[: area.shape[0], : area.shape[1]]
+    alpha = tile[..., 3:].astype(np.uint16)
+    area[...] = ((255 - alpha) * area + alpha * tile[..., :3] + 127) // 255
+
+
+@functools.lru_cache(maxsize=8)
+def _font(height: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
+    folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    return ImageFont.truetype(folder / f"DejaVuSans{'-Bold' if bold else ''}.ttf", height)
+
+
+def _blank_tile(width: float, height: float) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+    tile = Image.new("RGBA", (round(width), round(height)), PAPER)
+    return tile, ImageDraw.Draw(tile)

@@ -1,4 +1,4 @@
-"""Ellipsoids along a plan: of a predicted tube, or of a total cost near its least."""
+"""Ellipsoids along a plan: of a predicted tube, or of a total cost near its minimum."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from lqrsim.errors import Array
 from lqrsim.results.solution import Solution
 
 SIGMAS = 2.0  # standard deviations at which ellipsoids are drawn
-COST_ABOVE_LEAST = SIGMAS**2 / 2  # total cost above its least, on an ellipsoid of the cost
+COST_ABOVE_LEAST = SIGMAS**2 / 2  # total cost above its minimum, on an ellipsoid of the cost
 PREDICTED = f"predicted: {SIGMAS:g} sigma, 95 % in each direction"
 OF_COST = f"{SIGMAS:g} sigma of the cost: total ≤ least + {COST_ABOVE_LEAST:g}"
 
@@ -42,7 +42,7 @@ class Ellipsoids:
 
     @classmethod
     def of_cost(cls, solution: Solution, states: tuple[int, ...]) -> "Ellipsoids":
-        """The states whose total cost is at most `COST_ABOVE_LEAST` above its least, projected onto d of the states.
+        """The states whose total cost is at most `COST_ABOVE_LEAST` above its minimum, projected onto d of the states.
 
         The projection of an ellipsoid has the corresponding block of its covariance.
 

@@ -1,4 +1,4 @@
-"""Overlays of pictures, drawn as geoms of MuJoCo beside those of the model: lines, forces, tubes and funnels."""
+"""Overlays of pictures, drawn as geoms of MuJoCo beside those of the model: lines, forces, tubes, funnels, the mark."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,13 +10,23 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.funnel import Funnel
+from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.view import text_tiles
-from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
+from lqrsim.view.cameras import Camera
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.options import Overlay
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.text_tiles import Colour
+
+Colour = tuple[float, float, float]
+
+# The mark by which a robot's position is read from a video: a green ball at the origin of its body, in front of a black
+# one. Nothing else is pure green. All of its light is its own, so that it looks the same in the sun and in the shade.
+MARK_RGB = (0.0, 1.0, 0.0)
+RIM = (
+    # Radius of the black ball, in radii of the green one: a video then blurs the same colour into the mark all around.
+    1.8
+)
+PLAN_RGB = (0.78, 0.08, 0.42)  # of the plan; neither the error map nor a robot has it
 
 # Opacity, for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a certified
 # ellipsoid.
@@ -51,7 +61,7 @@ class DrawnFunnel:
     Attributes:
       certified: its ellipsoids at knots that have a level, if there are any.
       between: some ellipsoids of interpolated levels, if there are any.
-      said: (T+1) whether the run was in the funnel at each step, in words.
+      said: (T+1) whether the run was in the funnel at each step, as text.
     """
 
     certified: DrawnTube | None
@@ -69,7 +79,7 @@ def predicted(recorded: RecordedTrial) -> DrawnTube | None:
 
 
 def of_cost(recorded: RecordedTrial, solution: Solution | None) -> DrawnTube:
-    """The ellipsoids in which the solution's total cost is near its least."""
+    """The ellipsoids in which the solution's total cost is near its minimum."""
     run = recorded.rollout
     if solution is None:
         raise InputError("solution: got None with the overlay cost_tube, want the Solution that was run")
@@ -152,7 +162,7 @@ FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
-FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; no green, which is the mark's
+FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; not green, as the mark is
 SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than they are
 SEGMENTS = 120  # of a line, at most
 DOTS = 30  # latest measured states that are drawn
@@ -250,7 +260,7 @@ class Overlays:
             done = int(np.searchsorted(self.knots, time, side="right"))
             points = np.vstack([self.trace[:done], recorded.driven(time)])
             errors = np.append(self.errors[:done], recorded.interpolate(recorded.error, time))
-            colours = text_tiles.error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
+            colours = error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
             pen.ribbon(points + lift, (2.6 if recorded.planar else 1.1) * self.width, colours)
         if "plan" in self.show:
             colours = np.tile((*PLAN_RGB, 1.0), (len(self.plan) - 1, 1))
@@ -320,3 +330,50 @@ def _round_up(value: float) -> float:
     """Round up to one of 1, 1.5, 2, 3, 5, 7, 10, 15, ..."""
     power = 10.0 ** np.floor(np.log10(value) + 1e-9)
     return float(power * next(step for step in (1, 1.5, 2, 3, 5, 7, 10) if step * power >= value * (1 - 1e-9)))
+
+
+def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Colours (n, 4) of errors as fractions (n,) of the full scale."""
+    import matplotlib  # not above: viewers draw no trace in colours, and matplotlib makes a folder for its settings
+
+    return np.asarray(matplotlib.colormaps["cividis"](np.asarray(fractions, dtype=np.float64)))
+
+
+def decorate(
+    geom: mujoco.MjvGeom,
+    kind: Geom,
+    size: npt.ArrayLike,
+    position: npt.ArrayLike,
+    rgba: npt.ArrayLike,
+    rotation: Array | None = None,
+) -> mujoco.MjvGeom:
+    """Give a geom this kind, size (3,), place (3,) and colour (4,), without a shadow; returns the geom."""
+    mujoco.mjv_initGeom(
+        geom,
+        kind,
+        np.asarray(size, dtype=np.float64),
+        np.asarray(position, dtype=np.float64),
+        (np.eye(3) if rotation is None else rotation).ravel(),
+        np.asarray(rgba, dtype=np.float32),
+    )
+    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+    return geom
+
+
+def mark_radius(rollout: Rollout) -> float:
+    """Radius of the mark of a robot, in metres."""
+    return 0.25 * rollout.radius
+
+
+def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:
+    """Add the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
+
+    It is drawn close to the camera, where nothing hides it. In an orthographic picture its place is the same.
+    """
+    forward = np.array(camera.forward)
+    centre = centre - (forward @ (centre - camera.position)) * forward
+    for distance, size, colour in ((1, radius, MARK_RGB), (2, RIM * radius, (0.0, 0.0, 0.0))):
+        place = centre + (distance + size) * forward
+        ball = decorate(scene.geoms[scene.ngeom], Geom.mjGEOM_SPHERE, [size] * 3, place, (*colour, 1.0))
+        ball.specular, ball.emission = 0, 1
+        scene.ngeom += 1

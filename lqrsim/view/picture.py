@@ -16,12 +16,10 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import gl
 from lqrsim.view.cameras import CameraView, camera_view, leaves_room_for_captions
-from lqrsim.view.captions import Caption, Legend
-from lqrsim.view.decorative_geoms import draw_mark, mark_radius
+from lqrsim.view.captions import Caption, Legend, Pixels
 from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Box, Overlay, Quality, side_by_side, split_into_panes
-from lqrsim.view.overlays import Overlays, common_scale
+from lqrsim.view.overlays import Overlays, common_scale, draw_mark, mark_radius
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import Pane
 
 FADED_OPACITY = 0.10  # of a geom that hides the robot
@@ -129,7 +127,7 @@ class SceneRenderer:
             target = centre + radius * offset
             # The rays of an orthographic camera are parallel.
             start = target + forward * (forward @ (eye - target)) if view.orthographic else eye
-            for _ in range(100):  # surfaces at most
+            for _ in range(100):  # surfaces behind each other, at most
                 ray = target - start
                 hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN_GROUPS, True, -1, geom)
                 if not 0 <= hit < 1:
@@ -157,7 +155,7 @@ class SceneRenderer:
 LARGEST = 8192  # pixels of a side, which every OpenGL can draw
 MOST_RUNS = 6  # side by side; more are too small
 MOST_INSETS = 3
-READABLE = 300  # height of a picture in pixels from which on captions may cover a part of it
+READABLE = 300  # pixels; captions may cover a part of a picture that is at least this high
 LEAST_HEIGHT = 16  # pixels that a caption must leave
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # between panes, and behind captions
 

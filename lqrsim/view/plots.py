@@ -27,7 +27,7 @@ from lqrsim.view import figure_parts, style
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
-MOMENTS = 7  # at which the balls of a robot are drawn
+MOMENTS = 7  # times at which the balls of a robot are drawn
 AREA = "area: "  # begins the label of a tube
 
 
@@ -45,7 +45,7 @@ def plot_run(
       solution: its plan is the one that the rollouts follow.
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       path: FILE.png, .pdf or .svg.
-      world: the obstacles, as the scene has them.
+      world: the obstacles, such as `scene.world`.
       trial: row of each rollout.
 
     Raises:
@@ -61,7 +61,7 @@ def plot_run(
             for run, color in zip(rollouts.values(), RUNS, strict=False)
             if run.collision_chance is not None and run.collision_chance.any()
         ]
-        low = 0.13 if len(list(_tubes(rollouts))) <= 2 else 0.155  # above the legend, which has two tubes a row
+        low = 0.13 if len(list(_tubes(rollouts))) <= 2 else 0.155  # above the legend, which has two tubes in a row
         under = low + 0.205 if chances else low
         left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=under, top=0.95)[0]
         right = figure.add_gridspec(
@@ -246,7 +246,7 @@ def plot_policy(
     Args:
       solution: with a policy.
       path: FILE.png, .pdf or .svg.
-      world: the obstacles, as the scene has them.
+      world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
       tube: tube of the solution, from `predict_tube`.
 
@@ -404,7 +404,7 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
     Args:
       funnel: with the position among its states.
       path: FILE.png, .pdf or .svg.
-      world: the obstacles, as the scene has them.
+      world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
 
     Raises:

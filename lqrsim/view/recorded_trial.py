@@ -73,7 +73,7 @@ class RecordedTrial:
         return self._between(places, self.times, self.times) if places.size else np.zeros((0, 3))
 
     def planned_balls(self, time: float) -> tuple[Array, Array]:
-        """Planned places (B, 3) and radii (B,) of the robot's balls; without balls, of the robot as one."""
+        """Planned places (B, 3) and radii (B,) of the robot's balls; without balls, of the robot as a single ball."""
         run = self.rollout
         if run.balls is None:
             return self.planned(time)[None], np.array([run.radius])
@@ -106,7 +106,7 @@ class RecordedTrial:
         return float(np.interp(time, self.times, values))
 
     def ending(self, time: float) -> str:
-        """What ended the trial before this time, in words; empty if nothing did."""
+        """What ended the trial before this time, as text; empty if nothing did."""
         run, k = self.rollout, self.trial
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
             return ""

@@ -24,9 +24,9 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
+from lqrsim.view.captions import Pixels
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, Picture, PictureOptions, open_picture
-from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import VideoMetadata
 
 QUEUE_LENGTH = 3  # frames that wait to be encoded, at most

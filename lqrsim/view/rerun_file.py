@@ -17,9 +17,8 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
-from lqrsim.view.decorative_geoms import PLAN_RGB
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, TUBE, DrawnFunnel, of_funnel
+from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, PLAN_RGB, TUBE, DrawnFunnel, of_funnel
 from lqrsim.view.recorded_trial import RecordedTrial
 
 TIMELINE = "time"

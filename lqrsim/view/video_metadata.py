@@ -47,7 +47,7 @@ class VideoMetadata:
 
     Attributes:
       runs: digests of the rollouts.
-      markers: radius in metres of each robot's mark in panes with a camera; see `decorative_geoms.py`.
+      markers: radius in metres of each robot's mark in panes with a camera; see `overlays.py`.
       rate: frames a second.
       speed: seconds of the run in a second of the video.
       frames: number of frames.

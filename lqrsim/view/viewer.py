@@ -372,7 +372,7 @@ def has_display() -> bool:
 
 
 def _check_window_opens() -> None:
-    """Raises InputError if no window can be opened: MuJoCo's viewer would wait for ever."""
+    """Raises InputError if no window can be opened: MuJoCo's viewer would wait forever."""
     import glfw
 
     with warnings.catch_warnings():

@@ -14,7 +14,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
+from lqrsim.view.overlays import PLAN_RGB, decorate
 from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
@@ -60,7 +60,7 @@ class Viewer(abc.ABC):
 
     Attributes:
       data: the state that is shown.
-      caption: the state in words, as lines.
+      caption: the state as lines of text.
       remark: further lines of the caption.
       wrench: force and torque (6,) of a drag.
       holds_goal: whether mouse and keys move the goal instead of the robot.
