@@ -288,7 +288,7 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
 
 @pytest.mark.parametrize("spatial", [True, False])
 def test_a_start_near_its_goal_has_not_reached_it(cage: Plant, spatial: bool) -> None:
-    """Whatever the way: its start does not count as reached, its last twentieth does; a way of nothing is left alone."""
+    """Whatever the way: its start does not count as reached, its last twentieth does; without a way both do."""
     space = cage.robot.dynamics.state_coordinates
     space = space if spatial else replace(space, position=(), plane="")
     rng = np.random.default_rng(36)
