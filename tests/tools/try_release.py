@@ -4,9 +4,9 @@
     python3 run.py release --pythons python3.13 /opt/python3.14/bin/python3
     python3 run.py release --quick                             # without the demo
 
-For each Python it makes a virtual environment with the wheel and its dependencies alone, and for the last one another with
-the sdist. Then, without a network and with nothing compiled, it runs the Python of the README, where a warning of a line
-of lqrsim is an error, and the commands `lqrsim --version`, `lqrsim reproduce --quick figure_3`, `lqrsim demo --quick`.
+For each Python it makes a virtual environment with the wheel and its dependencies alone, and another for the
+sdist. Then, without a network and with nothing compiled, it runs the README's Python, where warnings of lqrsim's lines
+are errors, and the commands `lqrsim --version`, `lqrsim reproduce --quick figure_3`, `lqrsim demo --quick`.
 
 Exits with 1 if anything failed; build/release/ has the environments, and dist/ what was built.
 """
