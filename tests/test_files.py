@@ -640,7 +640,7 @@ def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(
     drive_solution: ls.Solution, status: ls.Status
 ) -> None:
     """Solutions of every status, with all that a solve may leave: starts, limits, clearance, goal, noise, NaN."""
-    rng = np.random.default_rng(36)
+    rng: Any = np.random.default_rng(36)
     plan, one = drive_solution.trajectory, drive_solution.candidates[0]
     for _ in range(12):
         ends = [status, *rng.choice([None, *ls.Status], size=rng.integers(0, 40))]
