@@ -32,6 +32,7 @@ COMMANDS = {
     "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
     "check": "check lint, formatting and types",
     "numbers": "print the numbers of the pages again, which takes hours (arguments: numbers --help)",
+    "release": "try the sdist and the wheel in empty environments of each Python on the path (release --help)",
     "docs": "build the documentation site into build/site; warnings are errors",
     "setup": "only set up what the other commands need",
 }
@@ -70,6 +71,8 @@ def main() -> int:
         return run([PYTHON, "-m", "pytest", *(every if rest in ([], ["--long"]) else rest)])
     if options.command == "numbers":
         return run([PYTHON, "tests/tools/print_numbers.py", *rest])
+    if options.command == "release":
+        return run([PYTHON, "tests/tools/try_release.py", *rest])
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])

@@ -4,8 +4,9 @@ import contextlib
 import io
 import itertools
 import logging
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lqrsim import process
@@ -120,15 +121,33 @@ def _parse(arguments: list[str]) -> Any:
 
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(printed) if "--json" in arguments else contextlib.nullcontext():
+        with _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
             return tyro.cli(Command, prog="lqrsim", args=arguments)
     except SystemExit as end:
         if "--json" not in arguments or end.code != 2:
             raise
-    # The first line is the box's title; a rule separates the hints below.
-    lines = [line.strip("│╭╮╰╯ ") for line in printed.getvalue().splitlines()]
-    text = " ".join(itertools.takewhile(lambda line: not line.startswith("──"), filter(None, lines[1:])))
+    # The first line is the title; a rule follows it where stdout is not UTF-8. Another rule precedes the hints.
+    lines = [line.strip("│╭╮╰╯ ") for line in printed.getvalue().splitlines()[1:]]
+    said = [line for line in lines if line]
+    if said and not said[0].strip("─-"):
+        del said[0]
+    text = " ".join(itertools.takewhile(lambda line: line.strip("─-"), said))
+    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
     return text or "got arguments that cannot be parsed"
+
+
+@contextlib.contextmanager
+def _unwrapped(printed: io.StringIO) -> Iterator[None]:
+    """A block that prints errors to `printed`, in lines so wide that no word is broken."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100000"
+    try:
+        with contextlib.redirect_stderr(printed):
+            yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
 
 
 if __name__ == "__main__":

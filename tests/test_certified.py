@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from whole_problems.claims import contradictions
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
 from lqrsim.results.solution_parts import Certificate, Iteration, Status
-from lqrsim.solvers import certify
+from lqrsim.solvers import budget, certify, engine
 from lqrsim.solvers.certify import faults
 
 GOOD = Certificate(
@@ -171,6 +172,24 @@ class TestLimits:
         assert 1 <= len(late.iterations) <= 2
         assert late.cost <= min(iteration.cost for iteration in late.iterations) * (1 + 1e-12)
         assert contradictions(drive, late) == []
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    @pytest.mark.parametrize("iterations", [1.5, 2.9, 4.2])
+    def test_no_iteration_is_begun_that_would_end_after_the_time_limit(
+        self, drive: ls.Problem, solver: Any, iterations: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """By a clock that only the callback moves, as where an iteration of an MJCF takes seconds: 10 s for each."""
+        now = 0.0
+
+        def tick(iteration: Iteration) -> None:
+            nonlocal now
+            now += 10.0
+
+        for module in (budget, engine):
+            monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now))
+        solution = solver(drive, start=drive.nominal_control, time_limit=10 * iterations, callback=tick)
+        assert solution.status is Status.TIME_LIMIT
+        assert now == 10 * len(solution.iterations) == 10 * int(iterations)
 
     @pytest.mark.parametrize("bad", [0, -1, "1", float("nan"), float("inf")])
     def test_a_time_limit_is_a_number_of_seconds(self, drive: ls.Problem, bad: Any) -> None:

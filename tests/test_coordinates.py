@@ -1,5 +1,7 @@
 """Representatives of angles and rotation vectors, against SciPy's rotations."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,3 +67,34 @@ def test_a_vector_near_enough_is_returned_to_the_bit() -> None:
 def test_what_does_not_fit_is_refused(fields: dict, message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
         ls.types.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})
+
+
+@pytest.mark.parametrize(
+    ("field", "unit", "others"),
+    [
+        ("position", "m", ("cm", "mm", "km", "ft", "M", "m/s", "rad")),
+        ("angles", "rad", ("deg", "degrees", "°", "turn", "mrad", "rad/s", "m")),
+        ("rotation_vectors", "rad", ("deg", "°", "quat", "rad/s")),
+    ],
+)
+def test_what_is_counted_in_metres_or_radians_has_no_other_unit(field: str, unit: str, others: tuple[str, ...]) -> None:
+    """Obstacles are in metres, and a whole turn is 2 pi: another unit would be taken for these without a word."""
+    names = ("x", "y", "z")
+    entries = {"position": (0, 1, 2), "angles": (2,), "rotation_vectors": (0,)}[field]
+    for fitting in (unit, ""):
+        ls.types.Coordinates(names=names, units=(fitting,) * 3, **{field: entries})
+    for other in others:
+        units = (unit, unit, other)
+        with pytest.raises(ls.InputError, match=f"^units: z: got {other!r}, want {unit!r} for a"):
+            ls.types.Coordinates(names=names, units=units, **{field: entries})
+        ls.types.Coordinates(names=names, units=(other,) * 3)  # what is none of them may have any
+
+
+def test_dynamics_in_degrees_are_refused() -> None:
+    def f(x: Any, u: Any, p: Any) -> Any:
+        return [u[0]]
+
+    options: Any = {"controls": {"speed": "deg/s"}, "angles": ("heading",)}
+    with pytest.raises(ls.InputError, match="heading: got 'deg', want 'rad' for an angle, whose whole turns are 2 pi"):
+        ls.Dynamics(f, states={"heading": "deg"}, **options)
+    assert ls.Dynamics(f, states={"heading": "rad"}, **options).state_coordinates.angles == (0,)

@@ -177,6 +177,15 @@ def test_the_robot_hits_obstacles_where_they_are_not_where_the_scene_has_them(ar
 
 
 @pytest.mark.parametrize(
+    "mismatch", [MassMismatch, ThrustMismatch, WheelRadiusMismatch, AxleMismatch, FrictionMismatch]
+)
+def test_a_factor_without_numbers_is_refused(mismatch):
+    for factor in ([], (), np.zeros(0), [[]], np.zeros((0, 3))):
+        with pytest.raises(InputError, match=f"^{mismatch.__name__}: factor: got "):
+            mismatch(factor=factor)
+
+
+@pytest.mark.parametrize(
     ("fixture", "disturbance", "message"),
     [
         ("cage", WheelRadiusMismatch(0.01), "^WheelRadiusMismatch: got robot quadrotor, which has no wheels"),

@@ -275,7 +275,7 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
         assert "the plan MISSES the goal; to mend that" in text
     assert rollout.tally() == "0 of 2 trials reached the goal"
     assert outcomes(rollout).goal == pytest.approx(rollout.goal_distance)
-    near = ls.simulate(cage, short(0.2))
+    near = ls.simulate(cage, short(0.2), goal_radius=0.3)
     assert near.outcome == ("reached",)
     assert "MISSES" not in near.summary()
     # Where no radius is known, a tenth of the way decides, of which a robot that hovers goes nothing.
@@ -284,6 +284,39 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
     assert ls.simulate(cage, short(0.2), goal_radius=0.1).outcome == ("timed out",)
     with pytest.raises(InputError, match=r"^goal_tolerance: got 0\.1, want goal_radius, in metres"):
         ls.simulate(cage, solution, goal_tolerance=0.1)
+
+
+@pytest.mark.parametrize("spatial", [True, False])
+def test_a_start_near_its_goal_has_not_reached_it(cage: Plant, spatial: bool) -> None:
+    """Whatever the way: its start does not count as reached, its last twentieth does; without a way both do."""
+    space = cage.robot.dynamics.state_coordinates
+    space = space if spatial else replace(space, position=(), plane="")
+    rng = np.random.default_rng(36)
+    for way in (*10 ** rng.uniform(-3.5, 1.0, 40), 0.0, 1e-9):
+        across, usual = rng.normal(size=3), 0.3 if spatial else 0.1
+        across *= way / (np.linalg.norm(across) if spatial else np.abs(across).max())
+        goal = np.array([*across, *[np.nan] * 9])
+        plan = np.linspace(0.0, 1.0, 11)[:, None] * np.nan_to_num(goal)
+        target = Target(space, goal, plan)
+        radius = target.radius(0.3, None, None)
+        far = target.distance(plan[0])  # for long ways without a position relative to the plan's range
+        assert radius == usual if way < 1e-6 or far > usual else radius == pytest.approx(far / 10)
+        assert (far > radius) == (way > 1e-6)
+        assert target.distance(0.95 * plan[-1]) <= radius
+        asked = (way + 1, None) if spatial else (None, way + 1)
+        assert target.radius(0.3, *asked) == way + 1
+
+
+def test_a_robot_that_leaves_a_goal_beside_its_start_has_not_reached_it(cage: Plant) -> None:
+    """The plan ends 6 to 28 cm from the goal, which is within the robot's radius, but no nearer than it began."""
+    plan = hover()
+    for by in (0.02, -0.1, -0.2):
+        goal = plan.trajectory.states[0] + np.array([by, *np.zeros(11)])
+        rollout = ls.simulate(cage, replace(plan, goal=goal, goal_radius=None))
+        assert rollout.outcome == ("timed out",)
+        assert rollout.goal_radius == pytest.approx(abs(by) / 10)
+        assert rollout.goal_distance[0] < 0.3
+    assert ls.simulate(cage, hover()).outcome == ("reached",)
 
 
 def test_without_a_goal_it_is_the_end_of_the_plan_and_is_called_so(cage: Plant) -> None:

@@ -635,18 +635,41 @@ def test_a_funnel_that_its_trials_do_not_show_is_refused(tmp_path: Path, drive_s
             ls.load(path)
 
 
-def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(drive_solution: ls.Solution) -> None:
-    many = tuple(dataclasses.replace(drive_solution.candidates[0], start=f"start {i}") for i in range(40))
-    beyond = dataclasses.replace(
-        drive_solution.trajectory, controls=1e3 * np.ones_like(drive_solution.trajectory.controls)
-    )
-    failed = dataclasses.replace(
-        drive_solution, status=ls.Status.DIVERGED, detail="why", candidates=many, trajectory=beyond
-    )
-    for solution in (drive_solution, failed):
-        assert 4 <= len(str(solution).splitlines()) <= 15
-    assert "and 37 more" in str(failed)
-    assert len(failed.iteration_table().splitlines()) == 1 + len(failed.iterations)
+@pytest.mark.parametrize("status", ls.Status)
+def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(
+    drive_solution: ls.Solution, status: ls.Status
+) -> None:
+    """Solutions of every status, with all that a solve may leave: starts, limits, clearance, goal, noise, NaN."""
+    rng: Any = np.random.default_rng(36)
+    plan, one = drive_solution.trajectory, drive_solution.candidates[0]
+    for _ in range(12):
+        ends = [status, *rng.choice([None, *ls.Status], size=rng.integers(0, 40))]
+        starts = tuple(dataclasses.replace(one, start=f"start {i}", status=end) for i, end in enumerate(ends))
+        controls = plan.controls * rng.choice([1.0, 1e3])
+        states = plan.states + (np.nan if not status.success and rng.random() < 0.2 else 0.0)
+        certificate = dataclasses.replace(drive_solution.certificate, violation=rng.choice([0.0, 0.3]))
+        assert drive_solution.clearance is not None
+        drawn = dataclasses.replace(
+            drive_solution,
+            status=status,
+            detail="" if status.success else "why",
+            remedy=status.remedy if rng.random() < 0.5 else "",
+            candidates=starts,
+            trajectory=dataclasses.replace(plan, states=states, controls=controls),
+            certificate=certificate,
+            clearance=drive_solution.clearance - rng.choice([0.0, 1.0]) if rng.random() < 0.7 else None,
+            options=drive_solution.options | rng.choice([{}, {"noise": "of the wheels"}, {"noise": "a", "risk": 0.1}]),
+            goal=rng.choice([0.0, 1.0]) * np.ones(3) if rng.random() < 0.7 else None,
+        )
+        lines = str(drawn).splitlines()
+        assert 2 <= len(lines) <= 15, str(drawn)
+        assert lines[0] == f"{status.name} after 6 iterations of smooth: {status.meaning}"
+        assert [line for line in lines if line.startswith("  remedy:")] == [f"  remedy:    {drawn.remedy}"][
+            : bool(drawn.remedy)
+        ]
+        assert sum("  cost: " in line for line in lines) == 1
+        assert ("violation: 3.0e-01" in str(drawn)) == (certificate.violation > 0)
+        assert len(drawn.iteration_table().splitlines()) == 1 + len(drawn.iterations)
 
 
 def test_files_are_ordinary_zip_archives(saved: Path) -> None:

@@ -1,5 +1,6 @@
 """`--json`: one object on stdout and nothing else there, with the numbers that Python has, to the last bit."""
 
+import io
 import json
 import math
 import subprocess
@@ -130,14 +131,46 @@ def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytes
     assert captured.err == f"lqrsim: error: {found['error']}\n"
 
 
+LONG = "x" * 500  # longer than the lines of a box
+WRONG = {
+    "an option that no command has": ["--no-such-option"],
+    "a value that is no number": ["--seed", "many"],
+    "a choice that is none": ["--solver", "newton"],
+    "an option without its value": ["--out"],
+    "a flag with a value": ["--json=3"],
+    "more arguments than there are": ["a", "b", "c", "d", "e", "f"],
+    "a long word": [f"--{LONG}"],
+    "nothing": [""],
+    "an escape code": ["--\x1b[2J"],
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_option_that_no_command_has_is_an_object_of_each(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--no-such-option", "--json"]) == 2
-    captured = capsys.readouterr()
-    (line,) = captured.out.splitlines()
-    found = json.loads(line)
-    assert (found["format"], found["version"], found["exit_code"]) == (f"lqrsim {command}", 1, 2)
-    assert captured.err == f"lqrsim: error: {found['error']}\n"
+def test_wrong_options_of_every_command_are_one_object(
+    command: str, encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command's own object, on one line, and the same text on stderr, wherever --json stands."""
+    chosen = 4 * list(COMMANDS).index(command) + 2 * (encoding == "ascii")  # two for each: all of them take a minute
+    for what in [list(WRONG)[(chosen + i) % len(WRONG)] for i in range(2)]:
+        for arguments in ([command, *WRONG[what], "--json"], [command, "--json", *WRONG[what]])[chosen // 2 % 2 :][:1]:
+            streams = [io.TextIOWrapper(io.BytesIO(), encoding=encoding) for _ in range(2)]
+            monkeypatch.setattr(sys, "stdout", streams[0])
+            monkeypatch.setattr(sys, "stderr", streams[1])
+            assert main(arguments) == 2, what
+            for stream in streams:
+                stream.flush()
+            out, err = (stream.buffer.getvalue().decode() for stream in streams)  # pyright: ignore[reportAttributeAccessIssue]
+            (line,) = out.splitlines()
+            found = json.loads(line)
+            error = found["error"]
+            assert (found["format"], found["version"], found["exit_code"]) == (f"lqrsim {command}", 1, 2), what
+            assert err == f"lqrsim: error: {error}\n", what
+            assert error.isprintable(), what
+            assert not set("─│╭") & set(error), what
+            assert "----" not in error.replace(LONG, ""), what
+            assert error.count("x" * 50) == error.count(LONG) * (len(LONG) // 50), what  # no word is broken
+            assert error.strip("- "), what
 
 
 def test_in_a_process_of_its_own_stdout_has_nothing_else(tmp_path: Path) -> None:

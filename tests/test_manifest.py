@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from llvmlite.binding import FeatureMap
 
 import lqrsim as ls
 from lqrsim import machine, versions
@@ -237,6 +238,27 @@ def test_the_processor_is_the_one_that_code_is_compiled_for() -> None:
     assert told[""] == machine.processor()
     assert told["generic"] != told[""]
     assert told["generic"].startswith("generic ")
+
+
+@pytest.mark.parametrize(
+    ("host", "told", "features"),
+    [
+        ({"avx2": True, "avx512f": True}, None, "+avx2,+avx512f,-avx512f"),  # of two, LLVM takes the last
+        ({"avx2": True, "avx512f": False}, None, "+avx2,-avx512f"),
+        ({"avx2": True, "avx512f": True}, "+avx2,+avx512f", "+avx2,+avx512f"),  # whoever asks for it has it
+        ({"avx2": True, "avx512f": True}, "", ""),
+    ],
+)
+def test_avx_512_is_left_out_unless_asked_for(
+    host: dict[str, bool], told: str | None, features: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a processor has it, whole calls would take longer with it."""
+    monkeypatch.setattr("llvmlite.binding.get_host_cpu_features", lambda: FeatureMap(host))
+    monkeypatch.delenv("LQRSIM_CPU_NAME", raising=False)
+    monkeypatch.delenv("LQRSIM_CPU_FEATURES", raising=False)
+    if told is not None:
+        monkeypatch.setenv("LQRSIM_CPU_FEATURES", told)
+    assert machine.instruction_set.__wrapped__()[2] == features
 
 
 def test_a_campaign_does_not_go_on_with_another_processor(

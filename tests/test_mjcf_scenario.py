@@ -1,5 +1,6 @@
 """An MJCF by its path, where a scenario's name could stand."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mjcf_files
@@ -49,6 +50,25 @@ def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     (cost,) = scenario.problem.obstacle_costs
     assert cost.world.names == ("post",)  # a box can stand on the floor
     assert not ls.scenarios.mjcf(str(file), start={"z": 1.0}, obstacles=False).problem.obstacle_costs
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02, 0.3])
+def test_a_clearance_is_the_same_in_python_in_a_setting_and_as_an_option(tmp_path: Path, margin: float) -> None:
+    file = tmp_path / "box.xml"
+    post = '<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/></worldbody>'
+    file.write_text(mjcf_files.draw("box", 3, "Euler").xml.replace("</worldbody>", post), encoding="utf-8")
+    robot = ls.MjcfRobot(file)
+    start, goal = robot.at(z=1.0), robot.at(x=3.0, z=1.0)
+    problem = robot.problem(start, goal, steps=5, clearance=margin)
+    by_hand = ls.Clearance(robot.scene.world, geoms=robot.geoms, margin=margin)
+    plain = robot.problem(start, goal, steps=5)
+    assert problem.digest == replace(plain, constraints=[by_hand]).digest != plain.digest
+    setting = f"{file},start={{'z': 1.0}},goal={{'x': 3.0, 'z': 1.0}},steps=5"
+    assert resolve(f"{setting},clearance={margin}").problem.digest == problem.digest
+    main(["solve", setting, "--clearance", str(margin), "--max-iterations", "1", "--out", str(tmp_path)])
+    assert ls.load(tmp_path / "solution.npz", ls.Solution).problem_digest == problem.digest
+    with pytest.raises(InputError, match="clearance: got 'near', want a finite number"):
+        robot.problem(start, goal, clearance="near")  # pyright: ignore[reportArgumentType]
 
 
 def test_numbers_of_the_mjcf_are_by_name(cart: Path) -> None:

@@ -1,7 +1,6 @@
 """What people install works: the built wheel, in an environment that holds it and its dependencies alone."""
 
 import re
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -10,21 +9,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import try_release
+
+from lqrsim import versions
+from lqrsim.cli import main
 
 ROOT = Path(__file__).parent.parent
-
-SOLVE = """
-import sys
-from importlib.metadata import distributions
-import lqrsim as ls
-
-assert not {"pytest", "hatchling"} & {distribution.name for distribution in distributions()}, "not an empty environment"
-assert ls.__file__.startswith(sys.prefix), ls.__file__
-assert set(ls.scenarios.names()) >= {"differential_drive", "quadrotor"}
-solution = ls.smooth(ls.scenarios.differential_drive().problem)
-print(solution)
-assert solution.success
-"""
 
 
 def run(*command: object, cwd: Path) -> str:
@@ -101,28 +91,35 @@ def test_solves_without_optional_packages(tmp_path: Path, monkeypatch: pytest.Mo
     run(sys.executable, "-c", WITHOUT, cwd=tmp_path)
 
 
-def pythons() -> dict[str, str]:
-    """This Python, and others on the path that lqrsim runs on, by their versions."""
-    found = {f"python3.{sys.version_info.minor}": sys.executable}
-    for name in (f"python3.{minor}" for minor in range(11, 20)):
-        works = shutil.which(name) and subprocess.run([name, "-c", "import venv"], capture_output=True).returncode == 0
-        found.setdefault(name, name) if works else None
-    return found
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("python", pythons())
-def test_wheel_solves_from_an_empty_environment(python: str, built: Path, tmp_path: Path) -> None:
-    """Installs for real, with the dependencies that the wheel names and no others: 15 s where pip has them cached."""
+@pytest.mark.parametrize("python", try_release.pythons())
+def test_wheel_works_in_an_empty_environment(python: str, built: Path, tmp_path: Path) -> None:
+    """Installs for real, with the dependencies that the wheel names and no others, and runs without a network."""
     (wheel,) = built.glob("*.whl")
-    run(pythons()[python], "-m", "venv", "--without-pip", tmp_path / "empty", cwd=tmp_path)
-    binaries = tmp_path / "empty" / ("Scripts" if sys.platform == "win32" else "bin")
-    pip = [sys.executable, "-m", "pip", "--python", binaries / "python", "install", "--quiet", "--no-compile"]
-    run(*pip, wheel, cwd=tmp_path)
-    run(binaries / "python", "-I", "-c", SOLVE, cwd=tmp_path)
-    run(binaries / "lqrsim", "reproduce", "--quick", "figure_3", cwd=tmp_path)
-    assert (tmp_path / "runs" / "paper" / "figures" / "figure_3.pdf").stat().st_size > 0
-    assert run(binaries / "lqrsim", "--version", cwd=tmp_path).split() == ["lqrsim", wheel.name.split("-")[1]]
+    programs = try_release.installed(try_release.pythons()[python], wheel, tmp_path / "empty")
+    try_release.works(programs, wheel.name.split("-")[1], tmp_path, quick=True)
+
+
+@pytest.mark.parametrize("name", ["numpy", "mujoco", "scipy", "llvmlite", "tyro"])
+def test_a_package_that_is_too_old_is_named(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where another package has brought it: by every command, and at import; a newer one is not."""
+    needs = dict(re.findall(r'"([\w.-]+)>=([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8")))
+    found = versions.versions_of(*needs)
+    least = [int(part) for part in needs[name].split(".")]
+    older = [f"{least[0] - 1}.99.4", ".".join(map(str, [*least[:-1], least[-1] - 1])), "0.0.dev3"]
+    newer = [needs[name], f"{needs[name]}.0rc1", f"{least[0]}.{least[1] + 10}", f"{least[0] + 1}"]
+    for version in [one for one in older if "-1" not in one] + newer:
+        monkeypatch.setattr(
+            versions, "versions_of", lambda *names, one=version: {n: one if n == name else found[n] for n in names}
+        )
+        versions.outdated.cache_clear()
+        line = f"got {name} {version}, want newer: pip install '{name}>={needs[name]}'"
+        assert versions.outdated() == ("" if version in newer else line)
+        assert main(["list"]) == (0 if version in newer else 2)
+        assert capsys.readouterr().err == ("" if version in newer else f"lqrsim: error: {line}\n")
+    versions.outdated.cache_clear()
 
 
 def test_citation_is_of_this_version_and_has_the_fields_of_its_format() -> None:

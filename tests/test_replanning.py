@@ -388,7 +388,8 @@ class TestLive:
             planner.step(np.zeros(4), 0.0)
         with planner:
             refused: list[tuple[tuple[Any, Any], str]] = [
-                ((np.zeros(3), 0.0), "state: got shape"), ((np.full(4, np.nan), 0.0), "state: got"),
+                ((np.zeros(3), 0.0), "state: got shape"), ((np.zeros((2, 4)), 0.0), "state: got shape"),
+                ((np.full(4, np.nan), 0.0), "state: got"),
                 ((np.zeros(4), -1.0), "t: got -1"), ((np.zeros(4), "now"), "t: got 'now'"),
             ]  # fmt: skip
             for wrong, line in refused:

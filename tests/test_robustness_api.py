@@ -417,6 +417,9 @@ class Biting:
         (lambda: ls.stress.FunnelCheck(0, DEEP, rate(1, 2), np.ones(2, dtype=bool)), "FunnelCheck: level: got "),
         (lambda: ls.stress.ComparedPlan("", DEEP, np.ones(2, dtype=bool)), "ComparedPlan: solution: got "),
         (lambda: ls.types.ReplanRecord(**RECORD | {"reason": DEEP}), "ReplanRecord: reason: got "),
+        (lambda: lq.disturbances.Effect(factors=["mass"]), "Effect: factors: got ['mass'], want factors by name"),
+        (lambda: lq.disturbances.Effect(factors=3), "Effect: factors: got 3, want factors by name"),
+        (lambda: lq.disturbances.Effect(factors={"mas": 1}), "Effect: factors: got 'mas', want one of: mass"),
     ],
 )
 def test_what_hostile_calls_once_found(call: Callable[[], object], says: str) -> None:

@@ -1,6 +1,10 @@
 """smooth() and ilqr() on the two systems: numbers known from elsewhere, costs recomputed here, honest endings."""
 
 import dataclasses
+import re
+import threading
+import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from lqrsim.codegen import compiled_module
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.packaged import quadrotor_queries
+from lqrsim.solvers import budget
 
 PILLARS = [
     (0, -1.35), (1, -0.5), (-0.95, -0.5), (-0.2, 0.3), (0.8, 0.7), (1.1, 2.0), (-1.2, 0.8), (-1.1, 2.1), (-0.1, 1.6),
@@ -309,6 +314,79 @@ class TestMany:
             assert "scalar_rate(x, u, p): got inf as entry 0 (x) at the start" in lost.detail
         with pytest.raises(ls.InputError, match=r"^problem: got None, want a Problem"):
             ls.smooth(None)  # pyright: ignore[reportArgumentType]
+
+
+class TestProgress:
+    """Whoever hears nothing for long is told how far a solve is; here after a millisecond, not after two seconds."""
+
+    @pytest.fixture
+    def slow(self, monkeypatch: pytest.MonkeyPatch) -> ls.Problem:
+        """Some 300 calls of Python an iteration, of a hundredth of a millisecond each at least."""
+        monkeypatch.setattr(budget, "SILENT", 1e-3)
+        monkeypatch.setattr(budget, "SELDOM", 0.05)
+
+        def rate(x: Any, u: Any, p: Any) -> list[Any]:
+            time.sleep(1e-5)
+            return [x[1], u[0] - np.sin(x[0])]
+
+        dynamics = ls.Dynamics(
+            rate, states={"angle": "rad", "rate": "rad/s"}, controls={"torque": "N m"}, level="plain", angles=("angle",)
+        )
+        return ls.Problem(
+            dynamics=dynamics, dt=0.1, steps=10, initial=ls.FixedState(np.zeros(2)), stage_cost=ls.ControlCost([0.01]),
+            final_cost=ls.QuadraticCost([100.0, 100.0], about=[3.0, 0.0]),
+        )  # fmt: skip
+
+    @pytest.mark.parametrize(("solver", "name"), [(ls.smooth, "smooth"), (ls.ilqr, "ilqr")])
+    def test_it_says_what_has_been_found(
+        self, slow: ls.Problem, solver: Any, name: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        solution = solver(slow)
+        told = 0
+        for record in caplog.records:
+            line = re.fullmatch(rf"{name}: \d+ s, (.*)", record.getMessage())
+            assert line
+            if line[1] != "in the first iteration":
+                said = re.fullmatch(r"iteration (\d+): ([a-z]+), cost ([^,]+)", line[1])
+                assert said, line
+                iteration = solution.iterations[int(said[1]) - 1]
+                assert (iteration.method, f"{iteration.cost:.4g}") == (said[2], said[3])
+                told += 1
+        assert told > 0
+
+    def test_it_says_what_is_left_of_the_time(self, slow: ls.Problem, caplog: pytest.LogCaptureFixture) -> None:
+        ls.smooth(slow, time_limit=5000.2)
+        assert re.fullmatch(
+            r"smooth: \d+ s, in the first iteration; at most 5000 s left", caplog.records[0].getMessage()
+        )
+
+    def test_whoever_hears_of_iterations_is_not_told(
+        self, slow: ls.Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(budget, "SILENT", 1e3)
+        ls.smooth(slow, callback=lambda iteration: None)
+        monkeypatch.setattr(budget, "SILENT", 1e-3)
+        stop = budget.Stop(told=np.inf)
+        with stop.reporting("smooth", attentive=True):
+            time.sleep(0.02)
+        assert not caplog.records
+        ls.smooth_many([slow], progress=lambda done, of: None)
+        assert not caplog.records
+        solved = ls.smooth_many([slow] * 2, threads=1)
+        lines = [record.getMessage() for record in caplog.records]
+        assert {re.sub(r"\d+ s", "0 s", line) for line in lines} <= {
+            f"solving: 0 s, {k} of 2 problems done" for k in range(3)
+        }
+        assert len(lines) > 0
+        assert all(one.success for one in solved)
+
+    def test_no_thread_is_left(self, slow: ls.Problem) -> None:
+        def stop(iteration: ls.types.Iteration) -> None:
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            ls.smooth(slow, callback=stop)
+        assert not [thread for thread in threading.enumerate() if thread.name == "progress"]
 
 
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:

@@ -112,6 +112,19 @@ def test_only_its_own_pages_are_let_in(served: int) -> None:
         connect(f"{address}/state", origin=Origin(f"http://localhost:{served}"))
 
 
+def test_a_page_that_sends_junk_takes_no_place(served: int) -> None:
+    """Text and bytes that are no message, a thousand of each kind of connection: the next pages get the run."""
+    rng, ours = np.random.default_rng(36), Origin(f"http://127.0.0.1:{served}")
+    for path in ("ui", "state"):
+        with connect(f"ws://127.0.0.1:{served}/{path}", origin=ours, max_size=None) as connection:
+            for size in rng.integers(1, 300, 500).tolist():
+                connection.send(rng.bytes(size))
+                connection.send("junk" * size)
+    for _ in range(4):
+        with connect(f"ws://127.0.0.1:{served}/state", origin=ours, max_size=None) as connection:
+            assert ";role=spectator;" in str(connection.recv(timeout=600))
+
+
 def test_only_by_its_own_name_does_it_answer(served: int) -> None:
     """A site whose name is made to point to this machine would have pages of the same origin."""
     ours, other = f"localhost:{served}", f"example.org:{served}"

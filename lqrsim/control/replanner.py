@@ -16,13 +16,13 @@ from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveR
 from lqrsim.errors import (
     Array,
     InputError,
+    check_array,
     check_count,
     check_flag,
     check_function,
     check_kind,
     check_number,
     excerpt,
-    vectors_of,
 )
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
@@ -139,7 +139,7 @@ class LiveReplanner:
                 "LiveReplanner: got a step without its thread, want it within `with replanner.live() as live:`"
             )
         t = check_number("t", t, at_least=0.0)
-        state = vectors_of("state", state, len(self.active.plan.policy.state_coordinates))
+        state = check_array("state", state, (len(self.active.plan.policy.state_coordinates),))
         dt = self.problem.dt
         step = int(t / dt + 1e-9)
         self._take(step)

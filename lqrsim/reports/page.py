@@ -273,7 +273,7 @@ def _reach(results: Results, scenario: Scenario) -> str:
     """The distance, as text, within which a trial has reached its goal."""
     target = next(iter(results.trials.solutions.values())).target
     campaign = results.campaign
-    radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
+    radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance, target=target)
     return f"{radius:g} {target.unit} of the {target.name}"
 
 

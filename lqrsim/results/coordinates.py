@@ -32,6 +32,11 @@ PerEntry = npt.ArrayLike | Mapping[str, float]
 Limits = tuple[npt.ArrayLike, npt.ArrayLike] | Mapping[str, tuple[float, float]]
 
 _FROM_ABOVE = ("xy", "yx")
+_UNITS = {  # what distances to obstacles and whole turns are counted in
+    "position": ("m", "for a position"),
+    "angles": ("rad", "for an angle, whose whole turns are 2 pi"),
+    "rotation_vectors": ("rad", "for a rotation vector"),
+}
 _UPWARD = ("height", "altitude", "elevation", "vertical")  # such a name does not fit a plane seen from above
 
 
@@ -41,7 +46,7 @@ class Coordinates:
 
     Attributes:
       names: names of the entries.
-      units: units of the entries; "" for none.
+      units: units of the entries; "" for none. A position is in m, angles and rotation vectors in rad.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
         without a position, and two of x, y and z for a planar one. By default it follows from names that end in these
@@ -93,6 +98,11 @@ class Coordinates:
             width = 3 if field == "rotation_vectors" else 1
             if any(not 0 <= index <= size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
+            unit, why = _UNITS[field]
+            for entry in (first + i for first in indices for i in range(width)):
+                if self.units[entry] not in ("", unit):
+                    name = self.names[entry]
+                    raise InputError(f"units: {name}: got {excerpt(self.units[entry])}, want {unit!r} {why}")
         plane = self._plane()
         if len(plane) != 2 and self.offset is not None:
             raise InputError(

@@ -14,6 +14,7 @@ from lqrsim.results.coordinates import Coordinates
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 TOLERANCE = 0.1  # of the scaled error, by default
+STAYS = 1e-3  # of a radius: what begins closer to its goal stays there
 OF_RANGE = "of the plan's range"
 
 
@@ -98,9 +99,9 @@ class Target:
         """The distance within which the target counts as reached.
 
         Args:
-          robot_radius: in metres, the default where distances are in metres.
+          robot_radius: in metres, the default where distances are in metres; see `on_the_way`.
           goal_radius: in metres.
-          goal_tolerance: bound of the scaled error, TOLERANCE by default.
+          goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
 
         Raises:
           InputError: one of them is out of range, or is not in the unit of this target.
@@ -111,14 +112,26 @@ class Target:
                     f"goal_tolerance: got {excerpt(goal_tolerance)}, want goal_radius, in metres: the {self.name}"
                     " has a position"
                 )
-            return check_number("goal_radius", robot_radius if goal_radius is None else goal_radius, above=0.0)
+            if goal_radius is not None:
+                return check_number("goal_radius", goal_radius, above=0.0)
+            return self.on_the_way(check_number("goal_radius", robot_radius, above=0.0))
         if goal_radius is not None:
             names = ", ".join(self.space.names)
             raise InputError(
                 f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, relative to the plan's range: the"
                 f" {self.name} has no position among {names}"
             )
-        return check_number("goal_tolerance", TOLERANCE if goal_tolerance is None else goal_tolerance, above=0.0)
+        if goal_tolerance is not None:
+            return check_number("goal_tolerance", goal_tolerance, above=0.0)
+        return self.on_the_way(TOLERANCE)
+
+    def on_the_way(self, radius: float) -> float:
+        """A radius; where the plan starts within it, a tenth of the way, so that the start has not reached the target.
+
+        A plan that starts at its target, within a thousandth of the radius, has no way, and keeps the radius.
+        """
+        way = float(self.distance(self.plan[0]))
+        return TOLERANCE * way if STAYS * radius < way <= radius else radius
 
     def describe(self, distance: float) -> str:
         """A distance as text: "0.1 m from the goal"."""

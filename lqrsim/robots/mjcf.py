@@ -20,6 +20,7 @@ from lqrsim.errors import (
     excerpt,
     vectors_of,
 )
+from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
@@ -268,6 +269,7 @@ class MjcfRobot(Robot):
         effort: npt.ArrayLike | None = None,
         damping: float = 1e-3,
         limits: float = 100.0,
+        clearance: float | None = None,
     ) -> Problem:
         """Make a problem: from one state to another, within the actuators' limits, clear of obstacles at a cost.
 
@@ -287,6 +289,8 @@ class MjcfRobot(Robot):
           damping: weight of the velocities of hinges, slides and ball joints at each step.
           limits: weight of what a joint is closer to its limits, at each step, than 0.1 rad or m, 5 % of its range, or
             start and goal are.
+          clearance: constrains the distance to all obstacles to at least this, in metres, as `lqrsim solve --clearance`
+            does; by default obstacles only add cost.
 
         Returns:
           The Problem.
@@ -314,6 +318,9 @@ class MjcfRobot(Robot):
         bounds = self._bounds(start, goal)
         if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
+        kept = []
+        if clearance is not None:
+            kept = [Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance))]
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
@@ -321,6 +328,7 @@ class MjcfRobot(Robot):
             steps=steps, initial=FixedState(start), stage_cost=cost,
             final_cost=QuadraticCost(check_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
+            constraints=kept,
         )  # fmt: skip
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:

@@ -24,6 +24,7 @@ def mjcf(
     body: str | None = None,
     floors: bool = True,
     obstacles: bool | Sequence[str] = True,
+    clearance: float | None = None,
     parameters: Mapping[str, float] | None = None,
 ) -> Scenario:
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
@@ -42,6 +43,7 @@ def mjcf(
       body: as in `MjcfRobot`.
       floors: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
+      clearance: in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Raises:
@@ -57,6 +59,7 @@ def mjcf(
         _state(robot, "start", start), _state(robot, "goal", goal), steps=steps, dt=dt,
         weights=per_entry("weights", weights, space),
         effort=None if effort is None else per_entry("effort", effort, controls, above=0.0),
+        clearance=clearance,
     )  # fmt: skip
     return Scenario(
         name=Path(path).stem, summary=f"{robot.name}, with the dynamics of MuJoCo", robot=robot, scene=robot.scene,

@@ -36,7 +36,8 @@ class Scenario:
       disturbances: those of the demo: clearly visible, but within the reach of the policy.
       start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several are tried.
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
-      goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius.
+      goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius, or
+        a tenth of the way if the start is within it.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
       simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
     """
@@ -65,18 +66,23 @@ class Scenario:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
         return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
 
-    def target_radius(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
+    def target_radius(
+        self, goal_radius: float | None = None, goal_tolerance: float | None = None, *, target: Target | None = None
+    ) -> float:
         """The distance from the goal within which it counts as reached, in `Target.unit`.
 
         Args:
           goal_radius: in metres, or None.
           goal_tolerance: a scaled error, or None.
+          target: of a plan; without one, the plan starts where the problem does.
 
         Raises:
           InputError: as `simulate` does.
         """
-        dynamics, goal = self.problem.dynamics, self.problem.weighed_goal
-        target = Target(dynamics.state_coordinates, goal, np.zeros((1, len(dynamics.state_coordinates))))
+        if target is None:
+            space, start = self.problem.dynamics.state_coordinates, self.problem.start
+            plan = np.zeros((1, len(space))) if start is None else start[None]
+            target = Target(space, self.problem.weighed_goal, plan)
         return target.radius(self.robot.radius, **self.near_enough(goal_radius, goal_tolerance))
 
     def __post_init__(self) -> None:

@@ -39,7 +39,7 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
         start = start(problem) if is_function(start) else start
         start = start.controls if isinstance(start, InitialPrior) else start
     solution = SOLVERS[solver](problem, start=start, **options)
-    return replace(solution, goal_radius=scenario.target_radius())
+    return replace(solution, goal_radius=scenario.target_radius(target=solution.target))
 
 
 def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution | AffinePolicy | Trajectory:
@@ -106,7 +106,7 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
         raise InputError(
             f"solution: got {what}, whose plan is not finite ({found.status.name}), want one that can be run"
         )
-    return replace(found, goal_radius=scenario.target_radius())
+    return replace(found, goal_radius=scenario.target_radius(target=found.target))
 
 
 def remarks(scenario: Scenario, solution: Solution) -> list[str]:

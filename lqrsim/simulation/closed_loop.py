@@ -67,7 +67,8 @@ def simulate(
       seed: seed of all random numbers.
       trials: number of trials.
       first_trial: number of the first one; trial `i` of a seed is bit-identical, independent of the trials beside it.
-      goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius.
+      goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or
+        a tenth of the way if the plan starts within it.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` has the details.
       frames: whether to record the data for drawing, also between the control periods; without it there is no video.

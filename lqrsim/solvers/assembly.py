@@ -12,6 +12,7 @@ from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_spheres import clearances
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
@@ -68,7 +69,7 @@ def assemble(
         candidates=candidates,
         versions=versions(),
         goal=problem.weighed_goal,
-        goal_radius=goal_radius_of(problem),
+        goal_radius=goal_radius_of(problem, states),
     )
 
 
@@ -119,15 +120,19 @@ def _copied(value: Any) -> Any:
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
-def goal_radius_of(problem: Problem) -> float | None:
-    """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position."""
+def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
+    """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position.
+
+    With a plan (T+1, n) that starts within it, a tenth of the way.
+    """
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    return (
-        max((one.radius for one in _kept_clear(problem) if one.balls is None and one.geoms is None), default=0.0)
-        or None
-    )
+    shapes = [one for one in _kept_clear(problem) if one.balls is None and one.geoms is None]
+    radius = max((one.radius for one in shapes), default=0.0)
+    if plan is not None and radius:
+        radius = Target(problem.dynamics.state_coordinates, goal, plan).on_the_way(radius)
+    return radius or None
 
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:

@@ -1,6 +1,8 @@
 """The budget of a solve: time, iterations, and how it learns that the caller wants it to end."""
 
 import contextlib
+import logging
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +13,10 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
 
 Callback = Callable[[Iteration], object]
+
+_log = logging.getLogger("lqrsim")
+SILENT = 2.0  # s without a word, after which a solve says how far it is, and then less and less often
+SELDOM = 60.0  # s
 
 
 @dataclass
@@ -23,8 +29,14 @@ class Stop:
 
     deadline: float = np.inf
     error: BaseException | None = None
-    # How long the next iteration may take, in s: one that would end after the deadline is not begun.
+    # How long the next iteration may take, in s: one that would end after the deadline is not begun. By default as long
+    # as the last one took.
     reserve: float = 0.0
+    pace: float = 0.0
+    # Of all runs: number of iterations, the last one, and when the caller last heard of one.
+    iterations: int = 0
+    last: Iteration | None = None
+    told: float = -np.inf
 
     def begin(self, seconds: float | None) -> None:
         """Set a deadline this many seconds from now; None for no deadline."""
@@ -32,7 +44,28 @@ class Stop:
 
     @property
     def due(self) -> bool:
-        return self.error is not None or time.perf_counter() + self.reserve >= self.deadline
+        return self.error is not None or time.perf_counter() + (self.reserve or self.pace) >= self.deadline
+
+    @property
+    def found(self) -> str:
+        """How far the solve is, as text: what has been found so far, and what is left."""
+        left = (
+            "" if self.deadline == np.inf else f"; at most {max(self.deadline - time.perf_counter(), 0.0):.0f} s left"
+        )
+        last = self.last
+        if last is None:
+            return f"in the first iteration{left}"
+        parts = [f"iteration {self.iterations}: {last.method}"]
+        parts += [
+            f"{name} {value:.4g}" for name, value in (("cost", last.cost), ("violation", last.violation)) if value
+        ]
+        return ", ".join(part for part in parts if not part.endswith(" nan")) + left
+
+    def reporting(self, what: str, attentive: bool) -> contextlib.AbstractContextManager[None]:
+        """A block that says how far the solve is where the caller hears nothing for long, unless many are solved."""
+        if not attentive:
+            return contextlib.nullcontext()
+        return reported(what, lambda: self.found, lambda: self.told)
 
     def finish(self, solution: Solution) -> Solution:
         """Return the solution; or raise what ended the solve, with the solution attached."""
@@ -83,6 +116,7 @@ class Budget:
     def record(self, iteration: Iteration) -> None:
         """Add an iteration to the log, and tell the callback."""
         self.log.append(iteration)
+        self.stop.iterations, self.stop.last = self.stop.iterations + 1, iteration
         self._tell((iteration,))
 
     def report_to(self, callback: Callback | None) -> None:
@@ -93,6 +127,7 @@ class Budget:
     def _tell(self, iterations: Iterable[Iteration]) -> None:
         if self._callback is None:
             return
+        self.stop.told = time.perf_counter()
         try:
             for iteration in iterations:
                 self._callback(iteration)
@@ -139,3 +174,30 @@ class Budget:
                 self.log[begin - 1 :] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
             else:
                 self._tell(self.log[begin:])
+
+
+@contextlib.contextmanager
+def reported(what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf) -> Iterator[None]:
+    """A block that says how far it is, once it has been silent for two seconds: as a warning of the log `lqrsim`.
+
+    Args:
+      what: what is going on: "smooth".
+      found: what has been found so far, and what is left, as text.
+      told: when the caller last heard of it otherwise, on the clock of `time.perf_counter`.
+    """
+    ended, begun = threading.Event(), time.perf_counter()
+
+    def watch() -> None:
+        wait = SILENT
+        while not ended.wait(wait):
+            if (now := time.perf_counter()) - told() >= SILENT:
+                _log.warning("%s: %.0f s, %s", what, now - begun, found())
+                wait = min(2 * wait, SELDOM)
+
+    watcher = threading.Thread(target=watch, name="progress", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()

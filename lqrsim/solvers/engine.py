@@ -178,6 +178,7 @@ def iterate(
             budget.record(
                 Iteration(cost, improvement, gap, optimality, residual, found, seconds, _METHODS[int(method)])
             )
+        stop.pace = time.perf_counter() - clock
         if stop.error is not None:
             outcome = declarations.TIMED_OUT
     return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))

@@ -163,10 +163,11 @@ def _solve(
     loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, rows)
     budget = Budget(most, callback=callback, attentive=attentive)
     budget.stop.begin(settings.time_limit)
-    ending = iterate(
-        problem, lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, rows), rows,
-        first=0, last=most, budget=budget,
-    )  # fmt: skip
+    with budget.stop.reporting("ilqr", attentive):
+        ending = iterate(
+            problem, lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, rows), rows,
+            first=0, last=most, budget=budget,
+        )  # fmt: skip
     done = len(budget.log)
     ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
     whole = done > 0 and ending.failed < 0

@@ -15,6 +15,7 @@ from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import reported
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.settings import Settings
 
@@ -45,9 +46,15 @@ def solve_all(
     functions = [function for problem in problems for function in functions_of(problem)]
     with workers(threads, functions) as pool:
         futures = [pool.submit(solve, problem, settings) for problem in problems]
-        for done, _ in enumerate(as_completed(futures), start=1):
-            if progress is not None:
-                progress(done, len(futures))
+        done, silent = 0, progress is None
+        with (
+            reported("solving", lambda: f"{done} of {len(futures)} problems done")
+            if silent
+            else contextlib.nullcontext()
+        ):
+            for done, _ in enumerate(as_completed(futures), start=1):
+                if progress is not None:
+                    progress(done, len(futures))
         return [future.result() for future in futures]
 
 

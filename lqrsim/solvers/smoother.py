@@ -72,7 +72,7 @@ def smooth(
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
         has as many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
-        comes first, does not count. It is checked between iterations.
+        comes first, does not count. An iteration that would end later, if it took as long as the last, is not begun.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and

@@ -81,19 +81,20 @@ def solve(
     ]
     stop.begin(settings.time_limit)  # compiling, which comes before, does not count
     search = Search([name for name, _ in given], runs, callback, threads)
-    with problem.dynamics.solving(threads if len(runs) == 1 else 1):
-        search.run()
-        default = settings.start is None and settings.starts is None
-        # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-        poor = search.says_infeasible or (default and search.is_unacceptable)
-        if settings.safeguard and not stop.due and poor:
-            search.widen()
-        if settings.start is None and search.best[0].second_order and not stop.due:
-            search.look_aside()
-        if problem.risk > 0 and settings.safeguard and not stop.due:
-            search.retry_without_risk()
-    if default and settings.safeguard and not stop.due and not search.best[1].success:
-        search.soften()
+    with stop.reporting("smooth", attentive):
+        with problem.dynamics.solving(threads if len(runs) == 1 else 1):
+            search.run()
+            default = settings.start is None and settings.starts is None
+            # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
+            poor = search.says_infeasible or (default and search.is_unacceptable)
+            if settings.safeguard and not stop.due and poor:
+                search.widen()
+            if settings.start is None and search.best[0].second_order and not stop.due:
+                search.look_aside()
+            if problem.risk > 0 and settings.safeguard and not stop.due:
+                search.retry_without_risk()
+        if default and settings.safeguard and not stop.due and not search.best[1].success:
+            search.soften()
     chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -390,10 +391,11 @@ def _solve_for_duration(
         first = begin if first is None else first
         if attempt and not begin.success:
             break
-        near = find_duration(
-            problem, begin.trajectory, tolerance=settings.final(problem),
-            violation=settings.violation_tolerance(problem), most=settings.max_iterations, watch=watch,
-        )  # fmt: skip
+        with budget.stop.reporting("smooth", attentive):
+            near = find_duration(
+                problem, begin.trajectory, tolerance=settings.final(problem),
+                violation=settings.violation_tolerance(problem), most=settings.max_iterations, watch=watch,
+            )  # fmt: skip
         cheaper = best is None or near[1].measures.cost < best[1].measures.cost
         if budget.stop.due or not near[1].solved or not cheaper:
             break

@@ -144,8 +144,9 @@ class ReliabilityProblem:
             f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}: {words}",
             f"a trial draws {score.size:,} numbers; failure: {self.failure}",
         ]
-        radius = self.resolved.target_radius(self.goal_radius, self.goal_tolerance)
-        return "\n".join(lines + score.solution.target.of_plan(radius))
+        target = score.solution.target
+        radius = self.resolved.target_radius(self.goal_radius, self.goal_tolerance, target=target)
+        return "\n".join(lines + target.of_plan(radius))
 
     def rare_failures(
         self,

@@ -21,6 +21,7 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_function,
+    check_kind,
     check_name,
     check_number,
     excerpt,
@@ -79,6 +80,7 @@ class Effect:
         wanted = "a function of the step, states and controls, or None"
         check_function("Effect: kick", self.kick, wanted, arguments=3)
         if self.factors is not None:
+            check_kind("Effect: factors", self.factors, Mapping, "factors by name: {'mass': factors}")
             factors = {check_name("Effect: factors", name, PARAMETERS): one for name, one in dict(self.factors).items()}
             for name, one in factors.items():
                 factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
