@@ -21,7 +21,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from peers.common import Unavailable
-from runner import Result, Settings, at_most, between, interval, judge, opening, progress, run, table
+from runner import FolderSettings, Result, at_most, between, interval, judge, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.control.controllers import OutputFeedback, as_controller
@@ -147,10 +147,10 @@ Section = Literal["campaign", "board"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     sections: tuple[Section, ...] = ("campaign", "board")
     """Which of them."""
-    trials: int = 400
+    trials: int = 200
     """Of each law under each set of disturbances."""
     seed: int = 0
     """Of all trials."""

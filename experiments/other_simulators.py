@@ -1,8 +1,8 @@
 """Plans from our model, run in simulators that we did not write: RotorPy's Hummingbird, crazyflow's Crazyflie.
 
     pip install 'lqrsim[rotorpy,crazyflow]'
-    SCIPY_ARRAY_API=1 python experiments/other_simulators.py            # some forty minutes
-    python experiments/other_simulators.py --simulators rotorpy         # crazyflow alone needs SCIPY_ARRAY_API
+    python experiments/other_simulators.py                         # some forty minutes
+    python experiments/other_simulators.py --simulators rotorpy    # one of them
     python experiments/other_simulators.py --quick
 
 The model is `Quadrotor` with the vehicle's numbers. What it does not have, such as the lag of the rotors, shows in a
@@ -10,9 +10,13 @@ recorded run: the numbers that explain it best are fitted, and the plan and its 
 the queries of Fig. 3, in the cage, undisturbed and under the presets.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
+
+if __name__ == "__main__":  # before SciPy looks: crazyflow asks for it
+    os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 import numpy as np
 from runner import FolderSettings, Result, at_most, between, interval, judge, opening, progress, run, table
