@@ -321,8 +321,8 @@ def main(config: Config) -> Result:
 def report(result: Result) -> str:
     lines = [
         "## AdaptiveQuadBench",
-        "The benchmark of arXiv 2510.03471, rebuilt on RotorPy's wheel; `experiments/adaptive_quad_bench.py` says where"
-        " it differs.",
+        "The benchmark of arXiv 2510.03471, rebuilt on RotorPy's wheel, with the extra `rotorpy`;"
+        " `experiments/adaptive_quad_bench.py` says where it differs.",
     ]
     if "skipped" in result:
         return "\n\n".join([*lines, f"skipped: {result['skipped']}"])

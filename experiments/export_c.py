@@ -332,7 +332,10 @@ def main(config: Config) -> Result:
 
 
 def report(result: Result) -> str:
-    parts = []
+    parts = [
+        "## Policies as C",
+        "What `lqrsim export` writes, by this machine's C compiler, and by `arm-none-eabi-gcc` in `qemu-system-arm`.",
+    ]
     if "campaign" in result:
         rows, exact, inside = [], [], []
         for row in result["campaign"]:

@@ -192,7 +192,8 @@ def main(config: Config) -> Result:
 def report(result: Result) -> str:
     lines = [
         "## Other simulators",
-        "Plans and laws from `Quadrotor` with a vehicle's numbers, run in the simulator that the vehicle is from.",
+        "Plans and laws from `Quadrotor` with a vehicle's numbers, run in the simulator that the vehicle is from."
+        " It needs the extras `rotorpy` and `crazyflow`.",
     ]
     config = result["config"]
     for name in config["simulators"]:

@@ -1,4 +1,4 @@
-/* @title@
+/* @what@ in C99: @m@ controls from @Y@ measured numbers.
  *
  * Written by lqrsim @version@ from a file whose content has the SHA-256 that is below as MY_POLICY_SHA256.
  * @rounding@
