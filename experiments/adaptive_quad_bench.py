@@ -2,7 +2,7 @@
 
     pip install 'lqrsim[rotorpy]'
     python experiments/adaptive_quad_bench.py                        # some forty minutes
-    python experiments/adaptive_quad_bench.py --sections ranges      # some of it
+    python experiments/adaptive_quad_bench.py --sections when2fail --kinds wind torque    # some of it
     python experiments/adaptive_quad_bench.py --quick
 
 Vehicle, references and ranges are those that the authors published. A reference is the polynomial of least jerk from
@@ -81,6 +81,8 @@ EVERY = 0.5  # s, between re-plans
 class Config(FolderSettings):
     sections: tuple[Part, ...] = get_args(Part)
     """Which of them."""
+    kinds: tuple[Kind, ...] = get_args(Kind)
+    """Disturbances of the first two."""
     trials: int = 10
     """Of each disturbance, each with a reference of its own."""
     failing: int = 5
@@ -274,14 +276,14 @@ def ranges(config: Config) -> list[dict[str, Any]]:
     kinds |= {kind: Bench(kind, 0.0, most) for kind, most in RANGES.items()}
     return [
         cell(law, bench, config.trials, config.seed) | {"kind": kind}
-        for kind, bench in progress([*kinds.items()], "ranges")
+        for kind, bench in progress([one for one in kinds.items() if one[0] in config.kinds], "ranges")
         for law in LAWS
     ]
 
 
 def when2fail(config: Config) -> list[dict[str, Any]]:
     found = []
-    for kind, strengths in progress([*STEPS.items()], "when2fail"):
+    for kind, strengths in progress([one for one in STEPS.items() if one[0] in config.kinds], "when2fail"):
         flying = list(LAWS)
         for strength in strengths[:1] if config.quick else strengths:
             for law in list(flying):

@@ -150,7 +150,7 @@ Section = Literal["campaign", "board"]
 class Config(FolderSettings):
     sections: tuple[Section, ...] = ("campaign", "board")
     """Which of them."""
-    trials: int = 200
+    trials: int = 400
     """Of each law under each set of disturbances."""
     seed: int = 0
     """Of all trials."""

@@ -132,6 +132,24 @@ def laws(
         yield numbers, "`OffsetFree` on a safe plan", safe.solution, made.__getitem__
 
 
+def of_query(
+    plant: ls.Plant, robots: dict[str, ls.Quadrotor], lag: float, query: int, dt: float, config: Config
+) -> list[tuple[str, str, str, list[bool], list[float]]]:
+    """Numbers of the model, law, preset, whether each trial reaches the goal, and its largest error in m."""
+    found = []
+    for model, law, plan, controller_for in laws(plant, robots, lag, query, dt):
+        for preset in PRESETS:
+            disturbed = preset != "undisturbed"
+            flown = ls.simulate(
+                plant, plan, controller=controller_for(preset), seed=config.seed, frames=False,
+                disturbances=ls.disturbances.preset(preset, plant) if disturbed else (),
+                trials=config.trials if disturbed else 1, first_trial=query * config.trials if disturbed else 0,
+            )  # fmt: skip
+            counted = ls.stress.outcomes(flown)
+            found.append((model, law, preset, (counted.outcome == "reached").tolist(), counted.worst.tolist()))
+    return found
+
+
 def of_simulator(name: Name, config: Config) -> dict[str, Any]:
     make, dt = SIMULATORS[name]
     simulator: Simulator = make()
@@ -148,17 +166,9 @@ def of_simulator(name: Name, config: Config) -> dict[str, Any]:
     rows: dict[tuple[str, str], dict[str, list[bool]]] = {}
     worst: dict[tuple[str, str], dict[str, list[float]]] = {}
     for query in progress(range(config.queries), name):
-        for model, law, plan, controller_for in laws(plant, robots, numbers["lag"][1], query, dt):
-            for preset in PRESETS:
-                disturbed = preset != "undisturbed"
-                flown = ls.simulate(
-                    plant, plan, controller=controller_for(preset), seed=config.seed, frames=False,
-                    disturbances=ls.disturbances.preset(preset, plant) if disturbed else (),
-                    trials=config.trials if disturbed else 1, first_trial=query * config.trials if disturbed else 0,
-                )  # fmt: skip
-                counted = ls.stress.outcomes(flown)
-                rows.setdefault((model, law), {}).setdefault(preset, []).extend((counted.outcome == "reached").tolist())
-                worst.setdefault((model, law), {}).setdefault(preset, []).extend(counted.worst.tolist())
+        for model, law, preset, reached, errors in of_query(plant, robots, numbers["lag"][1], query, dt, config):
+            rows.setdefault((model, law), {}).setdefault(preset, []).extend(reached)
+            worst.setdefault((model, law), {}).setdefault(preset, []).extend(errors)
     preset = ls.disturbances.preset("light", plant)
     return {
         "simulator": simulator.name, "versions": dict(simulator.versions), "dt": dt, "numbers": numbers,
