@@ -21,7 +21,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from peers.common import Unavailable
-from runner import Result, Settings, at_most, between, interval, judge, opening, progress, run, table
+from runner import FolderSettings, Result, at_most, between, interval, judge, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.control.controllers import OutputFeedback, as_controller
@@ -147,7 +147,7 @@ Section = Literal["campaign", "board"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     sections: tuple[Section, ...] = ("campaign", "board")
     """Which of them."""
     trials: int = 400
@@ -332,7 +332,10 @@ def main(config: Config) -> Result:
 
 
 def report(result: Result) -> str:
-    parts = []
+    parts = [
+        "## Policies as C",
+        "What `lqrsim export` writes, by this machine's C compiler, and by `arm-none-eabi-gcc` in `qemu-system-arm`.",
+    ]
     if "campaign" in result:
         rows, exact, inside = [], [], []
         for row in result["campaign"]:

@@ -1,8 +1,8 @@
 """Plans from our model, run in simulators that we did not write: RotorPy's Hummingbird, crazyflow's Crazyflie.
 
     pip install 'lqrsim[rotorpy,crazyflow]'
-    SCIPY_ARRAY_API=1 python experiments/other_simulators.py            # some forty minutes
-    python experiments/other_simulators.py --simulators rotorpy         # crazyflow alone needs SCIPY_ARRAY_API
+    python experiments/other_simulators.py                         # some forty minutes
+    python experiments/other_simulators.py --simulators rotorpy    # one of them
     python experiments/other_simulators.py --quick
 
 The model is `Quadrotor` with the vehicle's numbers. What it does not have, such as the lag of the rotors, shows in a
@@ -10,9 +10,13 @@ recorded run: the numbers that explain it best are fitted, and the plan and its 
 the queries of Fig. 3, in the cage, undisturbed and under the presets.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
+
+if __name__ == "__main__":  # before SciPy looks: crazyflow asks for it
+    os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 import numpy as np
 from runner import FolderSettings, Result, at_most, between, interval, judge, opening, progress, run, table
@@ -128,6 +132,24 @@ def laws(
         yield numbers, "`OffsetFree` on a safe plan", safe.solution, made.__getitem__
 
 
+def of_query(
+    plant: ls.Plant, robots: dict[str, ls.Quadrotor], lag: float, query: int, dt: float, config: Config
+) -> list[tuple[str, str, str, list[bool], list[float]]]:
+    """Numbers of the model, law, preset, whether each trial reaches the goal, and its largest error in m."""
+    found = []
+    for model, law, plan, controller_for in laws(plant, robots, lag, query, dt):
+        for preset in PRESETS:
+            disturbed = preset != "undisturbed"
+            flown = ls.simulate(
+                plant, plan, controller=controller_for(preset), seed=config.seed, frames=False,
+                disturbances=ls.disturbances.preset(preset, plant) if disturbed else (),
+                trials=config.trials if disturbed else 1, first_trial=query * config.trials if disturbed else 0,
+            )  # fmt: skip
+            counted = ls.stress.outcomes(flown)
+            found.append((model, law, preset, (counted.outcome == "reached").tolist(), counted.worst.tolist()))
+    return found
+
+
 def of_simulator(name: Name, config: Config) -> dict[str, Any]:
     make, dt = SIMULATORS[name]
     simulator: Simulator = make()
@@ -144,17 +166,9 @@ def of_simulator(name: Name, config: Config) -> dict[str, Any]:
     rows: dict[tuple[str, str], dict[str, list[bool]]] = {}
     worst: dict[tuple[str, str], dict[str, list[float]]] = {}
     for query in progress(range(config.queries), name):
-        for model, law, plan, controller_for in laws(plant, robots, numbers["lag"][1], query, dt):
-            for preset in PRESETS:
-                disturbed = preset != "undisturbed"
-                flown = ls.simulate(
-                    plant, plan, controller=controller_for(preset), seed=config.seed, frames=False,
-                    disturbances=ls.disturbances.preset(preset, plant) if disturbed else (),
-                    trials=config.trials if disturbed else 1, first_trial=query * config.trials if disturbed else 0,
-                )  # fmt: skip
-                counted = ls.stress.outcomes(flown)
-                rows.setdefault((model, law), {}).setdefault(preset, []).extend((counted.outcome == "reached").tolist())
-                worst.setdefault((model, law), {}).setdefault(preset, []).extend(counted.worst.tolist())
+        for model, law, preset, reached, errors in of_query(plant, robots, numbers["lag"][1], query, dt, config):
+            rows.setdefault((model, law), {}).setdefault(preset, []).extend(reached)
+            worst.setdefault((model, law), {}).setdefault(preset, []).extend(errors)
     preset = ls.disturbances.preset("light", plant)
     return {
         "simulator": simulator.name, "versions": dict(simulator.versions), "dt": dt, "numbers": numbers,
@@ -188,7 +202,8 @@ def main(config: Config) -> Result:
 def report(result: Result) -> str:
     lines = [
         "## Other simulators",
-        "Plans and laws from `Quadrotor` with a vehicle's numbers, run in the simulator that the vehicle is from.",
+        "Plans and laws from `Quadrotor` with a vehicle's numbers, run in the simulator that the vehicle is from."
+        " It needs the extras `rotorpy` and `crazyflow`.",
     ]
     config = result["config"]
     for name in config["simulators"]:

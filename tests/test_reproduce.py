@@ -66,6 +66,30 @@ def test_a_script_that_fails_does_not_stop_the_others(
     assert main(["reproduce", "table_1", "--out", str(tmp_path / "out")]) == 0
 
 
+def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("table_1", "figure_2"):
+        (scripts / f"{name}.py").write_text(GOOD.replace("## It works", f"## {name}"))
+    out = tmp_path / "out"
+    assert main(["reproduce", "table_1", "--keep", "--out", str(out)]) == 2
+    assert "--keep: got" in capsys.readouterr().err  # there is nothing to keep yet
+    assert main(["reproduce", "table_1", "--out", str(out)]) == 0
+    assert main(["reproduce", "figure_2", "--quick", "--keep", "--out", str(out)]) == 2
+    assert "got results without --quick" in capsys.readouterr().err
+    before = json.loads((out / "results.json").read_text())
+    (out / "results.json").write_text(json.dumps(before | {"machine": "another machine"}))
+    assert main(["reproduce", "figure_2", "--keep", "--out", str(out)]) == 0
+    saved = json.loads((out / "results.json").read_text())
+    assert list(saved["results"]) == ["figure_2", "table_1"]  # in the order of the page
+    assert saved["results"]["table_1"] == before["results"]["table_1"]
+    assert saved["machine"] == "another machine"  # which the page's first lines are about
+    page = (out / "results.md").read_text()
+    assert page.index("## figure_2") < page.index("## table_1")
+    # A script that fails loses nothing.
+    (scripts / "table_1.py").write_text("import sys; sys.exit(1)")
+    assert main(["reproduce", "figure_2", "table_1", "--keep", "--out", str(out)]) == 1
+    assert json.loads((out / "results.json").read_text())["results"]["table_1"] == before["results"]["table_1"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -132,6 +132,41 @@ def test_changes_of_mujocos_models_and_jumps_are_refused(page: dict[str, Any]) -
         ls.simulate(page["plant"], page["solution"], disturbances=[jumps])
 
 
+def test_dynamics_are_compared_with_a_simulator(page: dict[str, Any]) -> None:
+    """The puck's dynamics are exact, as its simulator is; one of another mass changes speeds by a sixth less."""
+    puck, exact = page["puck"], page["Exact"]
+    check = ls.check_plant(puck, puck.scene, simulator=exact(), period=0.1, settle=0.2)
+    assert check.good
+    assert check.errors.max() < 1e-12
+    heavy = ls.check_plant(puck, puck.scene, simulator=exact(mass=2.4), period=0.1)
+    assert not heavy.good
+    assert heavy.relative[2:] == pytest.approx(1 / 6, rel=1e-9)  # of the speeds that change most
+    assert f", exact {heavy.simulated[puck.dynamics.state_coordinates.names.index(heavy.worst)]:.6g}" in str(heavy)
+
+
+def test_a_simulator_that_does_not_fit_is_refused_in_a_line(page: dict[str, Any]) -> None:
+    class Short(page["Exact"]):
+        def states(self, simulations: Any) -> Any:
+            return simulations["states"][:, :2]
+
+    class Nowhere(page["Exact"]):
+        def states(self, simulations: Any) -> Any:
+            return np.nan * simulations["states"]
+
+    class Nameless(page["Exact"]):
+        name = ""
+
+    puck, plan = page["puck"], page["solution"]
+    with pytest.raises(ls.InputError, match=r"^exact: states: got shape \(3, 2\), want \(3, 4\): trials, states$"):
+        ls.simulate(ls.Plant(puck, puck.scene, Short()), plan, trials=3)
+    with pytest.raises(ls.InputError, match=r"^exact: states: got shape \(1, 2\), want \(1, 4\)"):
+        ls.check_plant(puck, puck.scene, simulator=Short())
+    with pytest.raises(ls.InputError, match=r"^exact: got a state that is not finite, from x = "):
+        ls.check_plant(puck, puck.scene, simulator=Nowhere())
+    with pytest.raises(ls.InputError, match=r"^simulator: name: got '', want text: one printable line$"):
+        ls.Plant(puck, puck.scene, Nameless())
+
+
 def test_a_period_that_is_no_multiple_of_the_timestep(page: dict[str, Any]) -> None:
     with pytest.raises(ls.InputError, match=r"want a multiple of the physics step of exact, 0.05 s: plant.for_period"):
         page["plant"].substeps(0.07)

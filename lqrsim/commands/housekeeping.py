@@ -56,12 +56,14 @@ class Reproduce:
     """Output folder."""
     quick: bool = False
     """Run a small part of each, for a first look."""
+    keep: bool = False
+    """Keep the other results of an earlier run in the folder, and write the page with all of them."""
     json: Json = False
 
     def run(self) -> int:
         from lqrsim.commands.reproduce import reproduce
 
-        return reproduce(self.results, out=self.out, quick=self.quick)
+        return reproduce(self.results, out=self.out, quick=self.quick, keep=self.keep)
 
 
 @dataclass(frozen=True, kw_only=True)

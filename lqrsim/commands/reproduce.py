@@ -13,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from lqrsim.commands import console
-from lqrsim.errors import check_name
+from lqrsim.errors import InputError, check_name
 from lqrsim.machine import description
 from lqrsim.results.save_load import replacing
 
@@ -54,23 +54,25 @@ class Failure:
     code: int
 
 
-def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
+def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = False) -> int:
     """Run the scripts, write `results.md`, `results.json` and the figures, and print which statements hold.
 
     Args:
       scripts: names in `SCRIPTS`; none means all.
       out: output folder.
       quick: run a small part of each.
+      keep: whether results of other scripts in `results.json` stay.
 
     Returns:
       1 if a script failed, else 0, whether or not the paper's statements hold.
 
     Raises:
-      InputError: an unknown script, or a folder that cannot be written.
+      InputError: an unknown script, a folder that cannot be written, or results that cannot be kept.
     """
     named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
     chosen = [name for name in SCRIPTS if name in named]
     console.check_output("--out", out)
+    kept = _kept(out / "results.json", quick=quick) if keep else {"machine": description(), "results": {}}
     results: dict[str, ScriptResult] = {}
     failures: list[Failure] = []
     begun = time.monotonic()
@@ -88,7 +90,9 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
                 console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
             bar.update()
     if results:
-        saved = {"machine": description(), "quick": quick, "results": results}
+        together = kept["results"] | results
+        ordered = {name: together[name] for name in SCRIPTS if name in together}
+        saved = {"machine": kept["machine"], "quick": quick, "results": ordered}
         with replacing(out / "results.json") as unfinished:
             unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
         with replacing(out / "results.md") as unfinished:
@@ -102,6 +106,18 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
         console.say(f"FAILED {failure.script}: exit code {failure.code}")
     console.result(failures=failures)
     return 1 if failures else 0
+
+
+def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
+    """What an earlier call saved. Raises InputError if it cannot be read, or is of a run of another size."""
+    try:
+        saved = json.loads(file.read_text(encoding="utf-8"))
+        other = saved["quick"] is not quick
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
+    if other:
+        raise InputError(f"--keep: got results {'without' if quick else 'with'} --quick in {file}, want the same")
+    return saved
 
 
 def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:

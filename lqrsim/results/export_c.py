@@ -104,35 +104,29 @@ def export_c(
     law = policy.policy if isinstance(policy, Solution) else policy
     if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")
-    tables = _Tables(number, gains)
-    values = _filter_values(law) if isinstance(law, OutputFeedbackPolicy) else _values(law)
+    kind = FILTER if isinstance(law, OutputFeedbackPolicy) else FEEDBACK
+    measured = law.measured_coordinates if isinstance(law, OutputFeedbackPolicy) else law.state_coordinates
+    tables, values = _Tables(number, gains), _values(law)
     for field, array in values.items():
         tables.add(field, array)
     low, high = _limits(law.control_coordinates, DTYPES[number])
     tables.plain("lowest", low)
     tables.plain("highest", high)
-    sha = hash_of(policy)
-    header = "my_policy.h", {
-        "title": _title(law), "version": version("lqrsim"), "rounding": _rounding_text(law, tables, number, gains),
-        "period": repr(law.dt), "entries": _entries(law), "sha256": sha, "T": law.steps,
-        "n": len(law.state_coordinates), "Y": len(_measured(law)), "m": len(law.control_coordinates),
-        "bytes": tables.bytes, "real": number,
-        "or": "" if isinstance(law, OutputFeedbackPolicy) else ", or measured is NULL",
-        "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period."
-        if isinstance(law, OutputFeedbackPolicy) else "",
-    }  # fmt: skip
-    source = "filter.c" if isinstance(law, OutputFeedbackPolicy) else "feedback.c", {
-        "tables": tables.text(), "nearest": _nearest(law, number), "Z": law.nominal.shape[1],
-        **(BLENDED if interpolate else HELD),
-    }  # fmt: skip
     share = SHARES["int16" if gains == "int16" else number]
-    rows, tolerance = _rows(law, values, DTYPES[number], share, interpolate)
-    example = {"share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())), "rows": rows}
-    texts = {f"{name}.h": header, f"{name}.c": source} | {one: (one, example) for one in STATIC}
-    files = []
-    for file, (template, parts) in texts.items():
+    rows, tolerance = _rows(law, measured, values, DTYPES[number], share, interpolate)
+    sha, parts = hash_of(policy), kind | (BLENDED if interpolate else HELD)
+    parts |= {
+        "version": version("lqrsim"), "rounding": _rounding_text(law, tables, number, gains), "sha256": sha,
+        "entries": _entries(measured, law.control_coordinates), "period": repr(law.dt), "T": str(law.steps),
+        "n": str(len(law.state_coordinates)), "Y": str(len(measured)), "m": str(len(law.control_coordinates)),
+        "Z": str(law.nominal.shape[1]), "bytes": str(tables.bytes), "real": number, "tables": tables.text(),
+        "nearest": _nearest(law, number), "share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())),
+        "rows": rows,
+    }  # fmt: skip
+    files, templates = [], {f"{name}.h": "my_policy.h", f"{name}.c": kind["source"]} | {one: one for one in STATIC}
+    for file, template in templates.items():
         text = (TEMPLATES / template).read_text(encoding="utf-8")
-        text = re.sub("@([A-Za-z0-9]+)@", lambda match, parts=parts: str(parts[match[1]]), text)
+        text = re.sub("@([A-Za-z0-9]+)@", lambda match: parts[match[1]], text)
         text = text.replace(PREFIX, name).replace(PREFIX.upper(), name.upper())
         with replacing(folder / file) as unfinished:
             unfinished.write_text(text, encoding="utf-8", newline="\n")
@@ -143,6 +137,12 @@ def export_c(
     )  # fmt: skip
 
 
+# The template of the source, and what the header says.
+FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
+FILTER = {
+    "source": "filter.c", "what": "A filter and the law of its estimates", "or": "",
+    "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period.",
+}  # fmt: skip
 # What feedback.c does between two knots.
 HELD = {"blend": "", "near": "NOMINAL(k, j)", "wanted": "law(k, i, state)"}
 BLENDED = {
@@ -251,17 +251,16 @@ def _list(parts: Iterable[str]) -> str:
     return "{" + ", ".join(parts) + "}"
 
 
-def _values(law: AffinePolicy) -> dict[str, Array]:
-    planned = law.offset + np.einsum("tij,tj->ti", law.gain, law.nominal)
-    return {"planned": planned, "gain": law.gain, "nominal": law.nominal}
-
-
-def _filter_values(law: OutputFeedbackPolicy) -> dict[str, Array]:
+def _values(law: AffinePolicy | OutputFeedbackPolicy) -> dict[str, Array]:
+    """The tables by name: of a filter as in filter.c, of any other law as in feedback.c."""
     nominal, n = law.nominal, len(law.state_coordinates)
     planned = law.offset + np.einsum("tij,tj->ti", law.gain, nominal)
+    values = {"planned": planned, "gain": law.gain, "nominal": nominal}
+    if isinstance(law, AffinePolicy):
+        return values
     moved = np.einsum("tij,tj->ti", law.transition, nominal) + np.einsum("tij,tj->ti", law.input, planned)
-    return {
-        "planned": planned, "gain": law.gain, "nominal": nominal, "correction": law.correction, "sensor": law.sensor,
+    return values | {
+        "correction": law.correction, "sensor": law.sensor,
         "expected": law.sensor_offset + np.einsum("tij,tj->ti", law.sensor, nominal[:, :n]),
         "transition": law.transition, "input": law.input, "next": moved + law.drift,
     }  # fmt: skip
@@ -275,10 +274,6 @@ def _limits(controls: Coordinates, dtype: npt.DTypeLike) -> tuple[Array, Array]:
     lowest = np.where(lowest < low, np.nextafter(lowest, np.array(np.inf, dtype)), lowest)
     highest = np.where(highest > high, np.nextafter(highest, np.array(-np.inf, dtype)), highest)
     return lowest.astype(np.float64), highest.astype(np.float64)
-
-
-def _measured(law: AffinePolicy | OutputFeedbackPolicy) -> Coordinates:
-    return law.measured_coordinates if isinstance(law, OutputFeedbackPolicy) else law.state_coordinates
 
 
 def _nearest(law: AffinePolicy | OutputFeedbackPolicy, number: str) -> str:
@@ -304,15 +299,9 @@ def _comment(text: str) -> str:
     return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)", " ", re.sub(r"[^ -~]|[?\\]", "_", text))
 
 
-def _title(law: AffinePolicy | OutputFeedbackPolicy) -> str:
-    what = "A filter and the law of its estimates" if isinstance(law, OutputFeedbackPolicy) else "A feedback law"
-    return f"{what} in C99: {len(law.control_coordinates)} controls from {len(_measured(law))} measured numbers."
-
-
-def _entries(law: AffinePolicy | OutputFeedbackPolicy) -> str:
+def _entries(measured: Coordinates, controls: Coordinates) -> str:
     """The lines of a comment that name measured numbers and commands, with units and limits."""
-    lines, controls = ["measured:"], law.control_coordinates
-    measured = _measured(law)
+    lines = ["measured:"]
     turning = dict.fromkeys(measured.angles, ", an angle")
     turning |= {i + j: ", of a rotation vector" for i in measured.rotation_vectors for j in range(3)}
     lines += [f"  {i}: {label}{turning.get(i, '')}" for i, label in enumerate(measured.labels)]
@@ -352,8 +341,8 @@ def _kind_of(value: object) -> str:
 
 
 def _rows(
-    law: AffinePolicy | OutputFeedbackPolicy, values: dict[str, Array], dtype: npt.DTypeLike, share: float,
-    interpolate: bool,
+    law: AffinePolicy | OutputFeedbackPolicy, space: Coordinates, values: dict[str, Array], dtype: npt.DTypeLike,
+    share: float, interpolate: bool,
 ) -> tuple[str, Array]:  # fmt: skip
     """The rows of main.c, with Python's commands for random measurements, and the tolerance of each control (m,)."""
     rng, rows = np.random.default_rng(0), []
@@ -361,7 +350,7 @@ def _rows(
     periods = [0, 1, 1.5, law.steps // 2, law.steps - 1.25, law.steps - 1, law.steps, 2 * law.steps]
     times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
     z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
-    space, expected = _measured(law), values.get("expected", law.nominal)
+    expected = values.get("expected", law.nominal)
     # A filter takes the spread of its measurements for fast motion, so that it is smaller here.
     spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
     for place, period in enumerate(times):

@@ -10,7 +10,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array, InputError
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.simulator import Simulator
+from lqrsim.simulation.simulator import Simulator, states_of
 
 FRAME_PERIOD = 1 / 30  # s; positions are checked and recorded at least this often, unless the physics step is longer
 
@@ -133,7 +133,7 @@ class SimulatorPhysics(Physics):
 
     def _look(self) -> None:
         """Read the states, all NaN where one is not finite."""
-        self._states = np.array(self._simulator.states(self._simulations))
+        self._states = states_of(self._simulator, self._simulations, self._states.shape)
         lost = ~np.isfinite(self._states).all(axis=1)
         self._states[lost], self.unstable[lost] = np.nan, True
 

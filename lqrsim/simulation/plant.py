@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.codegen import distances
-from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_kind, check_number, check_text, shaped, vectors_of
 from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import evaluate
 from lqrsim.results.rollout import BallRecord
@@ -58,6 +58,9 @@ class Plant:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
         check_kind("simulator", simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
+        if simulator is not None:
+            check_text("simulator: name", getattr(simulator, "name", None))
+            check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)
         plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
         self.robot, self.scene, self.simulator = robot, scene, simulator

@@ -1,4 +1,4 @@
-"""A comparison of a robot's dynamics with its MJCF in MuJoCo."""
+"""A comparison of a robot's dynamics with its MJCF in MuJoCo, or with another simulator."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -26,6 +26,7 @@ from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.mujoco_physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.simulator import Simulator, states_of
 
 MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one
 PRINTED = 8  # pairs of geoms in contact
@@ -33,7 +34,7 @@ PRINTED = 8  # pairs of geoms in contact
 
 @dataclass(frozen=True)
 class PlantCheck:
-    """The differences between a robot's dynamics and MuJoCo over one control period.
+    """The differences between a robot's dynamics and MuJoCo, or another simulator, over one control period.
 
     Attributes:
       names: names of the states.
@@ -43,12 +44,13 @@ class PlantCheck:
       period: in seconds.
       state: (n,), the sample with the largest error of the worst state.
       control: (m,), of this sample.
-      simulated: (n,), the state after this sample in MuJoCo.
+      simulated: (n,), the state after this sample in the simulator.
       predicted: (n,), the state after this sample by the dynamics.
       tolerance: largest allowed value of `relative`.
       samples: number of random states.
       contacts: pairs of geoms that touched, each with its number of samples, the most frequent first. The dynamics may
         not know of these contacts.
+      simulator: name of what simulated.
     """
 
     names: Annotated[tuple[Line, ...], "n"]
@@ -63,6 +65,7 @@ class PlantCheck:
     tolerance: Annotated[float, Bounds(above=0.0)]
     samples: int
     contacts: tuple[tuple[str, str, int], ...] = ()
+    simulator: Line = "MuJoCo"
 
     def __post_init__(self) -> None:
         if not check_fields(self)["n"]:
@@ -96,7 +99,7 @@ class PlantCheck:
         ]
         lines.append(
             f"{'agrees' if self.good else 'DISAGREES'} (tolerance {self.tolerance:g} of the change); worst state:"
-            f" {self.worst}, MuJoCo {self.simulated[i]:.6g}, dynamics {self.predicted[i]:.6g},"
+            f" {self.worst}, {self.simulator} {self.simulated[i]:.6g}, dynamics {self.predicted[i]:.6g},"
             f" from x = {np.array2string(self.state, precision=3)}, u = {np.array2string(self.control, precision=3)}"
         )
         lines += [
@@ -111,6 +114,7 @@ def check_plant(
     robot: Robot,
     scene: Scene,
     *,
+    simulator: Simulator | None = None,
     problem: Problem | None = None,
     period: float | None = None,
     around: npt.ArrayLike | None = None,
@@ -130,6 +134,7 @@ def check_plant(
     Args:
       robot: the robot, with its dynamics.
       scene: a scene whose MJCF has the robot.
+      simulator: what the dynamics are compared with in place of MuJoCo; it knows of no contacts.
       problem: a problem of the robot. The random states keep its StateBounds, and the controls its limits: beyond them
         the dynamics need not hold.
       period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
@@ -146,7 +151,7 @@ def check_plant(
       InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the
         simulation becomes unstable.
     """
-    plant = Plant(robot, scene)
+    plant = Plant(robot, scene, simulator)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
@@ -161,7 +166,7 @@ def check_plant(
     rng = np.random.default_rng(check_seed("seed", seed))
     spread = check_number("spread", spread, at_least=0.0)
     if settle is None:
-        settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
+        settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
     waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
     samples = check_count("samples", samples, at_most=100_000)
     if not samples * (waiting + substeps) <= MOST_STEPS:
@@ -174,10 +179,14 @@ def check_plant(
     with unlogged():
         for _ in range(samples):
             state, control = _drawn(rng, middle, spread, lowest, highest), rng.uniform(low, high)
+            if simulator is not None:
+                found.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
+                continue
             sample, touched = _sample(plant, data, state, control, round(waiting), period)
             found.append(sample)
             touching.update(sorted(touched))
-    return _worst_of(found, robot, period, tolerance, touching)
+    check = _worst_of(found, robot, period, tolerance, touching)
+    return check if simulator is None else replace(check, simulator=simulator.name)
 
 
 class _Sample(NamedTuple):
@@ -268,6 +277,27 @@ def _sample(
     predicted = robot.dynamics.step(before, control, period)
     simulated = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=predicted)
     return _Sample(before, control, simulated, predicted), touched
+
+
+def _in_simulator(
+    simulator: Simulator, plant: Plant, state: Array, control: Array, waiting: int, period: float
+) -> _Sample:
+    """Run one control period in another simulator, after `waiting` steps."""
+    dynamics, states = plant.robot.dynamics, [state]
+    running = simulator.start(state[None], {}, plant.timestep)
+    for steps in (waiting, plant.substeps(period)):
+        if steps:
+            simulator.step(running, control[None], np.zeros((1, 6)), np.zeros((1, 3)), steps)
+        (after,) = states_of(simulator, running, (1, len(state)))
+        if not np.isfinite(after).all():
+            raise InputError(
+                f"{simulator.name}: got a state that is not finite, from x = {np.array2string(state, precision=3)},"
+                f" u = {np.array2string(control, precision=3)}, want a simulator that starts there"
+            )
+        states.append(after)
+    before = dynamics.state_coordinates.nearest(states[1], state)
+    predicted = dynamics.step(before, control, period)
+    return _Sample(before, control, dynamics.state_coordinates.nearest(states[2], predicted), predicted)
 
 
 def _worst_of(

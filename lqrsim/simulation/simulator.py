@@ -8,6 +8,8 @@ import abc
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from lqrsim.errors import Array, InputError
 from lqrsim.robots.base import Robot
 
@@ -101,3 +103,11 @@ class Simulator(abc.ABC):
           InputError: it cannot.
         """
         raise InputError(f"StateNoise: got a plant simulated by {self.name}, which does not override `place`")
+
+
+def states_of(simulator: Simulator, simulations: Any, shape: tuple[int, ...]) -> Array:
+    """A copy of the current states, of this shape (K, n). Raises InputError if it is another one."""
+    states = np.array(simulator.states(simulations), dtype=np.float64)
+    if states.shape != shape:
+        raise InputError(f"{simulator.name}: states: got shape {states.shape}, want {shape}: trials, states")
+    return states

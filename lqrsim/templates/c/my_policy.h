@@ -1,10 +1,11 @@
-/* @title@
+/* @what@ in C99: @m@ controls from @Y@ measured numbers.
  *
  * Written by lqrsim @version@ from a file whose content has the SHA-256 that is below as MY_POLICY_SHA256.
  * @rounding@
  *
- * Call my_policy_init() once, then my_policy_step() in each control period, @period@ s. Nothing is allocated. The state of
- * the law is static: one robot runs it. Do not compile it with -ffast-math, for it looks for NaN.
+ * Call my_policy_init() once, then my_policy_step() in each control period, @period@ s.
+ * Nothing is allocated. The state of the law is static: one robot runs it. Do not compile it with -ffast-math, for it
+ * looks for NaN.
  *
 @entries@
  */
