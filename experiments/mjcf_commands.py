@@ -3,7 +3,9 @@
     python experiments/mjcf_commands.py --models models       # `experiments/mjcf/family.py` says how to get the files
     python experiments/mjcf_commands.py --models models --only Panda point
 
-Start and goal are those of `experiments/mjcf_robots.py --family`, for robots whose files need nothing added.
+Start and goal are those of `experiments/mjcf_robots.py --family`, without the shelf, whose pose is no setting of a
+command. What a task adds to a file, such as a post, is in a file of its own in the folder of the output. Each row is
+kept as soon as it is done: the same command goes on where it was stopped.
 """
 
 import json
@@ -11,14 +13,19 @@ import subprocess
 import sys
 import time
 import urllib.request
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mjcf.family import FAMILY, FamilyTask, ShelfTask
-from runner import FolderSettings, Result, opening, progress, run, table
+from runner import FolderSettings, Result, kept, opening, progress, run, table
+from tqdm import tqdm
+
+import lqrsim as ls
 
 QUICKEST, TRIALS = "point", 20
+POLICIES = "smooth", "track"
 ANSWERS = 120.0  # s, in which a page is to be served
 
 
@@ -35,31 +42,45 @@ class Config(FolderSettings):
 
 
 def main(config: Config) -> Result:
-    plain = [one for one in FAMILY if not (isinstance(one, ShelfTask) or one.post or one.excluded or one.ends)]
     names = (QUICKEST,) if config.quick else config.only
-    chosen = [one.found_in(config.models) for one in plain if not names or one.name in names]
+    tasks = [one.found_in(config.models) for one in FAMILY if not isinstance(one, ShelfTask)]
+    chosen = [one for one in tasks if not names or one.name in names]
     here = [one for one in chosen if one.path is not None]
     result = opening(config) | {"rows": [], "missing": [one.name for one in chosen if one not in here]}
     for task in progress(here, "robots"):
-        result["rows"].append(of_task(config, task))
+        settings = {"time_limit": config.time_limit, "task": repr(replace(task, folder=None))}
+        row = kept(config.out / "rows", task.name, settings, lambda task=task: of_task(config, task))
+        result["rows"].append(row)
+        if not config.json:
+            tqdm.write(line(row))
     return result
 
 
-def reference(task: FamilyTask) -> str:
+def reference(task: FamilyTask, folder: Path) -> str:
     """The robot's file with start, goal and weights, as commands take it."""
     robot = task.robot()
-    names, nv = robot.dynamics.state_coordinates.names, robot.scene.model.nv
-    rest = robot.at()[:nv].tolist()
-    start = dict(zip(names, [*task.start, *rest[len(task.start) :]], strict=False))
-    goal = start | {names[joint]: start[names[joint]] + move for joint, move in task.moves.items()}
-    units = robot.dynamics.state_coordinates.units
-    weights = {unit: task.weights[i >= nv] for i, unit in enumerate(units)}
-    return f"{task.path},start={start},goal={goal},weights={weights},steps={task.steps},dt={task.dt}"
+    problem, path, more = task.problem(robot), task.path, ""
+    if task.post or task.excluded:
+        path, more = folder / f"{task.name.replace(' ', '_')}.xml", f",obstacles={list(robot.scene.world.names)}"
+        path.write_text(robot.scene.xml, encoding="utf-8")
+    assert isinstance(problem.final_cost, ls.QuadraticCost)
+    assert problem.start is not None
+    assert problem.goal is not None
+    names, rest = robot.dynamics.state_coordinates.names, robot.at()
+    start, goal = (
+        {name: float(value) for name, value, own in zip(names, state, rest, strict=True) if value != own}
+        for state in (problem.start, problem.goal)
+    )
+    diagonal = np.diag(problem.final_cost.weight)
+    weights = {name: float(weight) for name, weight in zip(names, diagonal, strict=True) if weight > 0}
+    return f"{path},start={start},goal={goal},weights={weights},steps={task.steps},dt={task.dt}{more}"
 
 
 def of_task(config: Config, task: FamilyTask) -> dict[str, Any]:
     """What each command returned: its exit code, and what says how it went."""
-    folder, robot = config.out / task.name.replace(" ", "_"), reference(task)
+    folder = config.out / task.name.replace(" ", "_")
+    folder.mkdir(parents=True, exist_ok=True)
+    robot = reference(task, folder)
     solution, rollout, still = folder / "solution.npz", folder / "rollout.npz", folder / "still.png"
     limit = ("--time-limit", f"{config.time_limit:g}")
     row: dict[str, Any] = {"name": task.name}
@@ -72,12 +93,18 @@ def of_task(config: Config, task: FamilyTask) -> dict[str, Any]:
     size = ("--size", "480", "270", "--quality", "draft")
     rendered = command("render", str(rollout), "--out", str(still), *size)
     row["render"] = f"{still.stat().st_size // 1000} kB" if rendered.returncode == 0 else error_of(rendered)
-    cell = ("--policies", "smooth", "--sweep", "light", "--strengths", "1", "--trials", str(TRIALS), "--workers", "1")
+    cell = ("--policies", *POLICIES, "--sweep", "light", "--strengths", "1", "--trials", str(TRIALS), "--workers", "1")
     campaign = ("--out", str(folder / "stress"), "--no-resume", "--solution", str(solution))
     stressed = command("stress", robot, *cell, *campaign, "--json")
-    row["stress"] = told(stressed, lambda found: f"{found['campaign']['cells'][0]['outcomes']['reached']} of {TRIALS}")
+    row["stress"] = told(stressed, _reached)
     row["view"] = viewed(robot, solution)
     return row
+
+
+def _reached(found: dict[str, Any]) -> str:
+    """How many trials of each policy reach the goal."""
+    reached = {cell["policy"]: cell["outcomes"]["reached"] for cell in found["campaign"]["cells"]}
+    return f"{', '.join(str(reached[policy]) for policy in POLICIES)} of {TRIALS}"
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -124,11 +151,22 @@ def viewed(robot: str, solution: Path) -> str:
                 process.kill()
 
 
+HEAD = "robot", "solve: status, iterations", "simulate", "render", f"stress: {', '.join(POLICIES)}", "view"
+
+
+def cells(row: dict[str, Any]) -> list[Any]:
+    """What the table has of a robot."""
+    return [row["name"], *(row.get(part, "") for part in ("solve", "simulate", "render", "stress", "view"))]
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table on its own."""
+    return table(HEAD, [cells(row)]).splitlines()[-1]
+
+
 def report(result: Result) -> str:
-    parts = ("solve", "simulate", "render", "stress", "view")
-    rows = [[one["name"], *(one.get(part, "") for part in parts)] for one in result["rows"]]
     missing = f"\nNot installed, and left out: {', '.join(result['missing'])}." if result["missing"] else ""
-    return table(("robot", *parts), rows) + missing
+    return table(HEAD, [cells(row) for row in result["rows"]]) + missing
 
 
 if __name__ == "__main__":

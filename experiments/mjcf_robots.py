@@ -12,7 +12,6 @@ where it was stopped, and a row is measured again when its file in the folder of
 """
 
 import copy
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,11 @@ from mjcf.family import FAMILY, FamilyTask, ShelfTask
 from mjcf.tasks import TASKS, Task
 from paper.common import render_still
 from PIL import Image
-from runner import FIGURES, FolderSettings, Result, opening, progress, run, table
+from runner import FIGURES, FolderSettings, Result, kept, opening, progress, run, table
 from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.save_load import replacing
 
 OUT = Path("runs/mjcf_robots")
 TILE = 400, 225  # pixels of a picture on the sheet of all
@@ -80,15 +78,8 @@ def row_of(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> d
     """The row that was kept, if it is of the same settings; or a new one, which is kept."""
     if config.quick:
         return of_task(config, task, limits)
-    kept = config.out / "rows" / f"{task.name.replace(' ', '_')}.json"
     settings = limits | {"task": repr(replace(task, folder=None) if isinstance(task, FamilyTask) else task)}
-    row = json.loads(kept.read_text("utf-8")) if kept.is_file() else None
-    if row is None or row["settings"] != settings:
-        row = of_task(config, task, limits) | {"settings": settings}
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(kept) as unfinished:
-            unfinished.write_text(json.dumps(row) + "\n", encoding="utf-8")
-    return row
+    return kept(config.out / "rows", task.name, settings, lambda: of_task(config, task, limits))
 
 
 def sheet(config: Config, result: Result) -> None:

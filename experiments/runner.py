@@ -121,6 +121,18 @@ def opening(config: Settings) -> Result:
     return {"config": options, "versions": versions(), "machine": description(), "figures": []}
 
 
+def kept(folder: Path, name: str, settings: Mapping[str, Any], measure: Callable[[], Result]) -> Result:
+    """The row of that name that an earlier run kept in a folder, if it is of these settings; or a new one, kept."""
+    file = folder / f"{name.replace(' ', '_')}.json"
+    row = json.loads(file.read_text("utf-8")) if file.is_file() else None
+    if row is None or row["settings"] != settings:
+        row = measure() | {"settings": settings}
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as unfinished:
+            unfinished.write_text(json.dumps(row) + "\n", encoding="utf-8")
+    return row
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of a script that can be run alone.

@@ -30,6 +30,7 @@ from lqrsim.errors import InputError
 from lqrsim.reports.page import report
 from lqrsim.results.goal import OF_RANGE, Target, endings
 from lqrsim.robots.base import Robot
+from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.uncertainty_of import tube_under
@@ -500,6 +501,20 @@ def test_at_strength_0_there_is_one_run_and_no_interval(rough: Results) -> None:
     assert "[" not in calm
     assert "[" in windy
     assert "smooth: the plan ends 0.0647 m from the goal" in rough.summary()
+
+
+def test_where_nothing_reaches_the_kinds_to_try_alone_are_named(tmp_path: Path) -> None:
+    """Each name is one that --sweep takes; nothing is said of a set that a trial survives, as calm."""
+    scenario = ls.scenarios.quadrotor()
+    sweeps = {name: disturbance_set(name, scenario) for name in ("calm", "light")}
+    campaign = replace(ROUGH, sweeps=sweeps, strengths=(1.0,), trials=3, goal_radius=1e-9)
+    (calm, light) = run_campaign(campaign, tmp_path / "none", workers=0).summary().splitlines()[-2:]
+    for name, line in (("calm", calm), ("light", light)):
+        said, _, kinds = line.partition(" --sweep ")
+        assert said == f"{name}: no trial reached the goal; each kind of disturbance alone:"
+        assert [one for kind in kinds.split() for one in disturbance_set(kind, scenario)] == list(sweeps[name])
+    easy = replace(campaign, sweeps={"calm": sweeps["calm"]}, goal_radius=9.0)
+    assert "--sweep" not in run_campaign(easy, tmp_path / "all", workers=0).summary()
 
 
 # Filters that diverge.

@@ -258,6 +258,18 @@ def test_names_that_obstacles_without_one_get_are_free(scene_of):
         ),
         ('<body><geom name="load" mass="nan" size="1"/></body>', "got NaN for the mass of geom 'load', want a number"),
         ('<body><geom density="NaN" size="1"/></body>', "got NaN for the density of geom, want a number"),
+        ('<body><geom mass="-nan(1)" size="1"/></body>', "got NaN for the mass of geom, want a number"),
+        ('<replicate count=" +900000000" offset="1 0 0"><geom size="1"/></replicate>', "900,000,000 copies"),
+        ('<replicate count="1000001" offset="1 0 0"/>', "<replicate> of 1,000,001 copies"),
+        (
+            '<body><flexcomp name="f" type="grid" dim="2" spacing="1 1 1" count="99999 99999 1"/></body>',
+            "<flexcomp> of 9,999,800,001 copies",
+        ),
+        ('<geom size="1"/></worldbody><compiler boundmass="nan"/><worldbody>', "got NaN for the boundmass of compiler"),
+        ('<geom size="1"/></worldbody><option timestep="nan"/><worldbody>', "got the timestep nan, want a finite"),
+        ('<geom size="1"/></worldbody><option timestep="0"/><worldbody>', "got the timestep 0, want a finite"),
+        ('<geom size="1"/></worldbody><option timestep="inf"/><worldbody>', "got the timestep inf, want a finite"),
+        ('<geom size="1"/></worldbody><option gravity="0 0 nan"/><worldbody>', r"got gravity \[0.0, 0.0, nan\], want"),
     ],
 )
 def test_what_mujoco_would_not_survive_or_not_say(text, message):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.fields import LINE, Bounds, Line, check_fields
 from lqrsim.results.solution import Solution
 
 _SHARE = Bounds(at_least=0.0, at_most=1.0)
@@ -42,7 +42,7 @@ class FailureCertificate:
     """
 
     solution: Solution
-    scenario: Line
+    scenario: Annotated[str, 10 * LINE]
     sweep: Line
     strength: Annotated[float, Bounds(above=0.0)]
     policy: Line

@@ -53,7 +53,7 @@ class Solution(Plan):
     problem_digest: Line
     versions: Mapping[str, Line]
     remedy: Annotated[str, 10 * LINE] = ""
-    scenario: Line = ""
+    scenario: Annotated[str, 10 * LINE] = ""
     candidates: tuple[Candidate, ...] = ()
 
     @classmethod

@@ -16,6 +16,7 @@ the way of that robot.
 """
 
 import contextlib
+import math
 import os
 import re
 import threading
@@ -49,7 +50,14 @@ _FLAT = 1e-9  # m, for geoms without a thickness
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
 MOST_COPIES = 1_000_000  # elements that <replicate> makes: some minutes of MuJoCo's, and GBs
-_MASSES = frozenset(("mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "armature"))
+_COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of what they make
+_MASSES = frozenset(
+    (
+        "mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "boundmass", "boundinertia",
+        "armature",
+    )
+)  # fmt: skip
+_NAN = re.compile(r"(^|[\s,])[+-]?nan")
 
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
@@ -254,7 +262,7 @@ def _check_elements(xml: str, what: str) -> None:
     It takes a NaN for the mass or density of a geom as if there were none.
     """
     text = xml.lower()
-    rare = any(word in text for word in ("replicate", "hfield", "nan"))
+    rare = any(word in text for word in (*_COPIERS, "hfield", "nan"))
     if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
         return  # files of thousands of geoms are not read once more
     reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
@@ -266,15 +274,15 @@ def _check_elements(xml: str, what: str) -> None:
             depth += 1 if event == "start" else -1
             if depth > DEEPEST:
                 raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want less nesting")
-            if element.tag == "replicate":
-                copies = [*copies, copies[-1] * _whole(element.get("count", ""))] if event == "start" else copies[:-1]
-            if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", "replicate"):
+            if element.tag in _COPIERS:
+                copies = [*copies, copies[-1] * _product(element.get("count", ""))] if event == "start" else copies[:-1]
+            if event == "start" and element.tag in ("geom", "body", "site", "light", "camera", *_COPIERS):
                 made += copies[-1]
                 if made > MOST_COPIES:
-                    got = f"<replicate> of {copies[-1]:,} copies"
+                    got = f"<{element.tag}> of {copies[-1]:,} copies" if element.tag in _COPIERS else "more"
                     raise InputError(f"{what}: got {got}, want {MOST_COPIES:,} elements at most")
             for key in _MASSES.intersection(element.attrib) if event == "start" else ():
-                if "nan" in element.attrib[key].lower().split():
+                if _NAN.search(element.attrib[key].lower()):
                     name = f" {element.attrib['name']!r}" if "name" in element.attrib else ""
                     raise InputError(f"{what}: got NaN for the {key} of {element.tag}{name}, want a number")
             if event == "start" and element.tag == "hfield":
@@ -288,13 +296,18 @@ def _check_elements(xml: str, what: str) -> None:
             raise  # the rest is for MuJoCo to say
 
 
-def _whole(text: str) -> int:
-    """A count in an MJCF; 1 if MuJoCo itself refuses it."""
-    return int(text) if text.strip().isdecimal() else 1
+def _product(text: str) -> int:
+    """The count of an element of an MJCF, of several numbers their product; 1 if MuJoCo itself refuses it."""
+    return math.prod(max(int(number), 1) for number in re.findall(r"(?<!\S)\+?(\d+)(?!\S)", text))
 
 
 def _check_numbers(model: mujoco.MjModel, what: str) -> None:
-    """Raises InputError if the model has a NaN, which MuJoCo only warns about."""
+    """Raises InputError if the model has a NaN, which MuJoCo only warns about, or a time step in which none passes."""
+    if not 0 < model.opt.timestep < np.inf:
+        raise InputError(f"{what}: got the timestep {model.opt.timestep:g}, want a finite number of seconds above 0")
+    for field in ("gravity", "wind", "magnetic"):
+        if not np.isfinite(getattr(model.opt, field)).all():
+            raise InputError(f"{what}: got {field} {getattr(model.opt, field).tolist()}, want finite numbers")
     for field in (name for name in dir(model) if not name.startswith("_")):
         array = getattr(model, field)
         if isinstance(array, np.ndarray) and array.dtype.kind == "f" and np.isnan(array).any():

@@ -84,7 +84,7 @@ class ReliabilityProblem:
     solution: Solution | str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
-        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
+        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
         check_text("sweep", self.sweep, "a name, such as 'light'")
         object.__setattr__(self, "strength", check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)

@@ -17,6 +17,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import from_anywhere, resolve
+from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
@@ -144,7 +145,8 @@ class Results:
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
-        return "\n".join([*lines, *self.manifest["remarks"], *self.plans(), *self.came_to_nothing()])
+        said = [*self.manifest["remarks"], *self.plans(), *self.came_to_nothing(), *self.hints()]
+        return "\n".join([*lines, *said])
 
     def _repr_html_(self) -> str:
         others = [name for name in OUTCOMES if name != "reached"]
@@ -170,6 +172,20 @@ class Results:
             if ends["error"] or ends["diverged"]:
                 reasons.update(self.reasons(cell).values())
         return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
+
+    def hints(self) -> list[str]:
+        """A line for each preset under which no trial reached the goal: how to see which disturbance it is."""
+        reached: dict[str, int] = {}
+        for cell, ends, found in self.cell_successes():
+            if found is not None and cell.strength > 0:
+                reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]
+        sweeps = self.manifest["campaign"]["sweeps"]
+        kinds = {name: [f"{name}:{one['kind']}" for one in sweeps[name]] for name in reached if name in PRESETS}
+        return [
+            f"{name}: no trial reached the goal; each kind of disturbance alone: --sweep {' '.join(kinds[name])}"
+            for name in kinds
+            if not reached[name]
+        ]
 
     def plans(self) -> list[str]:
         """Lines that say where the plan of each policy ends, and whether it misses the goal."""

@@ -136,7 +136,7 @@ class Campaign:
         def keep(field: str, value: object) -> None:
             object.__setattr__(self, field, value)
 
-        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
+        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
         keep("scenario", from_anywhere(self.scenario))  # workers and reports may run in other folders
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
