@@ -10,7 +10,7 @@ rest at the origin to a random position, velocity and acceleration, each compone
 has a reference of its own, and succeeds if the root mean square of its position's error is below 5 m, their test.
 
 ranges     Each disturbance within its published range: successes, and the error of those that succeed.
-when2fail  One disturbance alone, stronger and stronger, until no trial of a law succeeds.
+when2fail  One disturbance alone, stronger and stronger, until no trial of a law succeeds or the ladder ends.
 delay      The longest delay of the commands with which the error stays below 1 m, law by law, none told of it.
 
 Where this differs from theirs: the vehicle has no noise of the motors, and rotors begin at hover speed. A wrong model

@@ -43,15 +43,18 @@ class Demo:
 class Reproduce:
     """Reproduce the paper's results and check its statements.
 
-    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes over an
-    hour, most of it for robust_policies. Includes other solvers and controllers if the bench extra is installed.
+    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes some hours,
+    the longest being robust_policies and adaptive_quad_bench. Includes other solvers and controllers with the extra
+    bench, other simulators with rotorpy and crazyflow, and an emulated board with arm-none-eabi-gcc and
+    qemu-system-arm. What is not installed is skipped, and named.
 
     Exits with 1 if an experiment failed, whether or not the paper's statements hold.
     """
 
     results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
     """Results: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
-    robust_policies, noise_aware, funnels, solver_league. By default all."""
+    robust_policies, noise_aware, funnels, solver_league, other_simulators, adaptive_quad_bench, export_c. By default
+    all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
     """Output folder."""
     quick: bool = False

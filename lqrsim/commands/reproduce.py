@@ -35,6 +35,9 @@ SCRIPTS = (
     "noise_aware",
     "funnels",
     "solver_league",
+    "other_simulators",
+    "adaptive_quad_bench",
+    "export_c",
 )
 
 TIDYING = 20.0  # s, for a stopped script to remove unfinished files
