@@ -55,6 +55,7 @@ CROSSINGS = 8  # most steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the tolerance falls if these fail, and its least value
 AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
 CREEP, CREEPING = 0.1, 20  # part of a step that is short, and number of short ones in a row that end the run
+SLOW = 0.01  # unless the constraints are kept and the cost falls by this share meanwhile
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step that softens equalities, the factor, and its limit
 ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
 FARTHEST = 10.0  # largest violation relative to the first plan's
@@ -427,7 +428,10 @@ class InteriorPoint:
         stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
         self._costates, _ = self._adjoint()
         self._measure()
-        self._farthest = FARTHEST * max(0.05 * stages.steps, self._off(self.point))
+        # In a sum over many rows, those that are far from acting count, too.
+        begun, steps = self._off(self.point), stages.steps
+        self._farthest_gap = FARTHEST * max(0.05 * steps, begun)
+        self._farthest = FARTHEST * max(0.05 * max(steps, len(self._row)), begun)
 
     def _rows_of(self, plan: Motion, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
         """Set up slacks and multipliers."""
@@ -498,12 +502,15 @@ class InteriorPoint:
         if near and self._settle(tolerance, violation):
             watch(self.measures)
             return self._found(True)
-        solved, ended, creeping = self._within(tolerance, violation), False, 0
+        solved, ended, creeping, begun = self._within(tolerance, violation), False, 0, self.measures.cost
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
                 break
             solved = self._within(tolerance, violation)
-            creeping = creeping + 1 if self._part < CREEP else 0
+            now = self.measures
+            falls = now.violation <= violation and now.cost < begun - SLOW * abs(begun)
+            creeping = 0 if self._part >= CREEP or falls else creeping + 1
+            begun = begun if creeping else now.cost
             ended = watch(self.measures) or creeping == CREEPING
         finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
@@ -833,8 +840,11 @@ class InteriorPoint:
 
     def _off(self, point: Point) -> float:
         """Total violation of dynamics and rows at a point, relative to their sizes."""
-        gaps = np.abs(point.arrived - point.plan.states[1:]) / self._state_size
-        return float(gaps.sum() + (np.abs(self._missed(point)) / self._size).sum())
+        return self._gap(point) + float((np.abs(self._missed(point)) / self._size).sum())
+
+    def _gap(self, point: Point) -> float:
+        """The dynamics' share of it."""
+        return float((np.abs(point.arrived - point.plan.states[1:]) / self._state_size).sum())
 
     def _merit(self, point: Point) -> float:
         """Cost plus prices plus barrier."""
@@ -866,7 +876,7 @@ class InteriorPoint:
         """Whether the filter accepts a trial point."""
         off, merit = self._off(tried), self._merit(tried)
         before, at_first = self._off(self.point), self._merit(self.point)
-        if not np.isfinite(merit) or off > self._farthest:
+        if not np.isfinite(merit) or off > self._farthest or self._gap(tried) > self._farthest_gap:
             return False
         if any(off > worst and merit > dearest for worst, dearest in self._filter):
             return False
