@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
@@ -280,7 +281,7 @@ class Stages:
         spread[self.live] = rows
         return spread
 
-    def of_each(self, numbers: Array) -> Array:
+    def of_each(self, numbers: NDArray[Any]) -> NDArray[Any]:
         """Numbers of the rows (R,) for each of the live ones, (K,)."""
         return np.broadcast_to(numbers, self.live.shape)[self.live]
 
