@@ -116,6 +116,45 @@ class TestInfeasible:
         assert f"the plan is from the start {chosen!r}, one of 7" in solution.summary()
 
 
+def car(way: tuple[float, float], weight: float, *, seconds: float = 3.0, steps: int = 30) -> ls.Problem:
+    """A car that drives at most 2 m/s and is to stand at a place, as it stands at the start."""
+    from sympy import cos, sin
+
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0] * cos(x[2]), u[0] * sin(x[2]), u[1]], states={"x": "m", "y": "m", "heading": "rad"},
+        controls={"speed": "m/s", "turn": "rad/s"}, position=("x", "y"),
+    )  # fmt: skip
+    return ls.Problem(
+        dynamics=dynamics, dt=seconds / steps, steps=steps, initial=ls.FixedState(np.zeros(3)),
+        stage_cost=ls.ControlCost(np.full(2, 0.01)),
+        final_cost=ls.QuadraticCost(np.full(3, weight), about=(*way, 0.0)),
+        constraints=[ls.GoalState((*way, 0.0))], control_limits=(-2.0, 2.0),
+    )  # fmt: skip
+
+
+class TestInfeasibleByTheMultipliersAlone:
+    """With finish=None: a violation that no longer falls is evidence only if two starts lead to it."""
+
+    @pytest.mark.parametrize("weight", [0.0, 1.0, 100.0])
+    @pytest.mark.parametrize("aside", [0.2, -0.5, 0.8])
+    def test_a_car_moves_sideways(self, aside: float, weight: float) -> None:
+        """Standing still, nothing moves it that way: there the violation is stationary, from whatever optimum."""
+        solution = ls.smooth(car((0.0, aside), weight), finish=None)
+        assert solution.success, solution.summary()
+        np.testing.assert_allclose(solution.trajectory.states[-1], (0.0, aside, 0.0), atol=1e-3)
+
+    @pytest.mark.parametrize("share", [1.2, 4.0])
+    def test_what_is_too_far_is_infeasible_from_two_starts(self, share: float) -> None:
+        case = car((share * 2.0 * 0.6, 0.1), 1.0, seconds=0.6, steps=10)
+        solution = ls.smooth(case, finish=None)
+        assert solution.status is Status.INFEASIBLE, solution.summary()
+        assert solution.violation >= (share - 1) * 2.0 * 0.6
+        assert len(solution.candidates) >= 2
+        alone = ls.smooth(case, finish=None, start=(0.1, 0.1))
+        assert alone.status is Status.STALLED
+        assert alone.violation == pytest.approx(solution.violation, rel=0.05)
+
+
 class TestTolerance:
     @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
     def test_so_much_is_left_to_spare_at_most(self, tolerance: float) -> None:

@@ -12,7 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from shooting import Shooting
 
 import lqrsim as ls
+from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Status
+from lqrsim.solvers.interior_point import InteriorPoint
 
 DT = 0.1
 # A state, a speed, a control and the cost in another unit: by how much their numbers are larger.
@@ -299,6 +301,58 @@ def test_a_plan_that_is_given_and_keeps_the_constraints_is_not_left_behind(numbe
         assert len(solution.iterations) <= most
         assert solution.status is Status.CONVERGED or most < 500
         assert solution.status in (Status.CONVERGED, Status.MAX_ITERATIONS)
+
+
+# Rows that are many, and mostly far from acting.
+
+
+def balls_along(x, p):
+    """Six along each of two links of 0.4 m, whose angles are x[0] and x[0] + x[1]."""
+    from sympy import cos, sin
+
+    first, both = x[0], x[0] + x[1]
+    shares = [0.4 * k / 6 for k in range(1, 7)]
+    upper = [[way * cos(first), way * sin(first), 0] for way in shares]
+    return upper + [[0.4 * cos(first) + way * cos(both), 0.4 * sin(first) + way * sin(both), 0] for way in shares]
+
+
+@pytest.mark.parametrize("seed", [0, 5, 7, 9])
+def test_an_arm_at_rest_finds_a_plan_among_posts(seed: int) -> None:
+    """How far each of its 36 rows is from what a step foresaw adds up, though hardly any of them acts."""
+    rng = np.random.default_rng(seed)
+    places = [(rng.uniform(0.5, 0.75), rng.uniform(*span)) for span in ((-0.7, -0.3), (0.3, 0.9), (1.5, 2.0))]
+    posts = np.array([(far * np.cos(turn), far * np.sin(turn), 0.0) for far, turn in places])
+    world = ls.World(
+        [ls.Obstacle(f"{i}", "cylinder", post, np.eye(3), np.array([0.04, np.inf, 0])) for i, post in enumerate(posts)]
+    )
+    goal, weight = np.array([2.6, -0.2, 0, 0]), 10 ** rng.uniform(1, 3.3) * np.array([1, 1, 0.1, 0.1])
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[2], x[3], u[0], u[1]], angles=("shoulder", "elbow"), control_limits=(-4, 4),
+        states={"shoulder": "rad", "elbow": "rad", "turn": "rad/s", "bend": "rad/s"}, controls={"a": "", "b": ""},
+    )  # fmt: skip
+    of = ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=80, initial=ls.FixedState((-1.2, 0.1, 0, 0)),
+        stage_cost=ls.ControlCost((0.05, 0.05)), final_cost=ls.QuadraticCost(weight, about=goal),
+        constraints=[ls.Clearance(world, balls=ls.CollisionSpheres(balls_along, np.full(12, 0.03)), margin=0.02)],
+    )  # fmt: skip
+    still = Motion(np.tile((-1.2, 0.1, 0, 0), (81, 1)), np.zeros((80, 2)))
+    with np.errstate(all="ignore"):
+        found = InteriorPoint(of, still, room=0.06).run(tolerance=1e-8, violation=1e-6, most=200)
+    assert found.solved
+    states, controls = found.plan
+    speeds = states[:-1, 2:]
+    moved = np.column_stack([states[:-1, :2] + 0.05 * speeds + 0.05**2 / 2 * controls, speeds + 0.05 * controls])
+    np.testing.assert_allclose(states[1:], moved, atol=1e-7)
+    angles = np.cumsum(states[:, :2], axis=1)
+    ends = np.cumsum(0.4 * np.stack([np.cos(angles), np.sin(angles)], axis=2), axis=1)  # (T+1, link, 2)
+    begins = np.concatenate([np.zeros((81, 1, 2)), ends[:, :1]], axis=1)
+    balls = begins[:, :, None] + np.arange(1, 7)[:, None] / 6 * (ends - begins)[:, :, None]
+    apart = np.linalg.norm(balls[:, :, :, None] - posts[:, :2], axis=-1) - (0.03 + 0.04 + 0.02)
+    assert apart.min() >= -1e-6
+    off = states[-1] - goal
+    cost = 0.5 * 0.05 * (controls**2).sum() + 0.5 * off**2 @ weight
+    assert found.measures.cost == pytest.approx(cost, rel=1e-9)
+    assert cost < 0.8 * 0.5 * (states[0] - goal) ** 2 @ weight
 
 
 # What cannot be.

@@ -227,12 +227,14 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
         lagrangian.update()
         rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
     status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
-    if not lagrangian.kept and not lagrangian.nearly and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST):
-        status, detail = Status.INFEASIBLE, lagrangian.worst()
+    missed = not lagrangian.kept and not lagrangian.nearly
+    stuck = missed and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST)
+    if stuck:
+        status, detail = Status.STALLED, lagrangian.worst()
     if budget.stop.due:
         status = Status.TIME_LIMIT
     found = run.damped_result(ending, status, detail)
-    return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+    return dataclasses.replace(found, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
 
 
 def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:

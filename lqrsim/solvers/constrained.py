@@ -27,12 +27,11 @@ from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajec
 from lqrsim.solvers import augmented_lagrangian, compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.infeasibility import Evidence, evidence
+from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
-STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
 # Iterations of the augmented Lagrangian: from the plan of smoothing; of these, undamped ones that come no closer; and
 # damped ones from a plan of the search, which creep along a wall's corner to optima that cost less.
 AUGMENTED, STALE, REFINED = 50, 25, 100
@@ -57,7 +56,7 @@ class Known:
       rows: (R,) typical sizes of the constraint rows, in which violations are measured.
     """
 
-    evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
+    evidence: list[Evidence] = field(default_factory=list)
     from_start: bool = False
     rows: Array | None = None
 
@@ -86,6 +85,7 @@ class Ladder:
         self._best: RunResult | None = None
         self._given: RunResult | None = None
         self._smoothed: Motion | None = None
+        self._untried: RunResult | None = None  # the start, until the interior point has begun there
         # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
         self._known = known
@@ -120,7 +120,8 @@ class Ladder:
         if not stay:
             rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
         if stay or not self._known.from_start:  # the runs of a search have the same start
-            rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
+            self._untried = start
+            rungs += [self._from_itself, lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()
             if found is not None and found.success:
@@ -172,6 +173,11 @@ class Ladder:
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
         return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
 
+    def _from_itself(self) -> RunResult | None:
+        """From the start, once."""
+        start, self._untried = self._untried, None
+        return None if start is None else self._interior(_plan(start), MUCH)
+
     def _from_start(self, start: RunResult) -> RunResult | None:
         self._known.from_start = True
         return self._at_a_price(_plan(start))
@@ -204,7 +210,11 @@ class Ladder:
         return self._interior(plan, LITTLE)
 
     def _at_a_price(self, plan: Motion | None) -> RunResult | None:
-        """From the plan of a descent in which constraints may be violated at a price."""
+        """From the plan of a descent in which constraints may be violated at a price.
+
+        Where it comes nowhere at one price, a start that keeps the constraints, such as standing still, is tried before
+        the next.
+        """
         if plan is None or self._run.settings.elastic is not None:
             return None
         for price in PRICES:
@@ -217,8 +227,12 @@ class Ladder:
                 return None
             if priced.near or price == PRICES[-1]:
                 found = self._interior(plan, MUCH)
-                if found is not None and found.success:
-                    return found
+            elif self._untried is not None and self._untried.violation <= self._allowed:
+                found = self._from_itself()
+            else:
+                continue
+            if found is not None and found.success:
+                return found
         return None
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
@@ -258,11 +272,11 @@ class Ladder:
             return False
         rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
         found = evidence(
-            self._problem, self._run.work, there.states, there.controls, shares=shares, sizes=rows,
-            allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
+            self._problem, self._run.work, there, shares=shares, sizes=rows, allowed=self._allowed,
+            control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
-            self._known.evidence.append((found, there))
+            self._known.evidence.append(found)
         return found is not None
 
     def _interior(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
@@ -421,14 +435,12 @@ class Ladder:
             lagrangian.evaluate(best.states, best.controls)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
-            evidence = sorted(self._known.evidence, key=lambda pair: pair[0].missed)
-            alike = [one for one in evidence if one[0].missed <= (1 + ALIKE) * evidence[0][0].missed]
-            if len(alike) >= STARTS and best.violation > self._allowed:
-                least, best = alike[0]
+            if best.violation > self._allowed and (same := alike(self._known.evidence)):
+                best = same[0].plan
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                best = replace(best, against=least.beside(detail))
+                best = replace(best, against=same[0].beside(detail))
                 detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)

@@ -219,6 +219,7 @@ class RunResult:
       cost: cost of the plan, as the log has it; infinite where there is no plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
       final: whether another start cannot do better.
+      stuck: whether the violation no longer falls, however large the penalty.
       against: what conflicts with the constraints that are missed, in words, the strongest first.
     """
 
@@ -234,6 +235,7 @@ class RunResult:
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
     final: bool = False
+    stuck: bool = False
     against: tuple[str, ...] = ()
 
     @property

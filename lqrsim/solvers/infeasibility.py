@@ -4,44 +4,53 @@ The total violation, each row relative to its size, has a gradient in the contro
 problem's own functions, on a code path that the solvers do not use. Rows that are just kept balance it with multipliers
 from 0 to 1, which the restoration finds; controls at their limits balance it by themselves. Where everything cancels,
 no plan nearby violates the constraints less.
+
+The augmented Lagrangian's evidence is a violation that does not fall while its penalty grows. Either says that the
+constraints are infeasible only if two starts lead to the same violation.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
-from lqrsim.solvers.engine import Workspace
+from lqrsim.solvers.engine import RunResult, Workspace
 
+STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
 AT_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
 NAMED = 3  # most constraints that a message names beside the one that is violated most
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """A plan whose violation is stationary.
 
     Attributes:
-      states: (T+1, n). controls: (T, m). left: the remaining gradient, relative to the gradients that cancel. missed:
-        the total violation.
+      plan: that plan. missed: its violation, in the same measure for all of one search.
       against: the other constraints that conflict, in words, the strongest first.
     """
 
-    states: Array
-    controls: Array
-    left: float
+    plan: RunResult
     missed: float
-    against: tuple[str, ...]
+    against: tuple[str, ...] = ()
 
     def beside(self, worst: str) -> tuple[str, ...]:
         """The conflicting constraints other than the one that a message begins with, in words."""
         return tuple(name for name in self.against if not worst.startswith(name.rsplit(" at ", 1)[0]))[:NAMED]
 
 
+def alike(found: Sequence[Evidence]) -> list[Evidence]:
+    """The evidence with the least violation, that first; none unless it is from `STARTS` starts."""
+    least = sorted(found, key=lambda one: one.missed)
+    same = [one for one in least if one.missed <= (1 + ALIKE) * least[0].missed]
+    return same if len(same) >= STARTS else []
+
+
 def evidence(
-    problem: Problem, work: Workspace, states: Array, controls: Array, *, shares: list[Array], sizes: list[Array],
+    problem: Problem, work: Workspace, plan: RunResult, *, shares: list[Array], sizes: list[Array],
     allowed: float, control_size: Array, state_size: Array,
 ) -> Evidence | None:  # fmt: skip
     """Return the evidence that a plan provides, or None.
@@ -51,6 +60,7 @@ def evidence(
       sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
       control_size, state_size: typical sizes of controls and states.
     """
+    states, controls = plan.states, plan.controls
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     slopes, alone, missed = np.zeros((steps + 1, n + m)), np.zeros((steps + 1, n + m)), 0.0
     holding: list[tuple[float, str]] = []
@@ -95,12 +105,11 @@ def evidence(
             float((np.abs(of_missed) * control_size).max()),
         )
         ahead, own = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ own
-    left = total / size if size > 0 else 0.0
-    if not left <= STATIONARY:
+    if not total <= STATIONARY * size:
         return None
     names = problem.dynamics.control_coordinates.names
     if size > 0:
         holding += [
             (float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size
         ]
-    return Evidence(states, controls, left, missed, tuple(name for _, name in sorted(holding, reverse=True)))
+    return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
@@ -55,6 +56,7 @@ CROSSINGS = 8  # most steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the tolerance falls if these fail, and its least value
 AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
 CREEP, CREEPING = 0.1, 20  # part of a step that is short, and number of short ones in a row that end the run
+SLOW = 0.01  # unless the constraints are kept and the cost falls by this share meanwhile
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step that softens equalities, the factor, and its limit
 ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
 FARTHEST = 10.0  # largest violation relative to the first plan's
@@ -279,6 +281,10 @@ class Stages:
         spread[self.live] = rows
         return spread
 
+    def of_each(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Numbers of the rows (R,) for each of the live ones, (K,)."""
+        return np.broadcast_to(numbers, self.live.shape)[self.live]
+
     def pull(self, rows: Array) -> Array:
         """The sum of the slopes (T+1, n+m) of the live rows times these numbers."""
         return np.matmul(self.spread(rows)[:, None, :], self.slopes)[:, 0, :]
@@ -310,6 +316,10 @@ class Stages:
         joined = np.zeros((self.steps + 1, self.n + self.m))
         joined[:, : self.n], joined[:-1, self.n :] = self.changes
         return joined
+
+    def moved(self) -> Array:
+        """The changes of the live rows' values, (K,)."""
+        return np.matmul(self.slopes, self.joined()[:, :, None])[:, :, 0][self.live]
 
     def look(self, plan: Motion, costates: Array, *, own: bool = False) -> float:
         """Compute the models about a plan, and the margins of the rows; return its cost. See the kernel."""
@@ -427,7 +437,10 @@ class InteriorPoint:
         stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
         self._costates, _ = self._adjoint()
         self._measure()
-        self._farthest = FARTHEST * max(0.05 * stages.steps, self._off(self.point))
+        # In a sum over many rows, those that are far from acting count, too.
+        begun, steps = self._off(self.point), stages.steps
+        self._farthest_gap = FARTHEST * max(0.05 * steps, begun)
+        self._farthest = FARTHEST * max(0.05 * max(steps, len(self._row)), begun)
 
     def _rows_of(self, plan: Motion, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
         """Set up slacks and multipliers."""
@@ -437,9 +450,8 @@ class InteriorPoint:
         # A cost near zero, as of standing still, says nothing about the scale of the problem.
         self._scale = max(cost, NOTHING * self._typical) if cost < np.inf else FAR * self._typical
         shape = live.shape
-        size = np.broadcast_to(self._row_size, shape)[live]
-        equality = np.broadcast_to(stages.equality, shape)[live]
-        limit = np.broadcast_to(stages.owners == -1, shape)[live]
+        size = stages.of_each(self._row_size)
+        equality, limit = stages.of_each(stages.equality), stages.of_each(stages.owners == -1)
         self._size = size
         highest = np.where(limit, np.inf, price)
         self._highest, self._elastic = highest, bool(np.isfinite(highest).any())
@@ -498,12 +510,15 @@ class InteriorPoint:
         if near and self._settle(tolerance, violation):
             watch(self.measures)
             return self._found(True)
-        solved, ended, creeping = self._within(tolerance, violation), False, 0
+        solved, ended, creeping, begun = self._within(tolerance, violation), False, 0, self.measures.cost
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
                 break
             solved = self._within(tolerance, violation)
-            creeping = creeping + 1 if self._part < CREEP else 0
+            now = self.measures
+            falls = now.violation <= violation and now.cost < begun - SLOW * abs(begun)
+            creeping = 0 if self._part >= CREEP or falls else creeping + 1
+            begun = begun if creeping else now.cost
             ended = watch(self.measures) or creeping == CREEPING
         finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
@@ -538,9 +553,7 @@ class InteriorPoint:
         if np.isfinite(cost) and self._cross(tolerance, violation):
             self.iterations = 1
             return True
-        self.point, self._force, self._costates, self.measures = kept
-        stages.linearize(self.point.plan, self._costates, stages.spread(self._force), 1e-10 * self._scale)
-        self._measure()
+        self._go_back(*kept)
         return False
 
     def _found(self, solved: bool) -> Found:
@@ -562,8 +575,7 @@ class InteriorPoint:
         rounding.
         """
         stages, size, highest = self.stages, self._size, self._highest
-        equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
-        limit = np.broadcast_to(stages.owners == -1, stages.live.shape)[stages.live]
+        equality, limit = stages.of_each(stages.equality), stages.of_each(stages.owners == -1)
         aim = np.where(equality | limit, 0.0, INSIDE * violation)
         kept = self.point, self._force, self._costates, self.measures
         numbers = self.point.numbers
@@ -582,7 +594,7 @@ class InteriorPoint:
             gradient = stages.models.gradient - self.stages.pull(self._force - sigma * numbers)
             if not stages.direction(stages.models.hessian + barrier, gradient, gaps):
                 break
-            moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+            moved = stages.moved()
             self._force = self._force - sigma * (numbers + moved)
             self._costates = stages.to_go.gradient.copy()
             there = self._at(Step(stages.changes, np.zeros(len(self._row)), np.zeros(0), self._costates), 1.0)
@@ -604,16 +616,20 @@ class InteriorPoint:
         right = right and found.stationarity < tolerance and found.gap < tolerance
         if right and (self._elastic or found.violation <= violation):
             return True
-        self.point, self._force, self._costates, self.measures = kept
-        stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 1e-10 * self._scale)
-        self._measure()
+        self._go_back(*kept)
         return False
+
+    def _go_back(self, point: Point, force: Array, costates: Array, measures: Measures) -> None:
+        """Undo steps without a barrier."""
+        self.point, self._force, self._costates, self.measures = point, force, costates, measures
+        self.stages.linearize(point.plan, costates, self.stages.spread(force), 1e-10 * self._scale)
+        self._measure()
 
     def _within(self, tolerance: float, violation: float) -> bool:
         found = self.measures
         others = found.stationarity < tolerance and found.gap < tolerance and found.complementarity < tolerance
         if self._elastic:  # the violation is in the slacks
-            return others and float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0)) < tolerance
+            return others and self._residual() < tolerance
         return others and found.violation <= violation
 
     def _scale_of(self, cost: float) -> float:
@@ -628,6 +644,10 @@ class InteriorPoint:
         """Row values minus slacks, (K,)."""
         return point.numbers - np.bincount(self._row, self._sign * point.slack, len(point.numbers))
 
+    def _residual(self) -> float:
+        """The largest of these now, relative to the rows' sizes."""
+        return float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+
     def _duals(self, force: Array) -> Array:
         """Distances of multipliers from their bounds, (P,)."""
         return self._sign * (force[self._row] - self._bound)
@@ -640,7 +660,7 @@ class InteriorPoint:
         self._scale = self._scale_of(point.cost)
         stationarity = float((np.abs(slopes) * self._range).max())
         stationarity = max(stationarity, float((np.abs(start[0]) * self._state_size * stages.free).max()))
-        equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
+        equality = stages.of_each(stages.equality)
         numbers = point.numbers
         missed = float(np.where(equality, np.abs(numbers), -numbers).max(initial=0.0))
         self._products = point.slack * self._duals(self._force)
@@ -679,7 +699,7 @@ class InteriorPoint:
             hessian = self._hessian(mix, barrier)
             if free and not self._mixed and self._part >= LONG and len(self._row):
                 corrections = self._predict(hessian, sigma, duals, least)
-                self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
+                self._solve(hessian, sigma, duals, corrections)
             step = self._step(sigma, duals, corrections)
             if not self._mixed:
                 step, corrections = self._centred(step, hessian, sigma, duals, corrections)
@@ -693,7 +713,7 @@ class InteriorPoint:
         if taken is None:
             self._forced += 1
             if self._forced > FORCED or not self._solve(
-                self._hessian(1.0, barrier), sigma, duals, np.zeros(len(point.slack)), self._missed(point) * 0
+                self._hessian(1.0, barrier), sigma, duals, np.zeros(len(point.slack))
             ):
                 return False
             self._filter = []
@@ -726,7 +746,7 @@ class InteriorPoint:
 
         That rule empties the filter each time; without this condition iterations may cycle.
         """
-        found, missed = self.measures, float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+        found, missed = self.measures, self._residual()
         error = max(found.stationarity, found.gap, missed, float(self._products.max(initial=0.0)) / self._scale)
         good = error < max(self._errors[-LATELY:], default=np.inf)
         if good:
@@ -735,7 +755,7 @@ class InteriorPoint:
 
     def _lower_barrier(self, least: float) -> None:
         """Lower the barrier parameter while the measures are small relative to it."""
-        missed = float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+        missed = self._residual()
         for _ in range(4):
             off = max(
                 self.measures.stationarity * self._scale, max(missed, self.measures.gap) * self._scale,
@@ -754,20 +774,21 @@ class InteriorPoint:
     def _mix(self, barrier: Array, sigma: Array, duals: Array) -> float | None:
         """Write the step to `stages` with the least fraction of the projected Hessian that works; None if none does."""
         none = np.zeros(len(self.point.slack))
-        nothing = np.zeros(len(self.point.numbers))
         for mix in MIXES:
-            if self._solve(self._hessian(mix, barrier), sigma, duals, none, nothing):
+            if self._solve(self._hessian(mix, barrier), sigma, duals, none):
                 return mix
         hessian, n = self._hessian(1.0, barrier), self.stages.n
         for weight in WEIGHTS:
             heavier = hessian.copy()
             diagonal = np.arange(n, n + self.stages.m)
             heavier[:, diagonal, diagonal] += weight * self._scale / self._range**2
-            if self._solve(heavier, sigma, duals, none, nothing):
+            if self._solve(heavier, sigma, duals, none):
                 return 1.0
         return None
 
-    def _solve(self, hessian: Array, sigma: Array, duals: Array, corrections: Array, beyond: Array) -> bool:
+    def _solve(
+        self, hessian: Array, sigma: Array, duals: Array, corrections: Array, beyond: Array | float = 0.0
+    ) -> bool:
         """Compute the step in plan and costates; `beyond` is added to the rows' residuals."""
         pull = self._force - sigma * (self._target(duals, corrections) + beyond)
         gradient = self.stages.models.gradient - self.stages.pull(pull)
@@ -783,7 +804,7 @@ class InteriorPoint:
     def _step(self, sigma: Array, duals: Array, corrections: Array, beyond: Array | float = 0.0) -> Step:
         """Complete the step in `stages` by slacks and multipliers."""
         stages, point = self.stages, self.point
-        moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+        moved = stages.moved()
         multipliers = -sigma * (moved + self._target(duals, corrections) + beyond)
         ratio = point.slack / duals
         slack = (self.parameter - corrections) / duals - point.slack - self._sign * ratio * multipliers[self._row]
@@ -794,7 +815,7 @@ class InteriorPoint:
         """Mehrotra's rule: set the barrier parameter by an affine step; return its second-order corrections, (P,)."""
         point, none = self.point, np.zeros(len(self.point.slack))
         self.parameter = 0.0
-        self._solve(hessian, sigma, duals, none, np.zeros(len(point.numbers)))
+        self._solve(hessian, sigma, duals, none)
         step = self._step(sigma, duals, none)
         moved = self._sign * step.multipliers[self._row]
         primal, dual = self._longest(point.slack, step.slack, 1.0), self._longest(duals, moved, 1.0)
@@ -819,7 +840,7 @@ class InteriorPoint:
         products = (slack + min(1.0, part + REACH) * step.slack) * (duals + min(1.0, dual_part + REACH) * moved)
         wanted = np.clip(products, self.parameter / OUTLIER, OUTLIER * self.parameter)
         others = corrections - np.maximum(wanted - products, -OUTLIER * self.parameter)
-        if self._solve(hessian, sigma, duals, others, np.zeros(len(self.point.numbers))):
+        if self._solve(hessian, sigma, duals, others):
             other = self._step(sigma, duals, others)
             if self._longest(slack, other.slack) >= part + FURTHER * REACH:
                 return other, others
@@ -833,8 +854,11 @@ class InteriorPoint:
 
     def _off(self, point: Point) -> float:
         """Total violation of dynamics and rows at a point, relative to their sizes."""
-        gaps = np.abs(point.arrived - point.plan.states[1:]) / self._state_size
-        return float(gaps.sum() + (np.abs(self._missed(point)) / self._size).sum())
+        return self._gap(point) + float((np.abs(self._missed(point)) / self._size).sum())
+
+    def _gap(self, point: Point) -> float:
+        """The dynamics' share of it."""
+        return float((np.abs(point.arrived - point.plan.states[1:]) / self._state_size).sum())
 
     def _merit(self, point: Point) -> float:
         """Cost plus prices plus barrier."""
@@ -866,7 +890,7 @@ class InteriorPoint:
         """Whether the filter accepts a trial point."""
         off, merit = self._off(tried), self._merit(tried)
         before, at_first = self._off(self.point), self._merit(self.point)
-        if not np.isfinite(merit) or off > self._farthest:
+        if not np.isfinite(merit) or off > self._farthest or self._gap(tried) > self._farthest_gap:
             return False
         if any(off > worst and merit > dearest for worst, dearest in self._filter):
             return False
@@ -919,7 +943,7 @@ class InteriorPoint:
             gaps = tried.arrived - tried.plan.states[1:]
             if not stages.direction(hessian, stages.pull(sigma * missed), gaps):
                 break
-            moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+            moved = stages.moved()
             multipliers = -sigma * (moved + missed)
             slack = -self._sign * (self.point.slack / duals) * multipliers[self._row]
             change = Step(stages.changes, slack, multipliers, self._costates)

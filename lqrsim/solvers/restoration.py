@@ -58,9 +58,8 @@ def restore(
         gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.
     """
     live = stages.live
-    size = np.broadcast_to(sizes.rows, live.shape)[live]
-    equality = np.broadcast_to(stages.equality, live.shape)[live]
-    limit = np.broadcast_to(stages.owners == -1, live.shape)[live]
+    size, equality = stages.of_each(sizes.rows), stages.of_each(stages.equality)
+    limit = stages.of_each(stages.owners == -1)
     highest = price * sizes.cost / size
     edge = EDGE * np.where(np.isfinite(stages.high - stages.low), stages.high - stages.low, 0.0)
     controls = np.clip(plan.controls, stages.low + edge, stages.high - edge)
@@ -123,7 +122,7 @@ def restore(
                     taken = tried
                     break
             part /= 2
-        moved = np.matmul(stages.slopes, joined[:, :, None])[:, :, 0][live]
+        moved = stages.moved()
         aim = force - curvature * moved  # the multipliers after the whole step
         dual = dual + part * (aim - dual)
         if part > LONG:

@@ -43,6 +43,7 @@ from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.constrained import OPENING, Known, Ladder
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import find_duration, settled
+from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import Measures, iteration_of
 from lqrsim.solvers.multistart import SWAYS, choose, detours, guides, passable, pull, reweighted, sinusoidal_controls
@@ -57,6 +58,8 @@ HEAVIER = (10.0, 100.0)
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 # Iterations for each softness of contacts.
 SOFT = 60
+
+Finish = Callable[[SolveRun, Known], RunResult]
 
 
 def solve(
@@ -113,14 +116,24 @@ def finish(run: SolveRun, known: Known) -> RunResult:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
-    return Ladder(run, known).climb() if run.second_order else augmented_lagrangian.finish(run)
+    if run.second_order:
+        return Ladder(run, known).climb()
+    found = augmented_lagrangian.finish(run)
+    # It begins with the optimum without the constraints, which is often the same from all starts: they count as one.
+    if found.stuck and not known.evidence:
+        known.evidence.append(Evidence(found, found.violation))
+    return found
 
 
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on its side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
-    return augmented_lagrangian.refine(run)
+    found = augmented_lagrangian.refine(run)
+    if not found.stuck:
+        return found
+    known.evidence.append(one := Evidence(found, found.violation))
+    return replace(found, status=Status.INFEASIBLE) if one in alike(known.evidence) else found
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
@@ -245,11 +258,13 @@ class Search:
         starts: dict[str, StartLike] = {
             f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
         }
-        for name, one in (starts | detours(problem)).items():
+        exact = self.best[0].second_order
+        for name, one in (starts | detours(problem) if exact else starts).items():
             if self._budget.stop.due or self.best[1].success:
                 return
             self._known.from_start = False
-            self._finish_from(name, one)
+            # The augmented Lagrangian keeps to a start only where it begins with the start's own plan.
+            self._finish_from(name, one, finish if exact else refine)
 
     def look_aside(self) -> None:
         """Finish plans from paths aside, if the best plan touches a constraint that may be passed on another side."""
@@ -260,10 +275,10 @@ class Search:
                 if name not in tried and not self._budget.stop.due:
                     self._finish_from(name, one)
 
-    def _finish_from(self, name: str, start: StartLike) -> None:
+    def _finish_from(self, name: str, start: StartLike, how: Finish = finish) -> None:
         run = self._another(resolve(start, self._problem))
         self._named.append((name, run))
-        self._finish(run)
+        self._finish(run, how)
 
     def _try_reweighted(self, times: float) -> None:
         """Solve for heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
@@ -354,11 +369,11 @@ class Search:
         problem = self._problem if problem is None else problem
         return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
-    def _finish(self, run: SolveRun) -> None:
-        self._finished.append((run, self._to_its_end(run, finish, self._known)))
+    def _finish(self, run: SolveRun, how: Finish = finish) -> None:
+        self._finished.append((run, self._to_its_end(run, how, self._known)))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
 
-    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
+    def _to_its_end(self, run: SolveRun, how: Finish, known: Known) -> RunResult:
         """Finish a run; the callback hears of all its iterations, also those before."""
         run.budget.report_to(self._callback)
         return how(run, known)
