@@ -14,7 +14,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
-from lqrsim.commands import COMMANDS
+from lqrsim.commands import COMMANDS, console
 from lqrsim.commands.reproduce import SCRIPTS
 from lqrsim.view import gl
 
@@ -254,6 +254,19 @@ def test_bad_input_is_one_line(
     message = one_line(capsys)
     assert all(part in message for part in says), message
     assert sorted(path.name for path in tmp_path.iterdir()) in (before, sorted([*before, "__pycache__"]))
+
+
+def test_what_is_done_quickly_is_not_talked_about(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only what is resumed says at once how much is done: that has taken somebody's time before."""
+    for total in (1, 2, 150):
+        with console.progress("simulating", "step") as progress:
+            for done in range(1, total + 1):
+                progress(done, total)
+    assert capsys.readouterr() == ("", "")
+    with console.progress("stressing", "trial") as progress:
+        for done in (40, 60, 100):
+            progress(done, 100)
+    assert capsys.readouterr() == ("40 of 100 trials are done, 60 to go\n", "")
 
 
 def test_help_has_a_line_for_each_command(capsys: pytest.CaptureFixture[str]) -> None:

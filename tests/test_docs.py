@@ -1,5 +1,6 @@
 """The pages in docs/ are programs: what they build outside the package plugs in, unchanged."""
 
+import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -221,6 +222,13 @@ def test_stress_testing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     small = ["--trials", "4", "--strengths", "1", "--policies", "smooth", "--workers", "0"]
     assert main(["stress", "draught.py:draughty", "--sweep", "scenario", *small]) == 0
     assert ls.stress.Results("runs/stress/draughty").cells == [ls.stress.Cell("smooth", "scenario", 1.0)]
+
+
+def test_every_field_of_an_effect_has_its_row_in_their_order() -> None:
+    page = (DOCS / "stress_testing.md").read_text(encoding="utf-8")
+    table = page.split("returns an `Effect`")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+    assert rows == [field.name for field in dataclasses.fields(ls.disturbances.Effect)]
 
 
 def test_commands_of_pages_exist() -> None:

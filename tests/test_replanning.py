@@ -14,7 +14,7 @@ from point_mass import RADIUS, Oracle, balls, problem
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
-from lqrsim.control.replan_rule import ActivePlan
+from lqrsim.control.replan_rule import ActivePlan, ReplanLog
 from lqrsim.errors import Array
 
 STEPS, DT = 20, 0.1
@@ -274,6 +274,22 @@ def ready(planner: ls.types.LiveReplanner) -> None:
     solve = planner._solve
     while solve is not None and solve.answer is None and solve.error is None:
         time.sleep(1e-3)
+
+
+@pytest.mark.parametrize("cost", [1.0, np.float64(1.0), np.inf, np.float64("inf"), np.nan, np.float64("nan")])
+def test_an_answer_that_leads_to_infinity_is_counted_and_not_used(
+    solver: ls.types.PreparedSolver, solution: ls.Solution, cost: float
+) -> None:
+    """As far outside of a cage, where costs are beyond numbers: the run goes on with the law that it has."""
+    log = ReplanLog()
+    answer = replace(solver.solve(solution.trajectory.states[0], solution), cost=cost)
+    for trial, late in enumerate((False, True)):
+        used = np.isfinite(cost) and not late
+        assert log.enter(3, trial, answer, late=late) is bool(used)
+        record = log.records[-1]
+        assert record.used is bool(used)
+        assert ("infinity" in record.reason) == (not np.isfinite(cost))
+    assert (log.solved, log.kept.total()) == ((1, 1) if np.isfinite(cost) else (0, 2))
 
 
 class TestLive:

@@ -166,7 +166,7 @@ class Progress:
             self._begun, self._last_line, self._before = now, now, done
             options: dict[str, Any] = {"initial": done, "leave": False, "delay": 1.0, "disable": not self._watched}
             self._bar = tqdm(desc=self._what, unit=f" {self._unit}s", total=total, **options)
-            if done and done < total:
+            if 1 < done < total:  # a campaign that is resumed
                 say(f"{done} of {total} {self._unit}s are done, {total - done} to go")
         self._bar.set_postfix_str(found, refresh=False)
         self._bar.update(done - self._bar.n)

@@ -129,7 +129,7 @@ class ReplanLog:
             reason = "not ready in time"
         elif not replan.improved and not replan.success:
             reason = f"{replan.status.name}, without a better plan"
-        finite = np.isfinite(replan.cost)
+        finite = bool(np.isfinite(replan.cost))
         used = finite and not late and (replan.success or replan.improved)
         if not finite:
             reason = "the previous law leads to infinity by the model"

@@ -195,9 +195,10 @@ def reported(what: str, found: Callable[[], str], told: Callable[[], float] = la
                 wait = min(2 * wait, SELDOM)
 
     watcher = threading.Thread(target=watch, name="progress", daemon=True)
-    watcher.start()
     try:
+        watcher.start()
         yield
     finally:
-        ended.set()
-        watcher.join()
+        ended.set()  # first of all: also where Ctrl-C came while the thread began
+        if watcher.is_alive():
+            watcher.join()
