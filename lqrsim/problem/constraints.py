@@ -3,7 +3,6 @@
 To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Constraint` and write `bind`.
 """
 
-import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -28,6 +27,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.kernels import state_bound
+from lqrsim.problem.costs import ProblemPart
 from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
@@ -76,28 +76,8 @@ class ConstraintTerm(Term):
         super().__post_init__()
 
 
-class Constraint(abc.ABC):
+class Constraint(ProblemPart[ConstraintTerm]):
     """One constraint."""
-
-    @abc.abstractmethod
-    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        """Bind the constraint to a system.
-
-        Args:
-          dynamics: dynamics of the system.
-
-        Raises:
-          InputError: it does not fit the system.
-        """
-
-    @property
-    def moving(self) -> bool:
-        """Whether it changes with time; see `_bind_at`."""
-        return False
-
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
-        """This constraint for a system and the times (T+1,) in s of a problem's knots."""
-        return self.bind(dynamics)
 
     def ahead(self, steps: int) -> "Constraint":
         """The constraint after `steps` steps are over: itself, unless it differs from step to step.

@@ -8,7 +8,7 @@ import copy
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -85,17 +85,15 @@ class CostTerm(Term):
             self._keep("factor", check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
 
 
-class Cost(abc.ABC):
-    """One term of a cost."""
+_BoundTerm = TypeVar("_BoundTerm", bound=Term)
 
-    @property
-    def name(self) -> str:
-        """Its name in messages."""
-        return type(self).__name__
+
+class ProblemPart(abc.ABC, Generic[_BoundTerm]):
+    """A cost or a constraint, which can be bound to any system that it fits."""
 
     @abc.abstractmethod
-    def bind(self, dynamics: Dynamics) -> CostTerm:
-        """Bind the cost to a system.
+    def bind(self, dynamics: Dynamics) -> _BoundTerm:
+        """Bind it to a system.
 
         Args:
           dynamics: dynamics of the system.
@@ -109,9 +107,18 @@ class Cost(abc.ABC):
         """Whether it changes with time; see `_bind_at`."""
         return False
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
-        """This cost for a system and the times (T+1,) in s of a problem's knots."""
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
+        """Bind it to a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
+
+
+class Cost(ProblemPart[CostTerm]):
+    """One term of a cost."""
+
+    @property
+    def name(self) -> str:
+        """Its name in messages."""
+        return type(self).__name__
 
     def _in(self, dynamics: Dynamics) -> "Cost":
         """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
