@@ -397,6 +397,9 @@ class Biting:
     ("call", "says"),
     [
         (lambda: dataclasses.replace(ls.load_scene("arena"), geoms=0), "Scene: geoms: got 0, want ids of geoms"),
+        (lambda: dataclasses.replace(ls.load_scene("arena"), geoms=(10**200,)), "Scene: geoms: got 1000"),
+        (lambda: dataclasses.replace(ls.load_scene("arena"), geoms=(-1,)), "Scene: geoms: got -1, want a whole number"),
+        (lambda: dataclasses.replace(ls.load_scene("arena"), geoms=(0, 0)), "Scene: geoms: got (0, 0), want different"),
         (lambda: dataclasses.replace(rate(1, 2), value=[1.0]), "Estimate: value: got [1.0]"),
         (lambda: lq.MjcfRobot("cage", position=Biting()), "MjcfRobot cage: position: got "),
         (lambda: lq.verify_video("it.mp4", np.eye(3)), "rollout: got array"),
