@@ -32,10 +32,13 @@ class Case(NamedTuple):
 
 
 def measure(config: Config) -> dict[str, Any]:
-    kept, found = config.kept(), {name: list[Any]() for name in CASES}
+    chosen = [name for name in CASES if not config.cases or any(word in name for word in config.cases)]
+    if not chosen:
+        raise ls.InputError(f"--cases: got {' '.join(config.cases)}, want words of these: {'; '.join(CASES)}")
+    kept, found = config.kept(), {name: list[Any]() for name in chosen}
     for number in progress(range(config.plans), "chances"):
-        for name, make in CASES.items():
-            row = kept.row(f"chances, {name}, {number}", partial(of_number, config, make, number))
+        for name in chosen:
+            row = kept.row(f"chances, {name}, {number}", partial(of_number, config, CASES[name], number))
             found[name].append(row)
     return found
 

@@ -42,6 +42,8 @@ class Config(FolderSettings):
     """Trials at severe of each thing that is better than it is, and with plans that know what they meet."""
     seed: int = 0
     """Of the disturbances, as in stress_test.py."""
+    cases: tuple[str, ...] = ()
+    """Those of 'chances' whose name has one of these in it, such as severe drive; by default all."""
     keep: Path | None = None
     """File of the plans that 'chances' and 'severe' are done with: the same command goes on there, with more plans
     too."""

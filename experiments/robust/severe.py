@@ -40,7 +40,7 @@ CHANGES = {
     "no lag": Change(LAG),
     "twice the thrust": Change(thrust=(0.0, 2.0)),
     "thrust both ways": Change(thrust=(-1.0, 1.0)),
-    "all of these": Change((*SENSORS, *LAG), (-1.0, 2.0)),
+    "exact sensors, no lag": Change((*SENSORS, *LAG)),
 }
 
 
