@@ -2,6 +2,7 @@
 
     python experiments/robust_policies.py                              # everything, some forty minutes
     python experiments/robust_policies.py --sections presets steady    # some of it
+    python experiments/robust_policies.py --sections chances severe --keep F.json   # goes on where it was stopped
     python experiments/robust_policies.py --quick                      # as little as shows how it works
 
 Each section's numbers are in the folder of the output, as JSON, as soon as they are there.
@@ -12,7 +13,8 @@ steady   A steady wind, a wrong mass: whether it gets there, and what error stay
 drive    The differential drive under all disturbances at once.
 filter   Whether the filter knows how wrong it is.
 chances  The predicted chance of collision against what is measured, for four robots.
-severe   What keeps the quadrotor from its goal at 'severe': the plan, the lag, the thrust or the sensors.
+severe   What keeps the quadrotor from its goal at 'severe': the plan, the lag, the thrust or the sensors; and how many
+         trials have a plan that knows what they meet, which bounds any law.
 worlds   Whether safe plans in random worlds keep the chance that they were asked for, and what they cost.
 """
 

@@ -168,6 +168,35 @@ def measure(config: Any, sections: Sections, result: Result, *, keep_as: str | N
     return result
 
 
+class Kept:
+    """What is done of a long measurement, in a file if there is one: the same command goes on where it was stopped.
+
+    Args:
+      file: JSON; None keeps nothing. asked: what the rows depend on.
+
+    Raises:
+      InputError: the file has rows for something else.
+    """
+
+    def __init__(self, file: Path | None, asked: Result) -> None:
+        self.file, self.asked, self.rows = file, asked, dict[str, Any]()
+        if file is not None and file.is_file():
+            kept = json.loads(file.read_text("utf-8"))
+            if kept["asked"] != asked:
+                raise ls.InputError(f"--keep: got rows for {kept['asked']}, want those for {asked}")
+            self.rows = kept["rows"]
+
+    def row(self, key: str, make: Callable[[], Item]) -> Item:
+        """The row of that key, made if it is not there."""
+        if key not in self.rows:
+            self.rows[key] = make()
+            if self.file is not None:
+                with replacing(self.file) as unfinished:
+                    kept = {"asked": self.asked, "rows": self.rows}
+                    unfinished.write_text(json.dumps(kept, allow_nan=False) + "\n", encoding="utf-8")
+        return self.rows[key]
+
+
 def report_of(sections: Sections, result: Result) -> list[str]:
     """Paragraphs of the sections that were measured."""
     parts = []

@@ -94,7 +94,7 @@ def test_ctrl_c_keeps_the_best_plan_so_far(problem: ls.Problem) -> None:
         ls.smooth_chance_constrained(problem, UNCERTAINTY, chance=1e-3, controller=tracked, progress=progress)
     plan = stopped.value.found  # pyright: ignore[reportAttributeAccessIssue]
     assert isinstance(plan, ls.types.SafePlan)
-    assert [one[:2] for one in told] == [(0, 8), (0, 8), (1, 8), (2, 8)]
+    assert [one[:2] for one in told] == [(0, 14), (0, 14), (1, 14), (2, 14)]  # with six weights after the rounds
     assert told[1][2].startswith(f"chance {plan.rounds[0][-1]:.2g} with margins of")
     assert plan.tube.collision_chance == min(one[-1] for one in plan.rounds)
 
@@ -147,9 +147,16 @@ def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -
         replace(problem, stage_cost=stage),
         Uncertainty(start=0.2, control=3.0, measurement=0.2),
     )
-    plan = ls.smooth_chance_constrained(narrow, wild, chance=1e-3, controller=tracked, rounds=1)
+    told: list[tuple[int, int, str]] = []
+    plan = ls.smooth_chance_constrained(
+        narrow, wild, chance=1e-3, controller=tracked, rounds=1, progress=lambda *one: told.append(one)
+    )
     assert plan.success
     assert plan.weight > 1
+    # Each plan is told once it is there, the heavier ones too, and they are counted among what there may be.
+    assert {one[2].split(" ")[1] for one in told[1:]} == {f"{line[-1]:.2g}" for line in plan.rounds}
+    assert [one[:2] for one in told if "the weight of obstacles" in one[2]][-1] == (7, 7)
+    assert sorted(told, key=lambda one: one[0]) == told
     (cost,) = plan.problem.obstacle_costs
     assert cost.weight == plan.weight
     assert f"with {plan.weight:g} times the weight of obstacles" in str(plan)

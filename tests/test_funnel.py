@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from pucks import RADIUS, STEPS, left, plant, solution
+from pucks import RADIUS, STEPS, Puck, left, plant, solution
 from scipy import stats
 
 import lqrsim as ls
@@ -18,10 +18,16 @@ from lqrsim.cli import main
 from lqrsim.disturbances import (
     ControlDelay,
     ControlNoise,
+    Disturbance,
+    Dryden,
     ForceNoise,
     Gusts,
     InitialStateError,
+    MassMismatch,
+    MeanWind,
     MeasurementNoise,
+    Push,
+    Saturation,
 )
 from lqrsim.errors import InputError
 from lqrsim.simulation.start_at import simulate_from
@@ -31,6 +37,13 @@ from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smal
 ice: Any = pytest.fixture(scope="module")(lambda tmp_path_factory: plant(tmp_path_factory.mktemp("ice")))
 PLAN = solution()
 COARSE: dict[str, Any] = {"rate": 0.8, "confidence": 0.9, "failures": 20}
+
+
+@dataclass(frozen=True)
+class Sail(Puck):
+    """The puck, in the wind."""
+
+    drag: float = 0.5
 
 
 def reach(knot: int) -> float:
@@ -95,6 +108,13 @@ def test_contains(ice: ls.Plant) -> None:
     assert f"{found.successes[0]} of {found.trials[0]} fresh" in found.summary()
 
 
+def test_what_does_not_act_is_not_listed(ice: ls.Plant) -> None:
+    """The command takes an error of the start out of a set by scaling it to zero; the others keep their numbers."""
+    given = [ForceNoise(0.02), InitialStateError(0.1).scaled(0.0), ControlNoise(0.01)]
+    found = ls.funnel(ice, PLAN, disturbances=given, knots=(0,), largest=0.01, **COARSE)
+    assert found.disturbances == tuple(given[i].describe(ice) for i in (0, 2))
+
+
 def test_from_nowhere(ice: ls.Plant) -> None:
     """A goal that the plan misses: level 0, with the reason; and a largest level that all succeed from."""
     lost = replace(PLAN, goal=np.array([1.0, 0, 0, 0]))
@@ -143,6 +163,10 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
         ({"seed": -1}, "seed"),
         ({"disturbances": [3]}, "disturbances"),
         ({"disturbances": [InitialStateError(5.0)]}, "got InitialStateError, which changes the start of a run"),
+        (
+            {"disturbances": [ForceNoise(0.1), InitialStateError(1e-9)], "knots": (5,)},
+            "got InitialStateError, which changes the start of a run",
+        ),
         ({"controller": 3}, "controller"),
         ({"progress": 3}, "progress"),
         ({"plant": 3}, "plant"),
@@ -272,6 +296,23 @@ class TestBegunLater:
         np.testing.assert_allclose(rest.states, whole.states[:, knot:], rtol=0, atol=1e-12)
         np.testing.assert_allclose(rest.applied, whole.applied[:, knot:], rtol=0, atol=1e-12)
         assert (np.abs(whole.states[:, knot:]).max(axis=(1, 2)) > 1e-3).all()
+
+    @pytest.mark.parametrize(
+        "one",
+        [
+            MeanWind((0.2, 0.1, 0.0)), Gusts(0.5), Dryden("light"), Push((0.3, 0.0, 0.0), at=1.2),
+            MassMismatch(0.05), Saturation(lowest=-0.01, highest=0.01), ForceNoise(0.05),
+        ],
+        ids=lambda one: type(one).__name__,
+    )  # fmt: skip
+    def test_what_happens_at_a_time_happens_then(self, ice: ls.Plant, one: Disturbance) -> None:
+        """Each kind without a memory of its own, alone, goes on as in the whole run: to rounding."""
+        sail = ls.Plant(Sail(), ice.scene)
+        whole = ls.simulate(sail, PLAN, disturbances=[ForceNoise(0.1), one], trials=3, seed=7)
+        rest = simulate_from(sail, PLAN, whole.states[:, 9], knot=9, disturbances=[ForceNoise(0.1), one], seed=7)
+        np.testing.assert_allclose(rest.states, whole.states[:, 9:], rtol=0, atol=1e-12)
+        without = ls.simulate(sail, PLAN, disturbances=[ForceNoise(0.1)], trials=3, seed=7)
+        assert np.abs(whole.states[:, 9:] - without.states[:, 9:]).max() > 1e-4
 
     def test_a_delay_has_its_past(self, ice: ls.Plant) -> None:
         """Controls that are on their way at the knot are the plan's, and not those of the deviation."""

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import hypothesis.strategies as st
@@ -593,3 +594,15 @@ def test_what_cannot_be_kept_is_not_called_converged() -> None:
     assert found.violation == pytest.approx(-went.rows(z, False).min(), abs=1e-9)
     # From 1.5 m/s the bound of 0.5 is missed at the first step by what full braking leaves.
     assert found.violation >= 1.5 - 2.0 * DT - 0.5 - 1e-9
+
+
+@pytest.mark.parametrize("slope", [-1e100, -1e134, -1e300])
+def test_a_slope_beyond_what_powers_can_hold_is_compared(slope: float) -> None:
+    """From a start that is thrown far off; a merit that falls by so much passes, and one that does not, does not."""
+    now, better, worse = (SimpleNamespace(merit=merit) for merit in (-slope, 0.0, -1.1 * slope))
+    point: Any = SimpleNamespace(
+        point=now, _off=lambda one: 0.0, _merit=lambda one: one.merit, _farthest=1.0, _filter=[], _gaps=np.zeros(3)
+    )
+    acceptable: Any = InteriorPoint._acceptable
+    assert acceptable(point, better, 1.0, slope)
+    assert not acceptable(point, worse, 1.0, slope)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from linear_plans import DT, Linear, double_integrator
+from linear_plans import DT, Linear, double_integrator, linear
 from tracking import hover, track
 
 import lqrsim as ls
@@ -166,6 +166,30 @@ def test_steady_disturbances_leave_no_error(
     error = rollout.tracking_error[0]
     assert error.max() > 0.005  # it is a disturbance
     assert error[300:].max() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_memory_without_end_takes_the_statement_as_it_is(seed: int) -> None:
+    """The filter then is as wrong as it thinks, to rounding; and where that is so, no other filter errs less.
+
+    How wrong it is comes from the joint recursion of state and estimate, which knows no filter but by its gains.
+    """
+    rng = np.random.default_rng(seed)
+    rates, inputs, pushes = (rng.normal(size=(2, columns)) for columns in (2, 1, 1))
+    system = linear(rates, inputs, pushes, steps=15)
+    unknowns = [Unknown("d0", 0.7), Unknown("d0", 0.5, time_constant=0.4, order=2)]
+    told = Uncertainty(unknowns=unknowns, lag=0.05, measurement=0.1, start=0.3, control=0.2, model_error=0.3)
+    errors = []
+    for memory in (np.inf, None):
+        law = ls.OffsetFree(system.problem, system.solution, told, tolerate=0.5, effort=2.0, memory=memory)
+        tube = ls.predict_tube(system.problem, system.solution, told, law, samples=0)
+        assert tube.estimate_covariance is not None
+        errors.append(tube.estimate_covariance)
+        if memory == np.inf:
+            np.testing.assert_allclose(tube.estimate_covariance, law.filter.predicted[:, :2, :2], rtol=1e-9, atol=1e-12)
+    best, offset_free = (np.trace(one, axis1=1, axis2=2) for one in errors)
+    assert (offset_free >= best * (1 - 1e-9)).all()
+    assert offset_free[-1] > 1.001 * best[-1]
 
 
 def test_after_the_horizon_the_last_laws_stay_in_force() -> None:

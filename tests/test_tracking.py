@@ -13,6 +13,8 @@ from linear_plans import DT, Linear, linear
 from scipy.linalg import expm
 
 import lqrsim as ls
+from lqrsim.control import tracking
+from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
@@ -188,6 +190,32 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     best = np.linalg.lstsq(slope, -base, rcond=None)[0].reshape(-1, m)
     u = gain[0] @ np.concatenate([e, a[: model.lagging], d]) + offset[0]
     np.testing.assert_allclose(system.plan.controls[0] + u, best[0], rtol=0, atol=1e-5 * (1 + np.abs(u).max()))
+
+
+@hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.0, 0.05, 0.5, 0.95]))
+@hypothesis.settings(max_examples=12)
+def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, seed: int, share: float) -> None:
+    """What compares tolerances computes a part of the covariance, for several laws at once: to 1e-9 of the numbers."""
+    system, uncertainty = drawn(structure, seed, unstable=False)
+    uncertainty = dataclasses.replace(
+        uncertainty, command_loss=share, start=0.3, measurement=0.1, control=0.2, model_error=0.05
+    )
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
+    limits = np.full(m, -1.0), np.full(m, 1.5)
+    given = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "prediction_of", lambda *parts: given.append(parts))
+        tracking.of_states(model, gain, offset, limits, Surroundings.of(system.problem, 0.0), None)
+    whole = LinearLoop(model, gain, offset, None, *limits).moments()
+    for i, (_, mean, covariance, across, saturation, *_) in enumerate(given):
+        for found, wanted in (
+            (mean, whole.mean[i, :, :n]), (covariance, whole.covariance[i, :, :n, :n]), (across, whole.across[i]),
+            (saturation, whole.saturation[i].mean()),
+        ):  # fmt: skip
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
+    assert len(given) == 3
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.05, 0.5, 0.95]))

@@ -32,13 +32,19 @@ class Case(NamedTuple):
 
 
 def measure(config: Config) -> dict[str, Any]:
-    return {
-        name: [of_case(config, number, make(number)) for number in progress(range(config.plans), f"chances, {name}")]
-        for name, make in CASES.items()
-    }
+    chosen = [name for name in CASES if not config.cases or any(word in name for word in config.cases)]
+    if not chosen:
+        raise ls.InputError(f"--cases: got {' '.join(config.cases)}, want words of these: {'; '.join(CASES)}")
+    kept, found = config.kept(), {name: list[Any]() for name in chosen}
+    for number in progress(range(config.plans), "chances"):
+        for name in chosen:
+            row = kept.row(f"chances, {name}, {number}", partial(of_number, config, CASES[name], number))
+            found[name].append(row)
+    return found
 
 
-def of_case(config: Config, number: int, case: Case) -> dict[str, Any]:
+def of_number(config: Config, make: Callable[[int], Case], number: int) -> dict[str, Any]:
+    case = make(number)
     plan, tube = case.plan, case.plan.tube
     row: dict[str, Any] = {
         "number": number, "asked": plan.asked, "linear": tube.linear_chance, "predicted": tube.collision_chance,

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 from paper.common import fixed
-from runner import FolderSettings, at_most
+from runner import FolderSettings, Kept, at_most
 
 import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
@@ -37,12 +38,23 @@ class Config(FolderSettings):
     """Random ones, each with a safe plan."""
     world_trials: int = 1000
     """In each of them."""
+    without: int = 300
+    """Trials at severe of each thing that is better than it is, and with plans that know what they meet."""
     seed: int = 0
     """Of the disturbances, as in stress_test.py."""
+    cases: tuple[str, ...] = ()
+    """Those of 'chances' whose name has one of these in it, such as severe drive; by default all."""
+    keep: Path | None = None
+    """File of the plans that 'chances' and 'severe' are done with: the same command goes on there, with more plans
+    too."""
+
+    def kept(self) -> Kept:
+        """What is done."""
+        return Kept(self.keep, {name: getattr(self, name) for name in ("particles", "world_trials", "without", "seed")})
 
     def bounded(self) -> Self:
         """The settings, reduced by `--quick`."""
-        return at_most(self, trials=5, queries=1, alone=3, plans=1, particles=20, worlds=1, world_trials=20)
+        return at_most(self, trials=5, queries=1, alone=3, plans=1, particles=20, worlds=1, world_trials=20, without=10)
 
 
 def reach_exactly(problem: ls.Problem) -> ls.Problem:

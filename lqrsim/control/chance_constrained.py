@@ -121,7 +121,8 @@ def smooth_chance_constrained(
       controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
       rounds: plans with clearances to solve for, at most.
-      progress: called with the rounds that are done, all of them, and what the last one found as text.
+      progress: called with the plans that are done, the most that there may be, with margins and then with heavier
+        obstacles, and what the last one found as text.
 
     Returns:
       The SafePlan.
@@ -140,21 +141,25 @@ def smooth_chance_constrained(
     if not surroundings.worlds:
         raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
     search = _Search(problem, uncertainty, chance, controller, surroundings)
-    with keeping(lambda _: search.result() if search.plans else None):
+    most = rounds + (len(HEAVIER) if problem.obstacle_costs else 0)
+
+    def tell(done: int) -> None:
         if progress is not None:
-            progress(0, rounds, "")
+            progress(done, most, search.last() if search.plans else "")
+
+    with keeping(lambda _: search.result() if search.plans else None):
+        tell(0)
         search.solve(None)
         for done in range(rounds):
-            if progress is not None:
-                progress(done, rounds, search.last())
+            tell(done)
             deviations = search.next_deviations()
             if deviations is None:
                 break
             search.solve(deviations)
-        for times in search.heavier():
+        for done, times in enumerate(search.heavier()):
+            tell(rounds + done)
             search.solve_heavier(times)
-    if progress is not None:
-        progress(rounds, rounds, search.last())
+        tell(most)
     return search.result()
 
 
@@ -340,7 +345,9 @@ class _Search:
     def last(self) -> str:
         """The last plan, for the progress."""
         low, high, cost, chance = self.lines[-1]
-        return f"chance {chance:.2g} with margins of {low:.3g} to {high:.3g} m, cost {cost:.5g}"
+        weight = self.plans[-1].weight
+        how = f"margins of {low:.3g} to {high:.3g} m" if weight == 1 else f"{weight:g} times the weight of obstacles"
+        return f"chance {chance:.2g} with {how}, cost {cost:.5g}"
 
     def result(self) -> SafePlan:
         best = replace(self._best(), rounds=tuple(self.lines))

@@ -17,8 +17,8 @@ from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.tracking import Prediction, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
-from lqrsim.control.uncertainty import Uncertainty, per_entry
-from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
+from lqrsim.control.uncertainty import Uncertainty, check_seconds, per_entry
+from lqrsim.errors import Array, InputError, check_flag, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, PerEntry
@@ -57,7 +57,8 @@ class OffsetFree(Controller):
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
-      memory: in s, by default 5 s, or the plan's horizon where that is shorter.
+      memory: in s, by default 5 s, or the plan's horizon where that is shorter. np.inf takes the uncertainty as it is
+        stated: constants do not change, what varies has the mean zero, and a steady disturbance leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
       replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
         without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
@@ -108,7 +109,7 @@ class OffsetFree(Controller):
         check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
         plan = solution.trajectory
         memory = min(plan.horizon, MEMORY) if memory is None else memory
-        memory = check_number("OffsetFree: memory", memory, above=0.0)
+        memory = check_seconds("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
         self.record = check_flag("OffsetFree: record", record)
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
@@ -206,17 +207,18 @@ def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
 
     Args:
       model: the model with the uncertainty as stated.
-      memory: seconds.
+      memory: seconds, or infinity, as of an `OffsetFree`.
       effort: effort of the controls, (m,).
     """
     stated, space = model.uncertainty, model.dynamics.state_coordinates
+    told = stated.as_steady if memory == np.inf else stated.steady(memory)
     moved = unit_means(space.units, reach_of(model, effort, 2)[2])
     control = per_entry("Uncertainty: control", stated.control, model.dynamics.control_coordinates)
     lost = stated.command_loss
     control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # for the filter expects the mean
     error = per_entry("Uncertainty: model_error", stated.model_error, space)
     assumed = replace(
-        stated.steady(memory), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+        told, control=tuple(np.maximum(control, INEXACT * effort).tolist()),
         model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
     )  # fmt: skip
     return replace(model, uncertainty=assumed)

@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.kalman import KalmanFilter
-from lqrsim.control.linear_loop import LinearLoop, limited
+from lqrsim.control.linear_loop import limited
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import AT_END, Averse, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
@@ -177,6 +177,60 @@ def with_filter(
     ]
 
 
+def of_states(
+    model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array], surroundings: Surroundings,
+    radius: float | None,
+) -> list[Prediction]:  # fmt: skip
+    """Predictions for C laws of the states that are shown, (C, T, m, n) and (C, T, m), in deviations from the plan.
+
+    The moments are those of `linear_loop.py`. No law moves the unknowns: their rows are the same for all, and of the
+    covariance's next one only the rows for the state and the actuators are computed.
+    """
+    n, own, steps, count, size = model.n, model.n + model.lagging, model.plan.steps, len(gain), model.size
+    covariance, mean = np.tile(model.start_root @ model.start_root.T, (count, 1, 1)), np.zeros((count, own))
+    states, across = np.empty((count, steps + 1, n, n)), np.empty((count, steps, n, n))
+    means, beyond = np.empty((count, steps + 1, n)), np.zeros((count, model.m))
+    shown, transition, unknowns = model.shown_std**2, model.transition, covariance[0, own:, own:]
+    arrives, *lost = model.steps_of_commands
+    for t in range(steps + 1):
+        states[:, t], means[:, t] = covariance[:, :n, :n], mean[:, :n]
+        if t == steps:
+            break
+        law, planned, noise = gain[:, t], model.plan.controls[t], model.process_noise[t]
+        F, G = arrives.F[t, :own], arrives.G[t, :own]
+        response = law @ covariance[:, :n]
+        std = np.sqrt(np.maximum((response[:, :, :n] * law).sum(axis=2) + law**2 @ shown, 0.0))
+        centre = planned + offset[:, t] + (law @ mean[:, :n, None])[:, :, 0]
+        slope, level, left = limited(centre, std, *limits)
+        beyond += (1 - slope) / steps
+        law, response = slope[:, :, None] * law, slope[:, :, None] * response
+        # M P for M = F + G law: the covariance with what was. All of them in one product, for P is symmetric.
+        free = np.ascontiguousarray((covariance.reshape(-1, size) @ F.T).reshape(count, size, own).swapaxes(1, 2))
+        moved, base = free + G @ response, mean @ F[:, :own].T
+        pushed = moved[:, :, :n] @ law.swapaxes(1, 2)
+        pushed += G @ ((law * shown) @ law.swapaxes(1, 2))
+        pushed[:] += G * left[:, None, :]
+        ahead, spread = base + (level - planned) @ G.T + arrives.c[t, :own], 0.0
+        if lost:  # what is in force stays, as if the law were to ask for it
+            (other,), kept = lost, slice(n, own)
+            moved_on, ahead_on = free + G @ covariance[:, kept], base + mean[:, kept] @ G.T + other.c[t, :own]
+            off = (ahead_on - ahead)[:, :, None]
+            spread = arrives.share * other.share * off * off.swapaxes(1, 2)
+            moved = arrives.share * moved + other.share * moved_on
+            pushed = arrives.share * pushed + other.share * moved_on[:, :, kept]
+            ahead = arrives.share * ahead + other.share * ahead_on
+        across[:, t], mean = moved[:, :n, :n], ahead
+        own_next = (moved.reshape(-1, size) @ F.T).reshape(count, own, own) + pushed @ G.T + spread
+        meet = moved[:, :, own:] @ transition.T + noise[:own, own:]
+        unknowns = transition @ unknowns @ transition.T + noise[own:, own:]
+        covariance[:, :own, :own], covariance[:, :own, own:] = own_next + noise[:own, :own], meet
+        covariance[:, own:, :own], covariance[:, own:, own:] = meet.swapaxes(1, 2), unknowns
+    saturation = beyond.mean(axis=1).tolist()
+    return [
+        prediction_of(model, means[i], states[i], across[i], saturation[i], surroundings, radius) for i in range(count)
+    ]
+
+
 def track(
     problem: Problem,
     solution: Solution,
@@ -239,15 +293,7 @@ def track(
 
         def predicted(tried: Weights) -> list[Prediction]:
             gain, offset = tracking_laws(model, tried)
-            moments, n = LinearLoop(truth, gain[..., : model.n], offset, None, *limits).moments(), model.n
-            saturation = moments.saturation.mean(axis=(1, 2)).tolist()
-            return [
-                prediction_of(
-                    truth, moments.mean[i, :, :n], moments.covariance[i, :, :n, :n], moments.across[i],
-                    saturation[i], surroundings, solution.goal_radius,
-                )
-                for i in range(len(saturation))
-            ]  # fmt: skip
+            return of_states(truth, gain[..., : model.n], offset, limits, surroundings, solution.goal_radius)
 
         weights = choose_tolerances(model, predicted, efforts, at_end).weights
     gain, offset = _laws(problem, solution, model, weights, risk)

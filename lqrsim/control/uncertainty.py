@@ -66,7 +66,8 @@ class Unknown:
             check_number(f"Unknown: of: {name}", share)
         object.__setattr__(self, "std", check_number("Unknown: std", self.std, at_least=0.0))
         object.__setattr__(self, "drift", check_number("Unknown: drift", self.drift, at_least=0.0))
-        object.__setattr__(self, "time_constant", _seconds("Unknown: time_constant", self.time_constant, at_least=0.0))
+        constant = check_seconds("Unknown: time_constant", self.time_constant, at_least=0.0)
+        object.__setattr__(self, "time_constant", constant)
         check_count("Unknown: order", self.order, at_most=2)
         if self.order == 2 and not 0 < self.time_constant < np.inf:
             raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
@@ -187,7 +188,7 @@ class Uncertainty:
         Raises:
           InputError: a number is out of range.
         """
-        memory = _seconds("memory", memory, above=0.0)
+        memory = check_seconds("memory", memory, above=0.0)
         share = check_number("share", share, at_least=0.0)
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
         for one in self.unknowns:
@@ -212,7 +213,7 @@ def possible_unknowns(dynamics: Dynamics) -> list[str]:
     return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
 
 
-def _seconds(field: str, value: float, **bounds: float) -> float:
+def check_seconds(field: str, value: float, **bounds: float) -> float:
     """A time that may be infinite."""
     return value if isinstance(value, float) and value == np.inf else check_number(field, value, **bounds)
 

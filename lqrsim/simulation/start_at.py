@@ -106,7 +106,7 @@ class _Later(Disturbance):
         if self.knot == 0:
             return effect
         past: dict[str, tuple[Array, ...]] = {  # in the order of a control period
-            "measure": (states,), "actuate": (controls,), "force": (states,), "torque": (states,),
+            "measure": (states,), "actuate": (controls,), "force": (states,), "torque": (states,), "wind": (states,),
             "kick": (states, controls),
         }  # fmt: skip
         hooks = {name: hook for name in past if (hook := getattr(effect, name)) is not None}

@@ -895,7 +895,7 @@ class InteriorPoint:
         if any(off > worst and merit > dearest for worst, dearest in self._filter):
             return False
         small = 1e-4 * max(1.0, 1e-2 * self._gaps.size)
-        if before < small and slope < 0 and (-part * slope) ** 2.3 > before**1.1:
+        if before < small and slope < 0 and min(-part * slope, 1e100) ** 2.3 > before**1.1:
             return merit <= at_first + ARMIJO * part * slope + 1e-12 * abs(at_first)
         at_rest = off < 1e-9 and merit <= at_first + 1e-11 * abs(at_first)
         return off <= (1 - MARGIN) * before or merit <= at_first - MARGIN * before or at_rest

@@ -29,7 +29,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel, flat, inverse_of
 from lqrsim.results.goal import Target, endings
 from lqrsim.results.solution import Solution
-from lqrsim.simulation.disturbances import Disturbance, as_disturbances
+from lqrsim.simulation.disturbances import Disturbance, InitialStateError, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.start_at import simulate_from
@@ -170,7 +170,7 @@ def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike 
         plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
         shape=shapes, family=_family(shape), knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
         reasons=("",) * len(starts), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
-        disturbances=tuple(one.describe(trials.plant) for one in trials.disturbances), versions=versions(),
+        disturbances=trials.described, versions=versions(),
         rate=asked.rate, confidence=asked.confidence, seed=asked.seed,
         options={"failures": asked.failures, "largest": asked.largest},
     )  # fmt: skip
@@ -310,6 +310,12 @@ class _Trials:
         self.radius = self.target.radius(plant.robot.radius, *near)
         self.options: Mapping[str, Any] = {"goal_radius": near[0], "goal_tolerance": near[1], "frames": False,
                                            "contacts": False, "threads": check_threads(threads)}  # fmt: skip
+
+    @property
+    def described(self) -> tuple[str, ...]:
+        """The disturbances that act, in words. An error of the start is zero here: any other is refused."""
+        acting = (one for one in self.disturbances if not isinstance(one, InitialStateError))
+        return tuple(one.describe(self.plant) for one in acting)
 
     def reached(self, states: Array, knot: int, seed: int, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Whether the trials with these numbers (K,), begun in the states (K, n), reach the goal, (K,)."""

@@ -38,8 +38,8 @@ def contradictions(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | 
 def _of_any_plan(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None) -> list[str]:
     """The plan is the rollout of its policy from where it must start, inside the limits, and costs what is said."""
     plan, policy, found = solution.trajectory, solution.policy, []
-    if isinstance(problem.initial, ls.FixedState) and not np.array_equal(plan.states[0], problem.initial.state):
-        found.append(f"begins at {plan.states[0]}, not at {problem.initial.state}")
+    if isinstance(problem.initial, ls.FixedState) and not np.array_equal(plan.states[0], problem.initial.numbers):
+        found.append(f"begins at {plan.states[0]}, not at {problem.initial.numbers}")
     low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
     if ((plan.controls < low) | (plan.controls > high)).any():
         found.append("a control is beyond its limits")
