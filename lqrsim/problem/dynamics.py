@@ -4,7 +4,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,9 @@ from lqrsim.errors import (
 )
 from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates
+
+if TYPE_CHECKING:
+    from lqrsim.scenes.contact_modes import ContactModes
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
 # Most operations of a formula that is differentiated twice, which then takes about five seconds.
@@ -249,6 +252,10 @@ class Dynamics:
           states: (T+1, n) of a plan; where nothing touches along it, there are none.
         """
         return iter(())
+
+    def contact_modes(self, dt: float) -> "ContactModes | None":
+        """What acts in control periods of `dt` seconds, for dynamics that are smooth only as long as the same does."""
+        return None
 
     @cached_property
     def step_source(self) -> Source:
