@@ -216,8 +216,8 @@ class ContactCertificate:
 
     Attributes:
       pressed: number of switches that the plan is pressed against: without them its cost would fall.
-      across: by how much the cost could at most be lower across one of these, by the jump and the slope there; negative
-        if it rises across each, and minus infinity where there is none, or none can be crossed on its own.
+      across: by how much the cheapest plan across one of these is below the plan, on rays up to 128 times the radius;
+        negative if all are dearer, and minus infinity where there is none, or none can be crossed on its own.
       sampled: by how much the cheapest of the sampled plans is below the plan; negative if all are dearer.
       radius: how far these plans change a control at most, as a part of its range. samples: how many there are.
     """
@@ -232,7 +232,7 @@ class ContactCertificate:
         check_fields(self)
 
     def __str__(self) -> str:
-        sides = f", the cost at least {-self.across:.1e} higher across each" if np.isfinite(self.across) else ""
+        sides = f", across each the cheapest is {-self.across:+.1e}" if np.isfinite(self.across) else ""
         return (
             f"optimal within the modes, against {self.pressed} switches{sides}; of {self.samples} plans within"
             f" {self.radius:g} of the controls' ranges the cheapest is {-self.sampled:+.1e}"

@@ -169,7 +169,7 @@ class ContactModes:
         jacobian, slopes = np.empty((n, len(point))), np.empty((len(switches.names), len(point)))
         certain = True
         for k in range(len(point)):
-            sides, moved = dict[float, tuple[Array, Switches]](), 0.0
+            both, sides, moved = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
             for share in _SMALLER:
                 moved = share * 1e-6 * max(1.0, abs(point[k]))
                 both = {sign: self._moved(point, k, sign * moved) for sign in (1, -1)}

@@ -14,7 +14,7 @@ The plan is optimal if neither is possible; `optimality_in_mode` and `surroundin
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ HALVINGS = 8  # of a step that are tried before it is damped more
 DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature where steps fail, at first and at most
 ROUNDS = 50  # of adding switches to a quadratic program
 SMALL = 1e-3  # how far plans beside a plan change a control, as a part of its range
-SAMPLES = 50  # of plans beside a plan
+SAMPLES, RAY = 50, 8  # plans beside a plan; how often the way across a switch doubles
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def minimize(model: Model, curvature: Array, *, across: int | None = None, depth
     """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
 
     Args:
-      across: a switch that must be on its other side instead, as far as `depth`.
+      across: a switch that must be on its other side instead, by `depth`; the change is the least one then.
     """
     try:
         factor = scipy.linalg.cholesky(curvature, lower=True)
@@ -145,7 +145,7 @@ def minimize(model: Model, curvature: Array, *, across: int | None = None, depth
     felt = lengths > 1e-12 * max(lengths.max(initial=0.0), 1e-300)
     rows, which, lengths = rows[felt] / lengths[felt, None], which[felt], lengths[felt]
     bounds = bounds[which] / lengths
-    free = -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
+    free = np.zeros(size) if across is not None else -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
     # The nearest point to `free` with rows y >= bounds; Lawson and Hanson's way to least distances.
     short, nearest, weights = bounds - rows @ free, free, np.zeros(len(bounds))
     active = np.flatnonzero(short > 0)
@@ -194,7 +194,7 @@ class Descent:
         while not self._budget.over:
             if about is not self.model:
                 aim, about = minimize(self.model, self.model.hessian), self.model
-            if aim is not None and aim.decrease < 0.5 * self._tolerance * abs(self.plan.cost):
+            if aim is not None and aim.decrease < self._tolerance * abs(self.plan.cost):
                 beyond = self._crossed(aim)
                 if beyond is None:
                     return Status.CONVERGED
@@ -216,7 +216,7 @@ class Descent:
             for halvings in range(HALVINGS):
                 share = 0.5**halvings
                 change, most = share * step.change, cost - ENOUGH * share * step.decrease
-                there = self._rolled_out(change)
+                there = changed(self._problem, self.plan, model, change)
                 if not there.cost < most:
                     there = self._pushed_back(there, change, step.multipliers)
                 if there.cost < most:
@@ -238,7 +238,7 @@ class Descent:
                     continue
                 switches = self._modes.step(there.states[t], there.controls[t])[1]
                 values, sides = switches.at(period.switches.names), model.sides[here]
-                across = (sides * values < 0) & model.known[here]
+                across = np.logical_and(sides * values < 0, model.known[here])
                 pressed = multipliers[here] > 0
                 held = np.isfinite(values) & model.known[here] & (across | pressed)
                 aim = np.where(pressed, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
@@ -255,22 +255,15 @@ class Descent:
             scale = 1 / np.sqrt(np.maximum(np.diag(system), 1e-300))
             pulls = np.linalg.lstsq(scale[:, None] * system * scale, scale * np.array(missing), rcond=1e-10)[0]
             change = change + moves @ (scale * pulls)
-            there = self._rolled_out(change)
+            there = changed(self._problem, self.plan, model, change)
         return there
-
-    def _rolled_out(self, change: Array) -> Plan:
-        plan, gain = self.plan, self.model.gain
-        controls = plan.controls + change.reshape(plan.controls.shape)
-        return rolled_out(self._problem, plan.states, controls, gain)
 
     def _crossed(self, step: Step) -> Plan | None:
         """A cheaper plan across a switch that this one is pressed against; None if there is none."""
         for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
-            for probe in Probe.across(self._problem, self.plan, self.model, which):
-                if probe.gain > self._tolerance * abs(self.plan.cost):
-                    best = probe.best(self._rolled_out)
-                    if best.cost < self.plan.cost - 0.1 * probe.gain:
-                        return best
+            best = beyond(self._problem, self.plan, self.model, which)
+            if best is not None and best.cost < self.plan.cost - self._tolerance * abs(self.plan.cost):
+                return best
         return None
 
     def pulls(self) -> list[Switches]:
@@ -300,6 +293,11 @@ def linearized(problem: Problem, modes: ContactModes, state: Array, control: Arr
     return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])), True)
 
 
+def changed(problem: Problem, plan: Plan, model: Model, change: Array) -> Plan:
+    """The plan after a change (T m,) of the offsets of its policy."""
+    return rolled_out(problem, plan.states, plan.controls + change.reshape(plan.controls.shape), model.gain)
+
+
 def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> Plan:
     """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
     offset = controls - np.einsum("tij,tj->ti", gain, states[:-1])
@@ -308,46 +306,21 @@ def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) ->
     return Plan(states, controls, float(cost))
 
 
-@dataclass(frozen=True)
-class Probe:
-    """What the true cost does across a switch.
+def beyond(problem: Problem, plan: Plan, model: Model, which: int) -> Plan | None:
+    """The cheapest plan across a switch, on a ray that crosses it by the least change; None if it cannot be crossed.
 
-    Attributes:
-      near, far: changes of the offsets (T m,) that cross it, one twice as far as the other. cost: that of the near one.
-      slope: of the cost from there on, per unit of length that the model's curvature has. gain: by how much the cost
-        could be lower beyond, than that of the plan: negative where there is a jump, or the cost rises.
+    The ray begins where a control has changed by half of SMALL, and doubles that RAY times.
     """
-
-    near: Array
-    far: Array
-    cost: float
-    slope: float
-    gain: float
-
-    @classmethod
-    def across(cls, problem: Problem, plan: Plan, model: Model, which: int) -> Iterator["Probe"]:
-        """One, or none where the switch cannot be crossed on its own."""
-        toward = scipy.linalg.solve(model.hessian, model.slopes[which], assume_a="pos")
-        reach = np.minimum(model.high - model.low, 1e3).ravel()
-        depth = SMALL * float(model.slopes[which] @ toward) / max(float(np.abs(toward / reach).max()), 1e-300)
-        steps = [minimize(model, model.hessian, across=which, depth=part * depth) for part in (0.5, 1.0)]
-        changes = [step.change for step in steps if step is not None]
-        if len(changes) < 2:
-            return
-        shape = plan.controls.shape
-        near, far = (
-            rolled_out(problem, plan.states, plan.controls + one.reshape(shape), model.gain).cost for one in changes
-        )
-        apart = changes[1] - changes[0]
-        slope = (far - near) / np.sqrt(max(float(apart @ model.hessian @ apart), 1e-300))
-        gain = plan.cost - near + 0.5 * min(slope, 0.0) ** 2
-        yield cls(*changes, near, slope, gain)
-
-    def best(self, roll_out: Callable[[Array], Plan]) -> Plan:
-        """The cheapest plan on the way that the slope predicts."""
-        apart = self.far - self.near
-        plans = [roll_out(self.near + share * apart) for share in (0.0, 1.0, 4.0, 16.0, 64.0, 256.0)]
-        return min(plans, key=lambda one: one.cost)
+    toward = scipy.linalg.solve(model.hessian, model.slopes[which], assume_a="pos")
+    reach = np.minimum(model.high - model.low, 1e3).ravel()
+    depth = SMALL * float(model.slopes[which] @ toward) / max(float(np.abs(toward / reach).max()), 1e-300)
+    steps = [minimize(model, model.hessian, across=which, depth=part * depth) for part in (0.5, 1.0)]
+    near, far = (None if step is None else step.change for step in steps)
+    if near is None or far is None:
+        return None
+    changes = (near + (2.0**doubled - 1) * (far - near) for doubled in range(RAY + 1))
+    plans = [changed(problem, plan, model, change) for change in changes]
+    return min(plans, key=lambda one: one.cost)
 
 
 def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
@@ -433,16 +406,17 @@ def optimality_in_mode(
 def surroundings(problem: Problem, model: Model, plan: Plan, pulls: Sequence[Switches]) -> ContactCertificate:
     """What the true cost is beside a plan: across each switch that it is pressed against, and at random."""
     pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
-    gains = [probe.gain for which in pressed for probe in Probe.across(problem, plan, model, which)]
+    plans = [beyond(problem, plan, model, which) for which in pressed]
+    cheapest = min((one.cost for one in plans if one is not None), default=np.inf)
     draws, reach = np.random.default_rng(0), np.minimum(model.high - model.low, 1e3)
     factor, lowest = scipy.linalg.cholesky(model.hessian, lower=True), np.inf
     for _ in range(SAMPLES):
         change = scipy.linalg.solve_triangular(factor.T, draws.standard_normal(len(factor)), lower=False)
         change = change.reshape(reach.shape)
         change *= SMALL / np.abs(change / reach).max()
-        lowest = min(lowest, rolled_out(problem, plan.states, plan.controls + change, model.gain).cost)
+        lowest = min(lowest, changed(problem, plan, model, change.ravel()).cost)
     size = max(abs(plan.cost), 1e-300)
     return ContactCertificate(
-        pressed=len(pressed), across=max(gains, default=-np.inf) / size, sampled=(plan.cost - lowest) / size,
+        pressed=len(pressed), across=(plan.cost - cheapest) / size, sampled=(plan.cost - lowest) / size,
         radius=SMALL, samples=SAMPLES,
     )  # fmt: skip
