@@ -142,7 +142,8 @@ def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> N
     modes = modes_of(robot_of("slide", mass))
     descent = Descent(problem, modes, begin, 1e-6, Budget(50, Stop()))
     assert descent.run() is ls.Status.CONVERGED
-    parts = surroundings(problem, descent.model, descent.plan, descent.pulls())
+    pulls, limits = descent.pulls()
+    parts = surroundings(problem, descent.model, descent.plan, pulls)
     assert parts.pressed > 0
     assert parts.across < 1e-6
 
@@ -161,9 +162,9 @@ def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> N
         other = np.clip(descent.plan.controls + size * draws.standard_normal((STEPS, 1)), -1, 1)
         assert cost_of(other) >= own * (1 - 1e-6)
     # The gradient says that it is not optimal: only with the multipliers of its switches it is.
-    none = [Switches(one.names, 0 * one.values) for one in descent.pulls()]
-    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, none)[0] > 1e-3
-    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, descent.pulls())[0] < 2e-6
+    none = [Switches(one.names, 0 * one.values) for one in pulls]
+    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, none, limits)[0] > 1e-3
+    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, pulls, limits)[0] < 2e-6
 
 
 def test_smooth_converges_beside_a_jump_and_says_what_is_there(tmp_path: Path) -> None:
@@ -210,7 +211,7 @@ def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None
     assert step is not None
     parts = np.split(step.multipliers, model.first[1:-1])
     pulls = [Switches(one.switches.names, part) for one, part in zip(model.periods, parts, strict=True)]
-    optimality, _ = optimality_in_mode(problem, modes, plan, model.gain, pulls)
+    optimality, _ = optimality_in_mode(problem, modes, plan, model.gain, pulls, step.limits)
     fall = (plan.cost - least_cost(mass, goal, speed)) / plan.cost
     # Without limits of the controls, and with all switches in sight, it is the fall itself, in a linear mode.
     assert optimality >= fall - 1e-6

@@ -113,11 +113,15 @@ class Model:
 
 @dataclass(frozen=True)
 class Step:
-    """A minimiser of the model, (T m,), the decrease that it predicts, and the multipliers of the switches, (K,)."""
+    """A minimiser of the model, (T m,), and the decrease that it predicts.
+
+    With the multipliers of the switches, (K,), and of the limits of the controls, (T, m), negative for upper ones.
+    """
 
     change: Array
     decrease: float
     multipliers: Array
+    limits: Array
 
 
 def minimize(model: Model, curvature: Array, *, across: int | None = None, depth: float = 0.0) -> Step | None:
@@ -170,10 +174,11 @@ def minimize(model: Model, curvature: Array, *, across: int | None = None, depth
             break
         active = np.union1d(np.flatnonzero(weights > 0), missed)
     change = scipy.linalg.solve_triangular(factor.T, nearest, lower=False)
-    multipliers, switches = np.zeros(len(model.values)), which < len(model.values)
-    multipliers[which[switches]] = (weights / lengths)[switches]
+    pulls = np.zeros(len(model.values) + 2 * size)
+    pulls[which] = weights / lengths
+    multipliers, lower, upper = np.split(pulls, [len(model.values), len(model.values) + size])
     decrease = -float(model.gradient @ change + 0.5 * change @ model.hessian @ change)
-    return Step(change, decrease, multipliers)
+    return Step(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
 
 
 class Descent:
@@ -266,12 +271,13 @@ class Descent:
                 return best
         return None
 
-    def pulls(self) -> list[Switches]:
-        """The multipliers of the last step, or of a new one, for each period."""
+    def pulls(self) -> tuple[list[Switches], Array]:
+        """The multipliers of the switches of each period, by name, and of the limits of the controls, (T, m)."""
         step = minimize(self.model, self.model.hessian)
         multipliers = np.zeros(len(self.model.values)) if step is None else step.multipliers
         parts = np.split(multipliers, self.model.first[1:-1])
-        return [Switches(one.switches.names, part) for one, part in zip(self.model.periods, parts, strict=True)]
+        pulls = [Switches(one.switches.names, part) for one, part in zip(self.model.periods, parts, strict=True)]
+        return pulls, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: Plan) -> None:
         """Take a plan, and linearise about it."""
@@ -337,8 +343,8 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     status = descent.run()
     plan, gain = descent.plan, descent.model.gain
     law = gain, plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
-    pulls = descent.pulls()
-    optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls)
+    pulls, limits = descent.pulls()
+    optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)
     result = RunResult(
         status=Status.STALLED, detail="", states=plan.states, controls=plan.controls, law=law, cost=plan.cost,
         violation=0.0, gap=np.nan, values={"cost_to_go": value},
@@ -360,16 +366,17 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
 
 
 def optimality_in_mode(
-    problem: Problem, modes: ContactModes, plan: Plan, gain: Array, pulls: Sequence[Switches]
+    problem: Problem, modes: ContactModes, plan: Plan, gain: Array, pulls: Sequence[Switches], limits: Array
 ) -> tuple[float, Quadratic]:
     """The most that a plan's own mode still allows the cost to fall, relative to it; and the policy's cost-to-go.
 
     By duality: half the square of the Lagrangian's gradient in the offsets, weighed as in `kernels/certificate.py`, and
-    the products of multipliers and distances of the switches. It uses the problem's functions and derivatives in a
-    recursion of its own, not the model from which the plan was found.
+    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives
+    in a recursion of its own, not the model from which the plan was found.
 
     Args:
-      pulls: multipliers of the switches of each period, by name, not negative.
+      pulls: multipliers of the switches of each period, by name, not negative. limits: those of the limits of the
+        controls, (T, m), negative for upper ones.
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]
@@ -389,9 +396,9 @@ def optimality_in_mode(
         whole = hessian + period.jacobian.T @ ahead @ period.jacobian
         rate = gradient + period.jacobian.T @ lagrangian - np.nan_to_num(period.slopes).T @ signed
         own = gradient + period.jacobian.T @ costate
-        slope = rate[n:]
-        free = ((u > space.low) | (slope < 0)) & ((u < space.high) | (slope > 0))
-        decrease += 0.5 * float(slope[free] @ np.linalg.solve(whole[n:, n:][np.ix_(free, free)], slope[free]))
+        rate[n:] -= limits[t]
+        room = np.where(limits[t] > 0, u - space.low, np.where(limits[t] < 0, space.high - u, 0.0))
+        decrease += float(np.abs(limits[t]) @ room) + 0.5 * float(rate[n:] @ np.linalg.solve(whole[n:, n:], rate[n:]))
         closed = np.vstack([np.eye(n), gain[t]])
         ahead, costate, lagrangian = closed.T @ whole @ closed, closed.T @ own, closed.T @ rate
         hessians.append(ahead)
