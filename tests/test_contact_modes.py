@@ -121,7 +121,7 @@ def least_cost(mass: float, goal: float, speed: float) -> float:
         value = 0.05 * float(u @ u) + 50 * float(off) ** 2 + 0.5 * float(rate) ** 2
         return value, 0.1 * u + 100 * off * where[-1] + rate * fast
 
-    keep = scipy.optimize.LinearConstraint(-where[:-1], about[:-1] - 1.0)
+    keep = {"type": "ineq", "fun": lambda u: 1.0 - about[:-1] - where[:-1] @ u, "jac": lambda u: -where[:-1]}
     found = scipy.optimize.minimize(
         cost, np.zeros(STEPS), jac=True, method="SLSQP", bounds=[(-1, 1)] * STEPS, constraints=[keep],
         options={"ftol": 1e-14, "maxiter": 500},

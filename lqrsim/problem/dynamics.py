@@ -254,7 +254,14 @@ class Dynamics:
         return iter(())
 
     def contact_modes(self, dt: float) -> "ContactModes | None":
-        """What acts in control periods of `dt` seconds, for dynamics that are smooth only as long as the same does."""
+        """What acts in control periods, for dynamics that are smooth only as long as the same does.
+
+        Args:
+          dt: the control period in seconds.
+
+        Returns:
+          None, except for an MJCF in which all that switches is known.
+        """
         return None
 
     @cached_property

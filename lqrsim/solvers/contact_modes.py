@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 import scipy.optimize
 
@@ -93,7 +94,7 @@ class Model:
         self.values = np.concatenate([period.switches.values for period in self.periods])
         self.sides = np.where(self.values < 0, -1.0, 1.0)
         self.first = np.cumsum([0, *(len(period.switches.names) for period in self.periods)])
-        self.known = np.isfinite(self.slopes).all(axis=1)
+        self.known: npt.NDArray[np.bool_] = np.asarray(np.isfinite(self.slopes).all(axis=1))
 
     def _gains(self) -> Array:
         """Gains (T, m, n) of iLQR; zero for controls at their limits."""
@@ -243,7 +244,7 @@ class Descent:
                     continue
                 switches = self._modes.step(there.states[t], there.controls[t])[1]
                 values, sides = switches.at(period.switches.names), model.sides[here]
-                across = np.logical_and(sides * values < 0, model.known[here])
+                across = (sides * values < 0) & model.known[here]
                 pressed = multipliers[here] > 0
                 held = np.isfinite(values) & model.known[here] & (across | pressed)
                 aim = np.where(pressed, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
