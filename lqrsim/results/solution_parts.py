@@ -219,7 +219,8 @@ class ContactCertificate:
       across: by how much the cheapest plan across one of these is below the plan, on rays up to 128 times the radius;
         negative if all are dearer, and minus infinity where there is none, or none can be crossed on its own.
       sampled: by how much the cheapest of the sampled plans is below the plan; negative if all are dearer.
-      radius: how far these plans change a control at most, as a part of its range. samples: how many there are.
+      radius: how far these plans change a control at most, as a part of its range.
+      samples: how many of them there are.
     """
 
     pressed: int
