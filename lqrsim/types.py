@@ -15,7 +15,7 @@ from lqrsim.results.export_c import ExportedC
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers
+from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.prepared import PreparedSolver
@@ -26,6 +26,7 @@ __all__ = [
     "Capsule",
     "Certificate",
     "ConstraintTerm",
+    "ContactCertificate",
     "ControllerRun",
     "Coordinates",
     "CostTerm",

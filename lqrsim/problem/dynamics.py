@@ -4,7 +4,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ from lqrsim.errors import (
 )
 from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
+
+if TYPE_CHECKING:
+    from lqrsim.scenes.contact_modes import ContactModes
 
 # Most operations of a formula that is differentiated twice, which then takes about five seconds.
 LONGEST = 1500
@@ -241,6 +244,17 @@ class Dynamics:
           states: (T+1, n) of a plan; where nothing touches along it, there are none.
         """
         return iter(())
+
+    def contact_modes(self, dt: float) -> "ContactModes | None":
+        """What acts in control periods, for dynamics that are smooth only as long as the same does.
+
+        Args:
+          dt: the control period in seconds.
+
+        Returns:
+          None, except for an MJCF in which all that switches is known.
+        """
+        return None
 
     @cached_property
     def step_source(self) -> Source:

@@ -24,6 +24,7 @@ from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Certificate
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate
 _Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, FailureCertificate)
@@ -38,6 +39,7 @@ FORMATS: dict[type, tuple[str, int]] = {
     FailureCertificate: ("certificate", 1),
 }
 VERSIONS = dict(FORMATS.values())
+LATER = {(Certificate, "contacts")}  # fields that files of the same version from before do not have
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
@@ -174,7 +176,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
             found[name] = _value(said, tree[name], field, arrays)
         elif said.dtype is not None and field in arrays:
             found[name] = arrays.pop(field)
-        else:
+        elif (kind, name) not in LATER:
             raise InputError(f"{field}: got none, want it")
     if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
         raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")

@@ -148,6 +148,8 @@ class Solution(Plan):
         lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
         if self.violation > 1e-6:  # the tolerance by default
             lines[-1] += f"   violation: {self.violation:.1e}"
+        if self.certificate.contacts is not None:
+            lines.append(f"  contacts:  {self.certificate.contacts}")
         if "noise" in self.options:
             risk = self.options.get("risk")
             meant = f"log E exp(risk cost) / risk, risk {risk}" if risk else "an expectation"

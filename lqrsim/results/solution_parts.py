@@ -167,10 +167,10 @@ class Iteration:
       violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
         are no equalities, which have rounding errors at least; NaN where it was not evaluated.
       seconds: time that this iteration took.
-      method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
-        "restoration", a descent on cost and penalised violation; in the safeguard "damped", or "ilqr" where its step is
-        that of iLQR; in Newton's method and the safeguard "rejected" (the cost would have risen, or a pass failed; the
-        cost is that of the plan that was kept).
+      method: "smooth", the paper's; "newton", at the end; "contact modes", see `Certificate.contacts`; with
+        constraints or limits "interior point", and "restoration", a descent on cost and penalised violation; in the
+        safeguard "damped", or "ilqr" where its step is that of iLQR; in Newton's method and the safeguard "rejected"
+        (the cost would have risen, or a pass failed; the cost is that of the plan that was kept).
     """
 
     cost: float
@@ -208,6 +208,39 @@ class Iteration:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ContactCertificate:
+    """What is beside a plan that keeps to its contact modes, by rollouts of its policy with other offsets.
+
+    A *switch* is where a contact, a limit or an edge of friction begins to act or lets go: the cost jumps there or has
+    a kink. All costs are relative to the plan's.
+
+    Attributes:
+      pressed: number of switches that the plan is pressed against: without them its cost would fall.
+      across: by how much the cheapest plan across one of these is below the plan, on rays up to 128 times the radius;
+        negative if all are dearer, and minus infinity where there is none, or none can be crossed on its own.
+      sampled: by how much the cheapest of the sampled plans is below the plan; negative if all are dearer.
+      radius: how far these plans change a control at most, as a part of its range.
+      samples: how many of them there are.
+    """
+
+    pressed: int
+    across: float
+    sampled: float
+    radius: float
+    samples: int
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def __str__(self) -> str:
+        sides = f", across each the cheapest is {-self.across:+.1e}" if np.isfinite(self.across) else ""
+        return (
+            f"optimal within the modes, against {self.pressed} switches{sides}; of {self.samples} plans within"
+            f" {self.radius:g} of the controls' ranges the cheapest is {-self.sampled:+.1e}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Certificate:
     """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
 
@@ -225,7 +258,9 @@ class Certificate:
         are no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
         unless constraints are elastic.
       optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
-        relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient.
+        relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient. With `contacts` it
+        is the decrease within the plan's contact modes, where switches bound the steps as limits bound controls.
+      contacts: for a plan through contacts of an MJCF that ends at the edge of its contact modes; None otherwise.
     """
 
     cost: float
@@ -235,6 +270,7 @@ class Certificate:
     limits: float
     violation: float
     optimality: float
+    contacts: ContactCertificate | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

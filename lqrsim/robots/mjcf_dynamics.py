@@ -19,6 +19,7 @@ from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.scenes.contact_modes import ContactModes
 from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches
 from lqrsim.scenes.scene import unlogged
@@ -153,6 +154,11 @@ class MjcfDynamics(Dynamics):
             other._stated = self._stated | {"softness": softness}
             other._set_mjcf(self.xml, self.physics.model)
             yield f"{softness:g}", other
+
+    def contact_modes(self, dt: float) -> ContactModes | None:
+        model, known = self.physics.model, not self.parameters and ContactModes.known_for(self.physics.model)
+        substeps = round(dt / float(model.opt.timestep))
+        return ContactModes(model, self._stated["actuators"], substeps) if known else None
 
     def period_near(self, dt: float) -> float:
         """The whole number of physics steps nearest to `dt`, in seconds."""

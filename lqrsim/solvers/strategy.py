@@ -9,7 +9,8 @@
      (`Search.look_aside`).
   4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
   5. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and
-     on to the true ones from there (`Search.soften`).
+     on to the true ones from there (`Search.soften`). Where that ends at a jump or a kink, a descent that keeps to
+     the contacts that act (`contact_modes.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
@@ -98,6 +99,8 @@ def solve(
                 search.retry_without_risk()
         if default and settings.safeguard and not stop.due and not search.best[1].success:
             search.soften()
+            if not search.best[1].success and not stop.due:
+                search.keep_modes()
     chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -325,6 +328,20 @@ class Search:
         # The best so far may have been put before a plan that converged, but does nothing; so nothing is sorted here.
         better = found.rank < self.best[1].rank
         self._finished.insert(0 if better else len(self._finished), (run, replace(found, detail=detail)))
+
+    def keep_modes(self) -> None:
+        """From the best plan go on within its contact modes, where a plan may end beside a jump or at a kink."""
+        from lqrsim.solvers.contact_modes import keep_modes  # it imports MuJoCo, which few problems need
+
+        best = self.best[1]
+        run = self._another(InitialGuess(best.law[0].copy(), best.law[1].copy(), None, None, "the best plan"))
+        run.budget.report_to(self._callback)
+        with self._problem.dynamics.solving(self._threads):
+            found = keep_modes(run, best)
+        if found is not None:
+            self._named.append(("the best plan, within its contact modes", run))
+            detail = "; ".join(part for part in (best.detail.partition("; ")[0], found.detail) if part)
+            self._finished.insert(0 if found.rank <= best.rank else 1, (run, replace(found, detail=detail)))
 
     def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
         """Plan for softer contacts: from that policy, or by a search where there is none."""

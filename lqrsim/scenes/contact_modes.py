@@ -1,0 +1,208 @@
+"""What acts at each physics step of a control period of an MJCF, its contact mode, and how far another mode is.
+
+A contact or a limit begins to act where its distance passes zero, and one that acts lets go, or an edge of its friction
+cone does, where its force passes zero. Each of these *switches* is a number that changes its sign there. As long as
+none does, a control period is a smooth function of its state and control. Where a distance changes its sign, a period
+is in general discontinuous; where a force does, it has a kink.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+
+_NEAR = 0.02  # m or rad, within which distances are watched
+_SMALLER = 1.0, 1e-2, 1e-4  # differences, relative to the first, that are tried until one stays in the mode
+_KIND = mujoco.mjtConstraint
+_LIMITS = [int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)]
+_CONTACTS = [int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)]
+# A switch's name, as a number: its stage, whether it is a force, what of, and which of those.
+_STAGE, _FORCE, _CONTACT, _GEOM, _NUMBER, _EDGE = 1 << 48, 1 << 47, 1 << 46, 1 << 14, 1 << 16, 1 << 4
+
+Names = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Switches:
+    """Switches of a control period, (k,): their names, ascending, and their values; negative where something acts."""
+
+    names: Names
+    values: Array
+
+    def at(self, names: Names) -> Array:
+        """The values of the switches of these names, NaN where there is none."""
+        if np.array_equal(names, self.names):
+            return self.values
+        found = np.full(len(names), np.nan)
+        _, here, there = np.intersect1d(names, self.names, assume_unique=True, return_indices=True)
+        found[here] = self.values[there]
+        return found
+
+    @property
+    def forces(self) -> npt.NDArray[np.bool_]:
+        """Which of them are forces, whose change of sign is a kink and not a jump."""
+        return (self.names & _FORCE) != 0
+
+    def same_mode(self, other: "Switches") -> bool:
+        """Whether the same acts. What is out of sight of one of them does not act in it."""
+        if not np.array_equal(self.names[self.forces], other.names[other.forces]):
+            return False
+        return bool(((self.values < 0) == (other.at(self.names) < 0)).all()) and bool(
+            ((other.values < 0) == (self.at(other.names) < 0)).all()
+        )
+
+
+@dataclass(frozen=True)
+class Period:
+    """A control period, linearised in its contact mode.
+
+    Attributes:
+      state: (n,) at its end. jacobian: (n, n+m). switches: k of them. slopes: (k, n+m), NaN where not known.
+      certain: whether all differences stayed in the mode.
+    """
+
+    state: Array
+    jacobian: Array
+    switches: Switches
+    slopes: Array
+    certain: bool
+
+
+class ContactModes:
+    """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
+
+    Args:
+      model: of the physics. actuators: ids of those that are controlled. substeps: physics steps of a control period.
+    """
+
+    def __init__(self, model: mujoco.MjModel, actuators: tuple[int, ...], substeps: int) -> None:
+        self._model, self._actuators, self._substeps = model, list(actuators), substeps
+        self._data, self._ahead = mujoco.MjData(model), copy.copy(model)
+        for margins in (self._ahead.jnt_margin, self._ahead.tendon_margin, self._ahead.geom_margin):
+            margins[:] += _NEAR
+        self._seen, self._nv = mujoco.MjData(self._ahead), model.nv
+        self._four = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+
+    @staticmethod
+    def known_for(model: mujoco.MjModel) -> bool:
+        """Whether all that switches is known: with joints that slide or turn, and pyramids of friction."""
+        turning = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
+        dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
+        elliptic = model.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+        return bool(turning.all()) and not (dry or elliptic or model.na or model.npair or model.geom_gap.any())
+
+    def step(self, state: Array, control: Array) -> tuple[Array, Switches]:
+        """The state (n,) after a control period, and its switches."""
+        data, found = self._data, list[tuple[Names, Array]]()
+        data.qpos[:], data.qvel[:] = state[: self._nv], state[self._nv :]
+        data.ctrl[self._actuators], data.qacc_warmstart[:], data.time = control, 0.0, 0.0
+        for step in range(self._substeps):
+            if self._four:
+                self._runge_kutta(4 * step, found)
+            else:
+                before = data.qpos.copy()
+                mujoco.mj_step(self._model, data)
+                self._observe(step, before, found)
+        names = np.concatenate([np.zeros(0, np.int64), *(one for one, _ in found)])
+        values, order = np.concatenate([np.zeros(0), *(one for _, one in found)]), np.argsort(names)
+        return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
+
+    def _runge_kutta(self, stage: int, found: list[tuple[Names, Array]]) -> None:
+        """A physics step of `mj_RungeKutta`, whose four stages each have contacts of their own."""
+        model, data, h = self._model, self._data, self._model.opt.timestep
+        qpos, qvel, time = data.qpos.copy(), data.qvel.copy(), data.time
+        mujoco.mj_forward(model, data)
+        self._observe(stage, data.qpos, found)
+        speeds, rates = [qvel], [data.qacc.copy()]
+        for number, share in enumerate((0.5, 0.5, 1.0)):
+            data.qpos[:] = qpos + h * share * speeds[number]
+            data.qvel[:], data.time = qvel + h * share * rates[number], time + h * share
+            mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
+            self._observe(stage + number + 1, data.qpos, found)
+            speeds.append(data.qvel.copy())
+            rates.append(data.qacc.copy())
+        weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6
+        data.qpos[:], data.qvel[:] = qpos + h * weights @ speeds, qvel + h * weights @ rates
+        data.time = time + h
+
+    def _observe(self, stage: int, qpos: Array, found: list[tuple[Names, Array]]) -> None:
+        """Add the switches of a stage at these positions (nq,), whose forces are in the data."""
+        model, seen = self._model, self._seen
+        seen.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self._ahead, seen)
+        limits, first = np.isin(seen.efc_type, _LIMITS), stage * _STAGE
+        if limits.any():
+            distances = (seen.efc_pos - seen.efc_margin)[limits] + _NEAR
+            found.append((first + _limits(self._ahead, seen, limits), distances))
+        if seen.ncon:
+            geoms, wide, own = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
+            # Versions of MuJoCo differ in whether the margin of two geoms is their sum or their maximum.
+            summed = np.isclose(seen.contact.includemargin, wide[geoms].sum(axis=1))
+            margins = np.where(summed, own[geoms].sum(axis=1), own[geoms].max(axis=1))
+            found.append((first + _contacts(geoms), seen.contact.dist - margins))
+        data = self._data
+        if data.nefc == 0:
+            return
+        limits, contacts = np.isin(data.efc_type, _LIMITS), np.isin(data.efc_type, _CONTACTS)
+        excess = np.empty(data.nefc)  # of acceleration, above what the constraint wants; it pushes if this is negative
+        mujoco.mj_mulJacVec(model, data, excess, data.qacc)
+        excess -= data.efc_aref
+        if limits.any():
+            found.append((first + _FORCE + _limits(model, data, limits), excess[limits]))
+        if contacts.any():
+            which = data.efc_id[contacts]
+            edges = np.arange(len(which)) - np.searchsorted(which, which)
+            names = first + _FORCE + _contacts(data.contact.geom)[which] + edges
+            found.append((names, excess[contacts]))
+
+    def linearize(self, state: Array, control: Array) -> Period:
+        """The control period and its derivatives, by differences that stay in its contact mode.
+
+        Central ones where both sides do, one-sided ones where one does; smaller ones where neither does.
+        """
+        n, point = len(state), np.concatenate([state, control])
+        end, switches = self.step(state, control)
+        jacobian, slopes = np.empty((n, len(point))), np.empty((len(switches.names), len(point)))
+        certain = True
+        for k in range(len(point)):
+            both, sides, moved = dict[int, tuple[Array, Switches]](), dict[int, tuple[Array, Switches]](), 0.0
+            for share in _SMALLER:
+                moved = share * 1e-6 * max(1.0, abs(point[k]))
+                both = {sign: self._moved(point, k, sign * moved) for sign in (1, -1)}
+                sides = {sign: side for sign, side in both.items() if side[1].same_mode(switches)}
+                if sides:
+                    break
+            else:
+                sides, certain = both, False
+            high, low = sides.get(1, (end, switches)), sides.get(-1, (end, switches))
+            moved *= len(sides)
+            jacobian[:, k] = (high[0] - low[0]) / moved
+            slopes[:, k] = (high[1].at(switches.names) - low[1].at(switches.names)) / moved
+        return Period(end, jacobian, switches, slopes, certain)
+
+    def _moved(self, point: Array, k: int, by: float) -> tuple[Array, Switches]:
+        """The period from a state and control, joined, of which one number is another."""
+        other = point.copy()
+        other[k] += by
+        n = 2 * self._nv
+        return self.step(other[:n], other[n:])
+
+
+def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.bool_]) -> Names:
+    """Names of the limits in these rows: of a joint or a tendon, which one, and which of its two limits."""
+    which, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
+    lower = data.efc_J.reshape(data.nefc, -1)[rows].sum(axis=1) > 0  # of a joint
+    ropes = which[~joints]
+    lower[~joints] = np.isclose(data.efc_pos[rows][~joints], data.ten_length[ropes] - model.tendon_range[ropes, 0])
+    return 4 * which + 2 * joints + lower
+
+
+def _contacts(geoms: npt.NDArray[np.int32]) -> Names:
+    """Names of contacts: the two geoms, and which of theirs; with room for the edges of a friction pyramid."""
+    pairs = (geoms[:, 0].astype(np.int64) * _GEOM + geoms[:, 1]) * _NUMBER
+    earlier = np.array([np.count_nonzero(pairs[:k] == one) for k, one in enumerate(pairs)], dtype=np.int64)
+    return _CONTACT + pairs + earlier * _EDGE

@@ -1,0 +1,430 @@
+"""Plans at the edges of contact modes: descent that keeps to a mode, and what makes such a plan optimal.
+
+A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. Plans
+that lower the cost end at a *switch*, beside a jump or at a kink: a contact that is just not reached, or just lets go.
+The gradient is not zero there, and steps along it go across. Here a switch is an inequality, like a limit of a control:
+
+- The model of the cost is that of iLQR, in the offsets of the policy with its gains held, and derivatives are those of
+  the plan's own mode. The step minimises it with all switches on their sides, linearised: a quadratic program.
+- A step that crosses a switch after all, because it is curved, is pushed back to its own side.
+- Where no such step lowers the cost, each switch that the plan is pressed against is crossed on its own. If the cost is
+  lower there, the descent goes on from there.
+
+The plan is optimal if neither is possible; `optimality_in_mode` and `surroundings` measure both again.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+import scipy.optimize
+
+from lqrsim.errors import Array
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution_parts import ContactCertificate, Iteration, Status
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.scenes.contact_modes import ContactModes, Period, Switches
+from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.certify import faults
+from lqrsim.solvers.engine import RunResult, SolveRun
+
+MARGIN = 1e-9  # m, rad or m/s^2, by which a plan stays on its side of a switch
+ENOUGH = 0.1  # share of the predicted decrease that a step must bring
+PUSHES = 5  # times that a step is pushed back to its side
+HALVINGS = 8  # of a step that are tried before it is damped more
+DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature where steps fail, at first and at most
+ROUNDS = 50  # of adding switches to a quadratic program
+SMALL = 1e-3  # how far plans beside a plan change a control, as a part of its range
+SAMPLES, RAY = 50, 8  # plans beside a plan; how often the way across a switch doubles
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan and its cost: states (T+1, n) and controls (T, m)."""
+
+    states: Array
+    controls: Array
+    cost: float
+
+
+class Model:
+    """The cost and the switches about a plan in the offsets d (T m,) of its policy.
+
+    Attributes:
+      gain: (T, m, n). hessian, gradient: of the cost, (T m, T m) and (T m,). slopes, values: of K switches, (K, T m)
+        and (K,). sides: +1 or -1. first: (T+1,) where those of each period begin. known: whether their slopes are.
+      responses: (T m, T m) of the controls. low, high: (T, m) room of the controls. periods: the linearised periods.
+    """
+
+    def __init__(self, problem: Problem, modes: ContactModes, plan: Plan) -> None:
+        states, controls, steps = plan.states, plan.controls, problem.steps
+        n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
+        self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
+        data, costs = compiled.arguments(problem), compiled.costs_module(problem)
+
+        def quadratic(x: Array, u: Array, t: int, cost: object) -> tuple[Array, Array]:
+            hessian, gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
+            costs.cost_quadratic(x.copy(), u.copy(), t, cost, hessian, gradient)
+            return hessian, gradient
+
+        self.stages = [quadratic(states[t], controls[t], t, data.stage) for t in range(steps)]
+        last, ends = quadratic(states[steps], np.zeros(m), steps, data.final)
+        self.last = last[:n, :n], ends[:n]
+        space = problem.control_coordinates
+        self.low, self.high = (np.broadcast_to(limit, controls.shape) - controls for limit in (space.low, space.high))
+        self.gain = self._gains()
+        self.hessian, self.gradient, reached = np.zeros((size, size)), np.zeros(size), np.zeros((n, size))
+        slopes, self.responses = [], np.zeros((steps, m, size))
+        for t, (period, (hessian, gradient)) in enumerate(zip(self.periods, self.stages, strict=True)):
+            self.responses[t] = self.gain[t] @ reached
+            self.responses[t][:, t * m : (t + 1) * m] += np.eye(m)
+            both = np.vstack([reached, self.responses[t]])
+            self.hessian += both.T @ hessian @ both
+            self.gradient += both.T @ gradient
+            slopes.append(period.slopes @ both)
+            reached = period.jacobian @ both
+        self.hessian += reached.T @ self.last[0] @ reached
+        self.hessian = 0.5 * (self.hessian + self.hessian.T)
+        self.gradient += reached.T @ self.last[1]
+        self.slopes, self.responses = np.vstack(slopes), self.responses.reshape(size, size)
+        self.values = np.concatenate([period.switches.values for period in self.periods])
+        self.sides = np.where(self.values < 0, -1.0, 1.0)
+        self.first = np.cumsum([0, *(len(period.switches.names) for period in self.periods)])
+        self.known: npt.NDArray[np.bool_] = np.asarray(np.isfinite(self.slopes).all(axis=1))
+
+    def _gains(self) -> Array:
+        """Gains (T, m, n) of iLQR; zero for controls at their limits."""
+        n = len(self.last[1])
+        ahead, gains = self.last[0], np.zeros((len(self.periods), self.stages[0][0].shape[0] - n, n))
+        for t in reversed(range(len(self.periods))):
+            jacobian = self.periods[t].jacobian
+            whole = self.stages[t][0] + jacobian.T @ ahead @ jacobian
+            free = np.flatnonzero((self.low[t] < 0) & (self.high[t] > 0))
+            if len(free):
+                gains[t, free] = -np.linalg.solve(whole[np.ix_(n + free, n + free)], whole[n + free, :n])
+            closed = np.vstack([np.eye(n), gains[t]])
+            ahead = closed.T @ whole @ closed
+            ahead = 0.5 * (ahead + ahead.T)
+        return gains
+
+
+@dataclass(frozen=True)
+class Step:
+    """A minimiser of the model, (T m,), and the decrease that it predicts.
+
+    With the multipliers of the switches, (K,), and of the limits of the controls, (T, m), negative for upper ones.
+    """
+
+    change: Array
+    decrease: float
+    multipliers: Array
+    limits: Array
+
+
+def minimize(model: Model, curvature: Array, *, across: int | None = None, depth: float = 0.0) -> Step | None:
+    """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
+
+    Args:
+      across: a switch that must be on its other side instead, by `depth`; the change is the least one then.
+    """
+    try:
+        factor = scipy.linalg.cholesky(curvature, lower=True)
+    except np.linalg.LinAlgError:
+        return None
+    size = len(model.gradient)
+    sides = np.where(np.arange(len(model.values)) == across, -1.0, 1.0) * model.sides
+    room = model.sides * model.values - MARGIN
+    bounds = np.where(room > 0, -room, 0.0)
+    if across is not None:
+        bounds[across] = abs(model.values[across]) + MARGIN + depth
+    rows = np.vstack([sides[:, None] * model.slopes, model.responses, -model.responses])
+    bounds = np.concatenate([bounds, model.low.ravel(), -model.high.ravel()])
+    bounds[len(model.values) :] = np.minimum(bounds[len(model.values) :], 0.0)
+    which = np.flatnonzero(np.concatenate([model.known, np.ones(2 * size, bool)]) & np.isfinite(bounds))
+    rows = scipy.linalg.solve_triangular(factor, rows[which].T, lower=True).T
+    lengths = np.linalg.norm(rows, axis=1)
+    felt = lengths > 1e-12 * max(lengths.max(initial=0.0), 1e-300)
+    rows, which, lengths = rows[felt] / lengths[felt, None], which[felt], lengths[felt]
+    bounds = bounds[which] / lengths
+    free = np.zeros(size) if across is not None else -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
+    # The nearest point to `free` with rows y >= bounds; Lawson and Hanson's way to least distances.
+    short, nearest, weights = bounds - rows @ free, free, np.zeros(len(bounds))
+    active = np.flatnonzero(short > 0)
+    for _ in range(ROUNDS):
+        if not len(active):
+            break
+        matrix = np.vstack([rows[active].T, short[active]])
+        target = np.zeros(size + 1)
+        target[-1] = 1.0
+        try:
+            pulls, _ = scipy.optimize.nnls(matrix, target, maxiter=30 * matrix.shape[1])
+        except RuntimeError:
+            return None
+        rest = matrix @ pulls - target
+        if not abs(rest[-1]) > 1e-13:  # they contradict each other
+            return None
+        nearest = free - rest[:size] / rest[-1]
+        weights[:] = 0.0
+        weights[active] = -pulls / rest[-1]
+        missed = np.flatnonzero(rows @ nearest - bounds < -1e-9 * (1 + np.abs(bounds)))
+        if not len(np.setdiff1d(missed, active)):
+            break
+        active = np.union1d(np.flatnonzero(weights > 0), missed)
+    change = scipy.linalg.solve_triangular(factor.T, nearest, lower=False)
+    pulls = np.zeros(len(model.values) + 2 * size)
+    pulls[which] = weights / lengths
+    multipliers, lower, upper = np.split(pulls, [len(model.values), len(model.values) + size])
+    decrease = -float(model.gradient @ change + 0.5 * change @ model.hessian @ change)
+    return Step(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
+
+
+class Descent:
+    """Descent from a plan, mode by mode.
+
+    Attributes:
+      plan: the best so far. model: about it. step: the last one from it.
+    """
+
+    def __init__(self, problem: Problem, modes: ContactModes, plan: Plan, tolerance: float, budget: Budget) -> None:
+        self._problem, self._modes, self._tolerance, self._budget = problem, modes, tolerance, budget
+        self._damping, self._clock = 0.0, time.perf_counter()
+        self.plan, self.model = plan, Model(problem, modes, plan)
+
+    def run(self) -> Status:
+        """Descend until the plan is optimal, nothing lowers the cost, or the budget is over."""
+        aim, about = None, None
+        while not self._budget.over:
+            if about is not self.model:
+                aim, about = minimize(self.model, self.model.hessian), self.model
+            if aim is not None and aim.decrease < self._tolerance * abs(self.plan.cost):
+                beyond = self._crossed(aim)
+                if beyond is None:
+                    return Status.CONVERGED
+            else:
+                beyond = self._descended()
+                if beyond is None:
+                    if self._damping > MOST:
+                        return Status.STALLED
+                    continue
+            self._go_to(beyond)
+        return Status.TIME_LIMIT if self._budget.stop.due else Status.MAX_ITERATIONS
+
+    def _descended(self) -> Plan | None:
+        """A step that lowers the cost in the plan's mode; None if none was found with this damping, which grows."""
+        model, cost = self.model, self.plan.cost
+        diagonal = np.diag(np.diag(model.hessian))
+        step = minimize(model, model.hessian + self._damping * diagonal)
+        if step is not None and step.decrease > 0:
+            for halvings in range(HALVINGS):
+                share = 0.5**halvings
+                change, most = share * step.change, cost - ENOUGH * share * step.decrease
+                there = changed(self._problem, self.plan, model, change)
+                if not there.cost < most:
+                    there = self._pushed_back(there, change, step.multipliers)
+                if there.cost < most:
+                    self._damping = 0.1 * self._damping if self._damping > DAMPING else 0.0
+                    return there
+        self._damping = max(10 * self._damping, DAMPING)
+        return None
+
+    def _pushed_back(self, there: Plan, change: Array, multipliers: Array) -> Plan:
+        """The plan after a change of the offsets, corrected until it crosses no switch; or the last one tried."""
+        model, wanted, factor = self.model, self.model.values + self.model.slopes @ change, None
+        for _ in range(PUSHES):
+            if not np.isfinite(there.cost):
+                break
+            rows, missing, crossed = list[int](), list[float](), False
+            for t, period in enumerate(model.periods):
+                here = slice(model.first[t], model.first[t + 1])
+                if not len(period.switches.names):
+                    continue
+                switches = self._modes.step(there.states[t], there.controls[t])[1]
+                values, sides = switches.at(period.switches.names), model.sides[here]
+                across = (sides * values < 0) & model.known[here]
+                pressed = multipliers[here] > 0
+                held = np.isfinite(values) & model.known[here] & (across | pressed)
+                aim = np.where(pressed, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                rows += (model.first[t] + np.flatnonzero(held)).tolist()
+                missing += (sides * aim - values)[held].tolist()
+                crossed = crossed or bool(across.any())
+                if (across & ~period.switches.forces).any():
+                    break  # what comes after a jump says nothing
+            if not crossed:
+                break
+            factor = scipy.linalg.cho_factor(model.hessian) if factor is None else factor
+            moves = scipy.linalg.cho_solve(factor, model.slopes[rows].T)
+            system = model.slopes[rows] @ moves
+            scale = 1 / np.sqrt(np.maximum(np.diag(system), 1e-300))
+            pulls = np.linalg.lstsq(scale[:, None] * system * scale, scale * np.array(missing), rcond=1e-10)[0]
+            change = change + moves @ (scale * pulls)
+            there = changed(self._problem, self.plan, model, change)
+        return there
+
+    def _crossed(self, step: Step) -> Plan | None:
+        """A cheaper plan across a switch that this one is pressed against; None if there is none."""
+        for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
+            best = beyond(self._problem, self.plan, self.model, which)
+            if best is not None and best.cost < self.plan.cost - self._tolerance * abs(self.plan.cost):
+                return best
+        return None
+
+    def pulls(self) -> tuple[list[Switches], Array]:
+        """The multipliers of the switches of each period, by name, and of the limits of the controls, (T, m)."""
+        step = minimize(self.model, self.model.hessian)
+        multipliers = np.zeros(len(self.model.values)) if step is None else step.multipliers
+        parts = np.split(multipliers, self.model.first[1:-1])
+        pulls = [Switches(one.switches.names, part) for one, part in zip(self.model.periods, parts, strict=True)]
+        return pulls, np.zeros_like(self.model.low) if step is None else step.limits
+
+    def _go_to(self, plan: Plan) -> None:
+        """Take a plan, and linearise about it."""
+        before, self.plan = self.plan, plan
+        self.model = Model(self._problem, self._modes, plan)
+        now = time.perf_counter()
+        improvement = (before.cost - plan.cost) / abs(plan.cost)
+        nan = float("nan")
+        self._budget.record(Iteration(plan.cost, improvement, 0.0, nan, 0.0, 0.0, now - self._clock, "contact modes"))
+        self._clock = now
+
+
+def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
+    """A period; where no switch is in sight, by the compiled derivatives, which are as good and quicker."""
+    end, switches = modes.step(state, control)
+    if len(switches.names):
+        return modes.linearize(state, control)
+    jacobian = np.hstack(problem.dynamics.linearize(state, control, problem.dt)[:2])
+    return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])), True)
+
+
+def changed(problem: Problem, plan: Plan, model: Model, change: Array) -> Plan:
+    """The plan after a change (T m,) of the offsets of its policy."""
+    return rolled_out(problem, plan.states, plan.controls + change.reshape(plan.controls.shape), model.gain)
+
+
+def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> Plan:
+    """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
+    offset = controls - np.einsum("tij,tj->ti", gain, states[:-1])
+    states, controls = compiled.rollout(problem, gain, offset, states[0])
+    cost = compiled.costs_of(problem, states[None], controls[None])[0] if np.isfinite(states).all() else np.inf
+    return Plan(states, controls, float(cost))
+
+
+def beyond(problem: Problem, plan: Plan, model: Model, which: int) -> Plan | None:
+    """The cheapest plan across a switch, on a ray that crosses it by the least change; None if it cannot be crossed.
+
+    The ray begins where a control has changed by half of SMALL, and doubles that RAY times.
+    """
+    toward = scipy.linalg.solve(model.hessian, model.slopes[which], assume_a="pos")
+    reach = np.minimum(model.high - model.low, 1e3).ravel()
+    depth = SMALL * float(model.slopes[which] @ toward) / max(float(np.abs(toward / reach).max()), 1e-300)
+    steps = [minimize(model, model.hessian, across=which, depth=part * depth) for part in (0.5, 1.0)]
+    near, far = (None if step is None else step.change for step in steps)
+    if near is None or far is None:
+        return None
+    changes = (near + (2.0**doubled - 1) * (far - near) for doubled in range(RAY + 1))
+    plans = [changed(problem, plan, model, change) for change in changes]
+    return min(plans, key=lambda one: one.cost)
+
+
+def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
+    """Descend from a plan within its contact modes; certified. None where no switch is in sight of it, or known."""
+    problem, dynamics = run.problem, run.problem.dynamics
+    modes = dynamics.contact_modes(problem.dt)
+    if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
+        return None
+    plan = Plan(found.states.copy(), found.controls.copy(), found.cost)
+    pairs = zip(plan.states[:-1], plan.controls, strict=True)
+    if not np.isfinite(plan.cost) or not any(len(modes.step(x, u)[1].names) for x, u in pairs):
+        return None
+    descent = Descent(problem, modes, plan, run.final, run.budget)
+    status = descent.run()
+    plan, gain = descent.plan, descent.model.gain
+    law = gain, plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
+    pulls, limits = descent.pulls()
+    optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)
+    result = RunResult(
+        status=Status.STALLED, detail="", states=plan.states, controls=plan.controls, law=law, cost=plan.cost,
+        violation=0.0, gap=np.nan, values={"cost_to_go": value},
+    )  # fmt: skip
+    certificate = run.certified(result).certificate
+    assert certificate is not None
+    contacts = surroundings(problem, descent.model, plan, pulls)
+    certificate = replace(certificate, optimality=optimality, contacts=contacts)
+    detail = f"within its contact modes, against {contacts.pressed} switches"
+    if status is Status.CONVERGED:
+        wrong = faults(certificate, claimed=plan.cost, rest=0.0, tolerance=run.final)
+        if max(contacts.across, contacts.sampled) > run.final:
+            wrong = f"{wrong}, a plan beside it is cheaper".removeprefix(", ")
+        if wrong:
+            status, detail = Status.STALLED, f"{detail}; {wrong}"
+    elif status is Status.STALLED:
+        detail = f"{detail}, no step lowers the cost any more"
+    return replace(result, status=status, detail=detail, cost=certificate.cost, certificate=certificate)
+
+
+def optimality_in_mode(
+    problem: Problem, modes: ContactModes, plan: Plan, gain: Array, pulls: Sequence[Switches], limits: Array
+) -> tuple[float, Quadratic]:
+    """The most that a plan's own mode still allows the cost to fall, relative to it; and the policy's cost-to-go.
+
+    By duality: half the square of the Lagrangian's gradient in the offsets, weighed as in `kernels/certificate.py`, and
+    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives
+    in a recursion of its own, not the model from which the plan was found.
+
+    Args:
+      pulls: multipliers of the switches of each period, by name, not negative. limits: those of the limits of the
+        controls, (T, m), negative for upper ones.
+    """
+    states, controls, steps = plan.states, plan.controls, problem.steps
+    n, m = states.shape[1], controls.shape[1]
+    data, costs, space = compiled.arguments(problem), compiled.costs_module(problem), problem.control_coordinates
+    whole, rate = np.zeros((n + m, n + m)), np.zeros(n + m)
+    cost = costs.cost_quadratic(states[steps].copy(), np.zeros(m), steps, data.final, whole, rate)
+    ahead, costate, lagrangian, decrease = whole[:n, :n].copy(), rate[:n].copy(), rate[:n].copy(), 0.0
+    hessians, slopes, constants = [ahead], [costate], [cost]
+    for t in reversed(range(steps)):
+        x, u = states[t].copy(), controls[t].copy()
+        period, hessian, gradient = linearized(problem, modes, x, u), np.zeros((n + m, n + m)), np.zeros(n + m)
+        cost += costs.cost_quadratic(x, u, t, data.stage, hessian, gradient)
+        switches = period.switches
+        pull = np.nan_to_num(pulls[t].at(switches.names))
+        decrease += float(pull @ np.abs(switches.values))
+        signed = np.where(switches.values < 0, -pull, pull)
+        whole = hessian + period.jacobian.T @ ahead @ period.jacobian
+        rate = gradient + period.jacobian.T @ lagrangian - np.nan_to_num(period.slopes).T @ signed
+        own = gradient + period.jacobian.T @ costate
+        rate[n:] -= limits[t]
+        room = np.where(limits[t] > 0, u - space.low, np.where(limits[t] < 0, space.high - u, 0.0))
+        decrease += float(np.abs(limits[t]) @ room) + 0.5 * float(rate[n:] @ np.linalg.solve(whole[n:, n:], rate[n:]))
+        closed = np.vstack([np.eye(n), gain[t]])
+        ahead, costate, lagrangian = closed.T @ whole @ closed, closed.T @ own, closed.T @ rate
+        hessians.append(ahead)
+        slopes.append(costate)
+        constants.append(cost)
+    hessian, slope = np.array(hessians[::-1]), np.array(slopes[::-1])
+    bent = np.einsum("tij,tj->ti", hessian, states)
+    constant = np.array(constants[::-1]) - np.einsum("ti,ti->t", slope - 0.5 * bent, states)
+    return decrease / max(abs(plan.cost), 1e-300), Quadratic(hessian, slope - bent, constant)
+
+
+def surroundings(problem: Problem, model: Model, plan: Plan, pulls: Sequence[Switches]) -> ContactCertificate:
+    """What the true cost is beside a plan: across each switch that it is pressed against, and at random."""
+    pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
+    plans = [beyond(problem, plan, model, which) for which in pressed]
+    cheapest = min((one.cost for one in plans if one is not None), default=np.inf)
+    draws, reach = np.random.default_rng(0), np.minimum(model.high - model.low, 1e3)
+    factor, lowest = scipy.linalg.cholesky(model.hessian, lower=True), np.inf
+    for _ in range(SAMPLES):
+        change = scipy.linalg.solve_triangular(factor.T, draws.standard_normal(len(factor)), lower=False)
+        change = change.reshape(reach.shape)
+        change *= SMALL / np.abs(change / reach).max()
+        lowest = min(lowest, changed(problem, plan, model, change.ravel()).cost)
+    size = max(abs(plan.cost), 1e-300)
+    return ContactCertificate(
+        pressed=len(pressed), across=(plan.cost - cheapest) / size, sampled=(plan.cost - lowest) / size,
+        radius=SMALL, samples=SAMPLES,
+    )  # fmt: skip

@@ -1,0 +1,217 @@
+"""Plans at the edges of contact modes: switches and derivatives of periods, and what is called optimal there."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.scenes.contact_modes import ContactModes, Switches
+from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.solvers.budget import Budget, Stop
+from lqrsim.solvers.contact_modes import (
+    Descent,
+    Model,
+    Plan,
+    minimize,
+    optimality_in_mode,
+    rolled_out,
+    surroundings,
+)
+
+H, DT, STEPS = 0.005, 0.02, 12  # s; a physics step, a control period, and how many of these
+# A slide that a motor pushes to its limit at 1 m, and a ball over the floor.
+SLIDE = """<mujoco><option timestep="0.005" gravity="0 0 0" tolerance="1e-14" integrator="INTEGRATOR"/>
+  <compiler autolimits="true"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-1 1"/>
+  <geom size="0.1" mass="MASS"/></body></worldbody>
+  <actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator></mujoco>"""
+BALL = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"/><compiler autolimits="true"/>
+  <worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.1"><joint name="x" type="slide" axis="0 0 1"/>
+  <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator>
+  </mujoco>"""
+FILES = {"slide": SLIDE, "ball": BALL}
+GRAVITY = {"slide": 0.0, "ball": 9.81}
+MASSES, SPEEDS = st.floats(0.5, 3.0), st.floats(0.2, 2.0)
+
+
+@cache
+def robot_of(kind: str, mass: float, integrator: str = "Euler") -> ls.MjcfRobot:
+    return ls.MjcfRobot(scene_from_xml(FILES[kind].replace("MASS", repr(mass)).replace("INTEGRATOR", integrator), kind))
+
+
+def modes_of(robot: ls.MjcfRobot) -> ContactModes:
+    assert isinstance(robot.dynamics, MjcfDynamics)
+    modes = robot.dynamics.contact_modes(DT)
+    assert modes is not None
+    return modes
+
+
+@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
+@settings(max_examples=6)
+@given(mass=MASSES, speed=SPEEDS, depth=st.floats(-0.015, 0.015))
+def test_a_period_is_that_of_the_dynamics_and_its_first_switch_the_distance(
+    kind: str, integrator: str, mass: float, speed: float, depth: float
+) -> None:
+    robot, control = robot_of(kind, mass, integrator), np.array([0.1])
+    state = np.array([1 + depth, speed] if kind == "slide" else [-depth, -speed])
+    end, switches = modes_of(robot).step(state, control)
+    # The compiled steps are MuJoCo's own; four stages of Runge and Kutta are added in another order here.
+    np.testing.assert_allclose(end, robot.dynamics.step(state, control, DT), rtol=0, atol=1e-11)
+    first = switches.values[~switches.forces][0]
+    assert first == pytest.approx(-depth, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", FILES)
+@settings(max_examples=6)
+@given(mass=MASSES, speed=SPEEDS, part=st.floats(0.1, 0.9))
+def test_derivatives_beside_a_jump_are_those_of_free_flight(kind: str, mass: float, speed: float, part: float) -> None:
+    robot, control = robot_of(kind, mass), np.array([0.0])
+    # The last physics step begins a nanometre before the contact: three steps of semi-implicit Euler are flown.
+    gravity = GRAVITY[kind]
+    way = 3 * H * speed + gravity * H * H * 6 + 1e-9
+    state = np.array([1 - way, speed] if kind == "slide" else [way, -speed])
+    period = modes_of(robot).linearize(state, control)
+    assert period.certain
+    push = 50 / mass
+    want = np.array([[1, 4 * H, push * 10 * H * H], [0, 1, push * 4 * H]])
+    np.testing.assert_allclose(period.jacobian, want, rtol=0, atol=1e-6)  # differences by 1e-6 of a linear step
+    gone = np.argmin(np.abs(period.switches.values))
+    sign = -1 if kind == "slide" else 1
+    np.testing.assert_allclose(period.slopes[gone], sign * np.array([1, 3 * H, push * 6 * H * H]), rtol=0, atol=1e-6)
+    a, b, _ = robot.dynamics.linearize(state, control, DT)
+    assert np.abs(np.hstack([a, b]) - want).max() > 1e3  # central differences straddle the jump
+
+
+def pushed(mass: float, goal: float, speed: float) -> ls.Problem:
+    """The slide is to be beyond its limit, and cannot without hitting it."""
+    robot = robot_of("slide", mass)
+    return ls.Problem(
+        dynamics=robot.dynamics, dt=DT, steps=STEPS, initial=ls.FixedState(np.array([1 - 0.2 * speed, speed])),
+        stage_cost=ls.ControlCost([0.1]), final_cost=ls.QuadraticCost([100.0, 1.0], about=np.array([goal, 0.0])),
+        control_limits=(-1, 1),
+    )  # fmt: skip
+
+
+def flown(mass: float, speed: float) -> tuple[Array, Array, Array, Array]:
+    """Positions at each physics step, and the last speed, linear in the controls: M, c of each."""
+    count = 4 * STEPS
+    responses, offsets = np.zeros((count + 1, 2, STEPS)), np.zeros((count + 1, 2))
+    offsets[0] = 1 - 0.2 * speed, speed
+    for k in range(count):
+        responses[k + 1, 1], offsets[k + 1, 1] = responses[k, 1], offsets[k, 1]
+        responses[k + 1, 1, k // 4] += H * 50 / mass
+        for one in (responses, offsets):
+            one[k + 1, 0] = one[k, 0] + H * one[k + 1, 1]
+    return responses[:, 0], offsets[:, 0], responses[-1, 1], offsets[-1, 1]
+
+
+def least_cost(mass: float, goal: float, speed: float) -> float:
+    """The least cost without touching the limit, by SciPy: a quadratic program."""
+    where, about, fast, begun = flown(mass, speed)
+
+    def cost(u: Array) -> tuple[float, Array]:
+        off, rate = where[-1] @ u + about[-1] - goal, fast @ u + begun
+        value = 0.05 * float(u @ u) + 50 * float(off) ** 2 + 0.5 * float(rate) ** 2
+        return value, 0.1 * u + 100 * off * where[-1] + rate * fast
+
+    keep = {"type": "ineq", "fun": lambda u: 1.0 - about[:-1] - where[:-1] @ u, "jac": lambda u: -where[:-1]}
+    found = scipy.optimize.minimize(
+        cost, np.zeros(STEPS), jac=True, method="SLSQP", bounds=[(-1, 1)] * STEPS, constraints=[keep],
+        options={"ftol": 1e-14, "maxiter": 500},
+    )  # fmt: skip
+    assert found.success
+    return float(found.fun)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> None:
+    draws = np.random.default_rng(seed)
+    mass, goal, speed = draws.uniform(0.7, 2), draws.uniform(1.03, 1.2), draws.uniform(0.5, 1.0)
+    problem = pushed(mass, goal, speed)
+    assert problem.start is not None
+    # A brake that stops it short of the limit.
+    controls = np.full((STEPS, 1), -mass * speed / (50 * DT * STEPS))
+    begin = rolled_out(problem, np.tile(problem.start, (STEPS + 1, 1)), controls, np.zeros((STEPS, 1, 2)))
+    modes = modes_of(robot_of("slide", mass))
+    descent = Descent(problem, modes, begin, 1e-6, Budget(50, Stop()))
+    assert descent.run() is ls.Status.CONVERGED
+    pulls, limits = descent.pulls()
+    parts = surroundings(problem, descent.model, descent.plan, pulls)
+    assert parts.pressed > 0
+    assert parts.across < 1e-6
+
+    def cost_of(controls: Array) -> float:
+        state, cost = problem.start, 0.05 * float(np.sum(controls**2))
+        for control in controls:
+            assert state is not None
+            state = problem.dynamics.step(state, control, DT)
+        assert state is not None
+        return cost + 50 * (state[0] - goal) ** 2 + 0.5 * state[1] ** 2
+
+    own = cost_of(descent.plan.controls)
+    assert own == pytest.approx(descent.plan.cost, rel=1e-9)
+    # Other controls, from far less than the distance to a switch to far more: rounding, and no more, may be gained.
+    for size in np.repeat([1e-9, 1e-7, 1e-5, 1e-3], 40):
+        other = np.clip(descent.plan.controls + size * draws.standard_normal((STEPS, 1)), -1, 1)
+        assert cost_of(other) >= own * (1 - 1e-6)
+    # The gradient says that it is not optimal: only with the multipliers of its switches it is.
+    none = [Switches(one.names, 0 * one.values) for one in pulls]
+    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, none, limits)[0] > 1e-3
+    assert optimality_in_mode(problem, modes, descent.plan, descent.model.gain, pulls, limits)[0] < 2e-6
+
+
+def test_smooth_converges_beside_a_jump_and_says_what_is_there(tmp_path: Path) -> None:
+    problem = pushed(1.0, 1.05, 0.8)
+    solution = ls.smooth(problem, max_iterations=30)
+    assert solution.status is ls.Status.CONVERGED, solution.detail
+    contacts = solution.certificate.contacts
+    assert contacts is not None
+    assert contacts.pressed > 0
+    assert contacts.across < 0
+    assert contacts.sampled <= 1e-4
+    assert solution.optimality < 2e-4
+    assert "contacts:" in solution.summary()
+    plain = ls.smooth(problem, max_iterations=30, safeguard=False)
+    assert not plain.success
+    # The plan is MuJoCo's own motion, and costs what it says.
+    state, cost = solution.trajectory.states[0], 0.0
+    for control, planned in zip(solution.trajectory.controls, solution.trajectory.states[1:], strict=True):
+        state, cost = problem.dynamics.step(state, control, DT), cost + 0.05 * float(control @ control)
+        np.testing.assert_allclose(state, planned, rtol=0, atol=1e-9)
+    off, rate = state - np.array([1.05, 0.0])
+    assert solution.cost == pytest.approx(cost + 50 * off**2 + 0.5 * rate**2, rel=1e-9)
+    ls.save(solution, tmp_path / "pushed.npz")
+    loaded = ls.load(tmp_path / "pushed.npz")
+    assert isinstance(loaded, ls.Solution)
+    assert loaded.certificate == solution.certificate
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None:
+    draws = np.random.default_rng(seed)
+    mass, goal, speed = draws.uniform(0.7, 2), draws.uniform(1.03, 1.2), draws.uniform(0.5, 1.0)
+    problem = pushed(mass, goal, speed)
+    modes = modes_of(robot_of("slide", mass))
+    assert problem.start is not None
+    controls = draws.uniform(-0.05, 0.0, (STEPS, 1))
+    plan = rolled_out(problem, np.tile(problem.start, (STEPS + 1, 1)), controls, np.zeros((STEPS, 1, 2)))
+    where, about, *_ = flown(mass, speed)
+    if (where[:-1] @ plan.controls[:, 0] + about[:-1] > 1).any():
+        return  # it touches
+    model = Model(problem, modes, Plan(plan.states, plan.controls, plan.cost))
+    step = minimize(model, model.hessian)
+    assert step is not None
+    parts = np.split(step.multipliers, model.first[1:-1])
+    pulls = [Switches(one.switches.names, part) for one, part in zip(model.periods, parts, strict=True)]
+    optimality, _ = optimality_in_mode(problem, modes, plan, model.gain, pulls, step.limits)
+    fall = (plan.cost - least_cost(mass, goal, speed)) / plan.cost
+    # Without limits of the controls, and with all switches in sight, it is the fall itself, in a linear mode.
+    assert optimality >= fall - 1e-6
