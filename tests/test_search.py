@@ -357,3 +357,54 @@ def test_where_no_control_helps_by_itself_some_do_together() -> None:
     # 2 pi r^2 = 1 and a speed of 2 pi r / T, that is 1/2 0.1 (T / dt) (2 pi r / T)^2 = 0.1 pi / (dt T).
     assert found.cost == pytest.approx(0.1 * np.pi / (0.05 * 2.0), rel=0.05)
     assert [one.start for one in found.candidates][:1] == ["nominal control"]
+
+
+@pytest.fixture(scope="module")
+def on_wheels() -> ls.Problem:
+    """The packaged drive by MuJoCo's steps, from rest on the floor to the other side of the arena, 150 steps."""
+    drive = ls.scenarios.differential_drive()
+    robot = ls.MjcfRobot("arena", position=("create_base_x", "create_base_y"), radius=drive.robot.radius)
+    start, goal = (robot.at(create_base_y=y, create_base_z=0.036, create_base_rz=np.pi) for y in (-2.5, 2.5))
+    weight = np.zeros(len(start))
+    weight[[0, 1, 5]] = 1000.0
+    return replace(
+        drive.problem, dynamics=robot.dynamics, initial=ls.FixedState(start),
+        final_cost=ls.QuadraticCost(weight, about=goal),
+    )  # fmt: skip
+
+
+class TestWhatContactsHold:
+    def test_what_moves_little_is_held_and_wheels_turn(self, on_wheels) -> None:
+        """By runs of `step` alone: tilts and height move little with swaying controls, and wheels most."""
+        few = replace(on_wheels, steps=40)
+        (_, prior), *others = guides(few, None)
+        assert prior is not None
+        weight = dict(zip(few.dynamics.state_coordinates.names, prior.weight, strict=True))
+        weight = {name.removeprefix("create_").removeprefix("base_"): number for name, number in weight.items()}
+        assert weight["x"] == weight["y"] > 0
+        held = ("z", "rx", "ry", "vz", "wx")
+        assert min(weight[name] for name in held) > 100 * max(weight[f"wheel_{side}"] for side in ("left", "right"))
+        assert weight["z"] > 100 * weight["x"]
+        assert weight["wx"] > 100 * weight["wz"]
+        for _, one in others:
+            assert one is not None
+            np.testing.assert_array_equal(one.weight, prior.weight)
+            ends = np.array([few.start, few.goal]) * (prior.weight > 0)
+            np.testing.assert_allclose(one.about[[0, -1]], ends, atol=1e-12)  # the sine of pi
+
+    def test_without_it_the_first_pass_is_lost(self, on_wheels) -> None:
+        """The default start passes through once; attracted by its position alone, wheels drive a robot that tilts."""
+        ((_, prior),) = guides(on_wheels, 1)
+        assert prior is not None
+        alone = ls.InitialPrior(
+            np.where(np.arange(len(prior.weight)) < 2, prior.weight, 0.0), about=prior.about, obstacles=prior.obstacles
+        )
+        once = {"max_iterations": 1, "safeguard": False}
+        assert ls.smooth(on_wheels, start=alone, **once).status is Status.NOT_FINITE
+        assert ls.smooth(on_wheels, start=prior, **once).cost < 1e4
+
+    def test_formulas_and_robots_without_a_position_are_drawn_as_before(self, differential_drive) -> None:
+        for _, one in guides(differential_drive.problem, None):
+            assert one is not None
+            assert one.iterations == 1
+            assert np.flatnonzero(one.weight).tolist() == [0, 1]
