@@ -145,8 +145,11 @@ class MjcfDynamics(Dynamics):
         """None: MuJoCo has no second derivatives."""
         return None
 
+    def touches(self, states: Array) -> bool:
+        return bool(np.isfinite(states).all()) and touches(self.physics.model, states)
+
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
-        if "softness" in self._stated or not np.isfinite(states).all() or not touches(self.physics.model, states):
+        if "softness" in self._stated or not self.touches(states):
             return
         for softness in SOFTER:
             other = copy.copy(self)

@@ -40,7 +40,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
 
     A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are those
     of the position; for a robot of collision spheres without a position, those of the states that move its spheres,
-    such as the angles of an arm. A body that MuJoCo's steps move is drawn to a straight line in its other states, too.
+    such as the angles of an arm. What stands on contacts is drawn to a straight line in its other states, too.
 
     Args:
       count: the number of starts; by default `STARTS` where there are obstacles.
@@ -50,7 +50,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
         return [("nominal control", None)]
     moving = _moving(problem)
     ends = problem.start[moving], problem.goal[moving]
-    holding = problem.dynamics.discrete and bool(problem.dynamics.state_coordinates.position)
+    holding = bool(problem.dynamics.state_coordinates.position) and problem.dynamics.touches(problem.start[None])
     weight = weight_of_path * _holding(problem) if holding else np.zeros(len(problem.start))
     weight[moving] = weight_of_path
     between = np.where(weight > 0, np.linspace(problem.start, problem.goal, problem.steps + 1), 0.0)
