@@ -146,10 +146,10 @@ class MjcfDynamics(Dynamics):
         return None
 
     def touches(self, states: Array) -> bool:
-        return bool(np.isfinite(states).all()) and touches(self.physics.model, states)
+        return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
 
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
-        if "softness" in self._stated or not self.touches(states):
+        if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
             return
         for softness in SOFTER:
             other = copy.copy(self)

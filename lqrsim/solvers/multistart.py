@@ -50,7 +50,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
         return [("nominal control", None)]
     moving = _moving(problem)
     ends = problem.start[moving], problem.goal[moving]
-    holding = bool(problem.dynamics.state_coordinates.position) and problem.dynamics.touches(problem.start[None])
+    holding = bool(problem.dynamics.state_coordinates.position) and _stands(problem)
     weight = weight_of_path * _holding(problem) if holding else np.zeros(len(problem.start))
     weight[moving] = weight_of_path
     between = np.where(weight > 0, np.linspace(problem.start, problem.goal, problem.steps + 1), 0.0)
@@ -62,6 +62,13 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
         prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=SHARES)
         found.append((name, prior))
     return found
+
+
+def _stands(problem: Problem) -> bool:
+    """Whether contacts act at the start, or a control period later, when what is set on the floor has sunk in."""
+    assert problem.start is not None
+    later = problem.dynamics.step(problem.start, problem.nominal_control, problem.dt)
+    return problem.dynamics.touches(np.array([problem.start, later]))
 
 
 def _holding(problem: Problem) -> Array:
