@@ -401,7 +401,9 @@ class TestWhatContactsHold:
 
     def test_formulas_and_robots_in_the_air_are_drawn_by_their_position_alone(self, differential_drive) -> None:
         robot = ls.MjcfRobot("cage")
-        start, goal = robot.at(quadrotor_x=-1.0, quadrotor_z=1.0), robot.at(quadrotor_x=1.0, quadrotor_z=1.0)
+        flight, names = ls.scenarios.quadrotor().problem, [f"quadrotor_{axis}" for axis in "xyz"]
+        ends = np.array([flight.start, flight.goal])[:, :3].tolist()
+        start, goal = (robot.at(**dict(zip(names, end, strict=True))) for end in ends)
         for problem, place in ((differential_drive.problem, [0, 1]), (robot.problem(start, goal, steps=20), [0, 1, 2])):
             for _, one in guides(problem, None):
                 assert one is not None
