@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 
 OUT = Path("runs/mjcf_robots")
 TILE = 400, 225  # pixels of a picture on the sheet of all
@@ -51,6 +52,8 @@ class Config(FolderSettings):
     """Folder with unpacked packages, for those that are not installed."""
     pictures: bool = True
     """Draw each run."""
+    frictionless: bool = False
+    """Begin with a plan without dry friction, which hides from a plan at rest that controls have an effect."""
 
 
 def main(config: Config) -> Result:
@@ -64,7 +67,8 @@ def main(config: Config) -> Result:
     here = [task for task in wanted if task.path is not None]
     result = opening(config) | {"rows": [], "missing": [task.name for task in wanted if task not in here]}
     for task in progress(here, "robots"):
-        row = row_of(config, task, {"iterations": most, "time_limit": config.time_limit})
+        limits = {"iterations": most, "time_limit": config.time_limit}
+        row = row_of(config, task, limits | ({"frictionless": True} if config.frictionless else {}))
         result["rows"].append(row)
         result["figures"] += row["figures"]
         if not config.json:
@@ -108,7 +112,8 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
     held = np.tile(robot.hold(problem.start), (problem.steps, 1)) if isinstance(task, FamilyTask) else None
     ways = task.moves.values() if isinstance(task, FamilyTask) else ()
     most, seconds = limits["iterations"], limits["time_limit"]
-    solution = ls.smooth(problem, max_iterations=most, time_limit=seconds)
+    begin = ls.smooth(without_friction(problem), max_iterations=most) if config.frictionless else None
+    solution = ls.smooth(problem, max_iterations=most, time_limit=seconds, start=begin)
     other = None  # iLQR keeps no constraints
     if not problem.constraints:
         other = ls.ilqr(problem, max_iterations=most, time_limit=seconds, start=held)
@@ -139,6 +144,14 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
             titles=(task.name,),
         )  # fmt: skip
     return row
+
+
+def without_friction(problem: ls.Problem) -> ls.Problem:
+    """The same without dry friction in any joint."""
+    dynamics = problem.dynamics
+    assert isinstance(dynamics, MjcfDynamics)
+    losses = {name: 0.0 for name in dynamics.numbers if name.endswith("_frictionloss")}
+    return replace(problem, dynamics=dynamics.with_parameters(**losses))
 
 
 def missed(task: Task | FamilyTask, robot: ls.MjcfRobot, problem: ls.Problem, last: Array) -> dict[str, float]:

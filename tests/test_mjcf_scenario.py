@@ -89,8 +89,9 @@ def test_the_path_is_found_from_any_folder(cart: Path, monkeypatch: pytest.Monke
 def test_solve_and_simulate_on_the_command_line(
     cart: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Also by a reference of thousands of characters, as one of a robot with many states is."""
     monkeypatch.chdir(cart.parent)
-    assert main(["solve", f"{cart.name},start={{'pole': 2.9}},goal={{'pole': 3.14159}},steps=40"]) == 0
+    assert main(["solve", f"{cart.name},start={{'pole': 2.9}},goal={{'pole': 3.14159{'0' * 5000}}},steps=40"]) == 0
     assert main(["simulate", "runs/cart/solution.npz"]) == 0
     assert "1 of 1 trials reached the goal" in capsys.readouterr().out
 

@@ -357,3 +357,55 @@ def test_where_no_control_helps_by_itself_some_do_together() -> None:
     # 2 pi r^2 = 1 and a speed of 2 pi r / T, that is 1/2 0.1 (T / dt) (2 pi r / T)^2 = 0.1 pi / (dt T).
     assert found.cost == pytest.approx(0.1 * np.pi / (0.05 * 2.0), rel=0.05)
     assert [one.start for one in found.candidates][:1] == ["nominal control"]
+
+
+@pytest.fixture(scope="module")
+def on_wheels() -> ls.Problem:
+    """The packaged drive by MuJoCo's steps, from rest on the floor to the other side of the arena, 150 steps."""
+    drive = ls.scenarios.differential_drive()
+    robot = ls.MjcfRobot("arena", position=("create_base_x", "create_base_y"), radius=drive.robot.radius)
+    start, goal = (robot.at(create_base_y=y, create_base_z=0.036, create_base_rz=np.pi) for y in (-2.5, 2.5))
+    weight = np.zeros(len(start))
+    weight[[0, 1, 5]] = 1000.0
+    return replace(
+        drive.problem, dynamics=robot.dynamics, initial=ls.FixedState(start),
+        final_cost=ls.QuadraticCost(weight, about=goal),
+    )  # fmt: skip
+
+
+class TestWhatContactsHold:
+    def test_what_moves_little_is_held_and_wheels_turn(self, on_wheels) -> None:
+        """By runs of `step` alone: tilts and height move little with swaying controls, and wheels most."""
+        few = replace(on_wheels, steps=40)
+        (_, prior), *others = guides(few, None)
+        assert prior is not None
+        weight = dict(zip(few.dynamics.state_coordinates.names, prior.weight, strict=True))
+        weight = {name.removeprefix("create_").removeprefix("base_"): number for name, number in weight.items()}
+        assert weight["x"] == weight["y"] > 0
+        held = ("z", "rx", "ry", "vz", "wx")
+        assert min(weight[name] for name in held) > 100 * max(weight[f"wheel_{side}"] for side in ("left", "right"))
+        assert weight["z"] > 100 * weight["x"]
+        assert weight["wx"] > 100 * weight["wz"]
+        for _, one in others:
+            assert one is not None
+            np.testing.assert_array_equal(one.weight, prior.weight)
+            ends = np.array([few.start, few.goal]) * (prior.weight > 0)
+            np.testing.assert_allclose(one.about[[0, -1]], ends, atol=1e-12)  # the sine of pi
+
+    def test_the_first_pass_is_not_lost(self, on_wheels) -> None:
+        """Attracted by its position alone, the robot is tilted in the first pass, which is NOT_FINITE."""
+        ((_, prior),) = guides(on_wheels, 1)
+        once = ls.smooth(on_wheels, start=prior, max_iterations=1, safeguard=False, threads=1)
+        assert once.status is Status.MAX_ITERATIONS
+        assert once.cost < 1e4
+
+    def test_formulas_and_robots_in_the_air_are_drawn_by_their_position_alone(self, differential_drive) -> None:
+        robot = ls.MjcfRobot("cage")
+        flight, names = ls.scenarios.quadrotor().problem, [f"quadrotor_{axis}" for axis in "xyz"]
+        ends = np.array([flight.start, flight.goal])[:, :3].tolist()
+        start, goal = (robot.at(**dict(zip(names, end, strict=True))) for end in ends)
+        for problem, place in ((differential_drive.problem, [0, 1]), (robot.problem(start, goal, steps=20), [0, 1, 2])):
+            for _, one in guides(problem, None):
+                assert one is not None
+                assert one.iterations == 1
+                assert np.flatnonzero(one.weight).tolist() == place

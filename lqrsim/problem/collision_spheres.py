@@ -248,16 +248,12 @@ class CollisionSpheres:
         p = symbolic.Parameters(**dynamics.parameters)
         try:
             with np.errstate(all="ignore"):
-                returned = plain(np.zeros(len(dynamics.state_coordinates)), p)
+                size = len(_points(plain(np.zeros(len(dynamics.state_coordinates)), p), len(self))[0])
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
             said = f"{type(error).__name__} ({error})"
             raise InputError(f"{self.name}: got {said}, want it to work at x = (0, ..., 0)") from error
-        try:
-            size = len(_points(returned, len(self))[0])
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from None
         self._check_plane(size, dynamics.state_coordinates)
         return size
 

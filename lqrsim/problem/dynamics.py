@@ -237,6 +237,10 @@ class Dynamics:
         made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
         return text_source(made["source"], f"{self.name}(x, u, p)")
 
+    def touches(self, states: Array) -> bool:
+        """Whether a contact or a limit acts in one of these states (k, n)."""
+        return False
+
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
         """The same dynamics with softer contacts and limits, each with its name, the softest first.
 

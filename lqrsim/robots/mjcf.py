@@ -42,7 +42,6 @@ _ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off it
 _REST = 1e-6  # m/s^2, by which something at rest may accelerate
 _PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
 _LISTED = 12  # names in a line of what is printed
-_WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
 
 class MjcfRobot(Robot):
@@ -127,6 +126,7 @@ class MjcfRobot(Robot):
         self.body = model.body(number).name
         self.joints = tuple(one.name for one in self._joints)
         self.actuators = tuple(one.name for one in actuators)
+        self._numbers = np.array([one.number for one in actuators], dtype=np.intp)
         self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
         turned = {"free": 3, "ball": 0}  # where among a joint's coordinates a rotation vector begins
@@ -255,8 +255,7 @@ class MjcfRobot(Robot):
 
     def _held(self, state: Array) -> Holding:
         model = self.dynamics.physics.model
-        numbers = np.array([model.actuator(name).id for name in self.actuators], dtype=np.intp)
-        return holding(model, self.configuration(state)[0], state[2 * model.nv :], numbers)
+        return holding(model, self.configuration(state)[0], state[2 * model.nv :], self._numbers)
 
     def problem(
         self,
@@ -303,16 +302,10 @@ class MjcfRobot(Robot):
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
-        if effort is None:
-            numbers = np.array([model.actuator(name).id for name in self.actuators], dtype=np.intp)
-            effort = efforts(model, numbers) ** -2.0
-        cost: Cost = ControlCost(effort, about=about)
-        moves = np.zeros(n)
+        cost: Cost = ControlCost(efforts(model, self._numbers) ** -2.0 if effort is None else effort, about=about)
+        damping, moves = check_number("damping", damping, at_least=0.0), np.zeros(n)
         for one in self._joints:
-            if one.kind != "free":
-                moves[model.nv + one.dof : model.nv + one.dof + _WIDTH[one.kind][1]] = check_number(
-                    "damping", damping, at_least=0.0
-                )
+            moves[model.nv : 2 * model.nv][one.dofs] = damping if one.kind != "free" else 0.0
         if moves.any():
             cost = cost + QuadraticCost(moves, about=np.zeros(n))
         bounds = self._bounds(start, goal)
@@ -344,18 +337,17 @@ class MjcfRobot(Robot):
 
     def __str__(self) -> str:
         space, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
-        held, names = self._held(self.at()), self.scene.world.names
+        held = self._held(self.at())
         told = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
         worst = int(np.argmax(np.abs(held.missed)))
-        turns = self.dynamics.state_coordinates.units[worst] == "rad"
-        short = f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {'N m' if turns else 'N'}"
-        short = "" if held.held else short
+        unit = "N m" if space.units[worst] == "rad" else "N"
+        short = "" if held.held else f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {unit}"
         lines = [
-            f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self._timestep:g} s",
+            f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {_listed(space.names)}",
             f"  held at rest by: {_listed(told)}{short}",
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
-            f"  obstacles: {_listed(names)}",
+            f"  obstacles: {_listed(self.scene.world.names)}",
         ]
         return "\n".join(lines)
 
@@ -371,10 +363,6 @@ class MjcfRobot(Robot):
             f"{first} and {second}" for first, second in mjcf_joints.contacts_of(model, self.configuration(rest)[0])
         ]
         return {"past their limits": past, "touching": touching}
-
-    @property
-    def _timestep(self) -> float:
-        return float(self.scene.model.opt.timestep)
 
     @property
     def joint_limits(self) -> StateBounds:
@@ -422,7 +410,7 @@ class MjcfRobot(Robot):
         qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
         parts = []
         for one in self._joints:
-            own = qpos[..., one.qpos : one.qpos + _WIDTH[one.kind][0]]
+            own = qpos[..., one.qpos]
             if one.kind in ("free", "ball"):
                 parts += [own[..., :3]] if one.kind == "free" else []
                 parts.append(rotations.rotation_vector(own[..., -4:]))
@@ -441,7 +429,7 @@ class MjcfRobot(Robot):
         state = vectors_of("state", state, len(self.dynamics.state_coordinates))
         parts = []
         for one in self._joints:
-            own = state[..., one.dof : one.dof + _WIDTH[one.kind][1]]
+            own = state[..., one.dofs]
             if one.kind in ("free", "ball"):
                 parts += [own[..., :3]] if one.kind == "free" else []
                 parts.append(rotations.quaternion(own[..., -3:]))

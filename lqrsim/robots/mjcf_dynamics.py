@@ -146,8 +146,11 @@ class MjcfDynamics(Dynamics):
         """None: MuJoCo has no second derivatives."""
         return None
 
+    def touches(self, states: Array) -> bool:
+        return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
+
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
-        if "softness" in self._stated or not np.isfinite(states).all() or not touches(self.physics.model, states):
+        if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
             return
         for softness in SOFTER:
             other = copy.copy(self)

@@ -83,13 +83,15 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
+
+    def forces(controls: Array) -> Array:
+        data.ctrl[:] = controls
+        mujoco.mj_forward(model, data)
+        return data.qfrc_actuator.copy()
+
     driven = np.zeros(model.nv, dtype=bool)
     for one in np.eye(model.nu):
-        forces = []
-        for data.ctrl[:] in (one, -one):
-            mujoco.mj_forward(model, data)
-            forces.append(data.qfrc_actuator.copy())
-        driven |= forces[0] != forces[1]
+        driven |= forces(one) != forces(-one)
     free = np.flatnonzero(~driven)
     if not len(free):
         return qpos.copy(), 0.0

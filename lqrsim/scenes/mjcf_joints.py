@@ -14,6 +14,7 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_HINGE: "hinge",
 }  # fmt: skip
 
+_SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
@@ -23,16 +24,19 @@ class Joint:
 
     Attributes:
       name: its own. kind: free, ball, slide or hinge.
-      qpos, dof: where its numbers begin in qpos and qvel. limits: of a slide or hinge, in m or rad; None without.
-      rest: its numbers in qpos by default.
+      qpos, dof: its numbers in qpos and in qvel. limits: of a slide or hinge, in m or rad; None without.
     """
 
     name: str
     kind: str
-    qpos: int
-    dof: int
+    qpos: slice
+    dofs: slice
     limits: tuple[float, float] | None
-    rest: Array
+
+    @property
+    def dof(self) -> int:
+        """The first of its numbers in qvel: the only one of a slide or hinge."""
+        return self.dofs.start
 
 
 @dataclass(frozen=True)
@@ -112,13 +116,12 @@ def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
     """All joints, in the order of their degrees of freedom."""
     found = []
     for number in range(model.njnt):
-        joint, limited = model.joint(number), bool(model.jnt_limited[number])
         kind = _KINDS[mujoco.mjtJoint(model.jnt_type[number])]
-        first = int(model.jnt_qposadr[number])
-        rest = model.qpos0[first : first + {"free": 7, "ball": 4}.get(kind, 1)].copy()
+        firsts = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
+        qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
         low, high = model.jnt_range[number].tolist()
-        limits = (low, high) if limited and kind in ("slide", "hinge") else None
-        found.append(Joint(joint.name, kind, first, int(model.jnt_dofadr[number]), limits, rest))
+        limits = (low, high) if model.jnt_limited[number] and kind in ("slide", "hinge") else None
+        found.append(Joint(model.joint(number).name, kind, qpos, dofs, limits))
     return tuple(found)
 
 
@@ -215,7 +218,7 @@ def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
     """
     data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
     candidates = {
-        one.dof + i: one.qpos + i for one in joints if one.kind in ("free", "slide")
+        one.dof + i: one.qpos.start + i for one in joints if one.kind in ("free", "slide")
         for i in range(3 if one.kind == "free" else 1)
     }  # fmt: skip
     errors = {(dof, axis): 0.0 for dof in candidates for axis in range(3)}

@@ -86,7 +86,7 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         elif one.what == "gear":
             _set(elements["actuator"][one.part], "gear", [*(ratio * model.actuator(one.part).gear)])
         else:
-            _set(_last(root, "option"), one.what, [value])
+            _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last one wins
     if scales:
         _state_masses(root, elements["body"], model, scales)
     return ElementTree.tostring(root, encoding="unicode")
@@ -112,7 +112,7 @@ def _state_masses(
             _set(inertial, "diaginertia", [*(scale * compiled.inertia)])
             body.insert(0, inertial)
     compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
-    root.append(ElementTree.Element("compiler", compiler))
+    ElementTree.SubElement(root, "compiler", compiler)
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
@@ -148,10 +148,3 @@ def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
 def _set(element: ElementTree.Element, name: str, numbers: list[float]) -> None:
     """Write numbers so that they read back exactly."""
     element.set(name, " ".join(repr(float(number)) for number in numbers))
-
-
-def _last(root: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """A new element at the end, which wins over those before."""
-    element = ElementTree.Element(tag)
-    root.append(element)
-    return element

@@ -21,10 +21,12 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
       body: the robot's first that moves. floors: whether level planes and height fields are for standing on, if a free
         joint, or a slide that is not level, lets the robot sink to them, or it touches them at rest.
     """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)  # at rest
     base, touched = _base(model), set(touching_pairs(model, candidates)[:, 1].tolist())
-    ground = _ground(model) if floors else set[int]()
-    if not _sinks(model, body):
-        ground = {geom for geom in ground if _touches(model, geom)}
+    ground = _ground(model, data) if floors else set[int]()
+    if not _sinks(model, data, body):
+        ground = {geom for geom in ground if _touches(model, data, geom)}
     bodies = model.geom_bodyid.tolist()
     return [geom for geom in candidates if geom in touched and geom not in ground and bodies[geom] not in base]
 
@@ -119,26 +121,20 @@ def _base(model: mujoco.MjModel) -> set[int]:
     return base | carriers
 
 
-def _ground(model: mujoco.MjModel) -> set[int]:
+def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
     """Level planes that face up, and height fields."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (data.geom_xmat[:, 8] > _LEVEL)
     return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
 
 
-def _touches(model: mujoco.MjModel, ground: int) -> bool:
-    """Whether something that moves touches a geom, or is in it, where all joints are at rest."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+def _touches(model: mujoco.MjModel, data: mujoco.MjData, ground: int) -> bool:
+    """Whether something that moves touches a geom, or is in it."""
     pairs = touching_pairs(model, [ground])[:, 0].tolist()
     return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
 
 
-def _sinks(model: mujoco.MjModel, body: int) -> bool:
+def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     while body:
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
         for joint in range(first, first + count):

@@ -216,13 +216,8 @@ def _functions() -> dict[str, int]:
     patterns = {"Windows": "mujoco.dll", "Darwin": "libmujoco*.dylib"}
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
-    found = {}
     names = (
         "mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac",
         "mj_geomDistance",
     )  # fmt: skip
-    for name in names:
-        address = ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value
-        assert address is not None
-        found[name] = address
-    return found
+    return {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value or 0 for name in names}

@@ -26,6 +26,9 @@ SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first it
 PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
 FOLD = 0.9  # the same for the states that move collision spheres: an arm must fold up before it passes an obstacle
+# What contacts hold, such as the tilt of a robot on a floor, is drawn to its start: the weight relative to the path's
+# for a state that moves by 1, and the least range of a state, relative to the largest of its unit.
+HOLD, LEAST = 0.01, 1e-3
 HALVE, CHOOSE = 3, 4  # iterations after which half of the starts remain, and one
 # Where controls at rest have no effect alone, as for a swimmer: cycles of oscillating controls along the plan, and
 # their amplitude relative to the room within the limits.
@@ -37,7 +40,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
 
     A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are those
     of the position; for a robot of collision spheres without a position, those of the states that move its spheres,
-    such as the angles of an arm.
+    such as the angles of an arm. What stands on contacts is drawn to a straight line in its other states, too.
 
     Args:
       count: the number of starts; by default `STARTS` where there are obstacles.
@@ -47,15 +50,46 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
         return [("nominal control", None)]
     moving = _moving(problem)
     ends = problem.start[moving], problem.goal[moving]
-    weight = np.zeros(len(problem.start))
+    holding = bool(problem.dynamics.state_coordinates.position) and _stands(problem)
+    weight = weight_of_path * _holding(problem) if holding else np.zeros(len(problem.start))
     weight[moving] = weight_of_path
+    between = np.where(weight > 0, np.linspace(problem.start, problem.goal, problem.steps + 1), 0.0)
     found, unit = [], problem.dynamics.state_coordinates.units[moving[0]]
     ring = RING if problem.dynamics.state_coordinates.position else FOLD
     for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count, ring=ring, unit=unit):
-        about = np.zeros((problem.steps + 1, len(weight)))
+        about = between.copy()
         about[:, moving] = path(*ends, bend, problem.steps)
-        found.append((name, InitialPrior(weight, about=about, obstacles=SHARES)))
+        prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=SHARES)
+        found.append((name, prior))
     return found
+
+
+def _stands(problem: Problem) -> bool:
+    """Whether contacts act at the start, or a control period later, when what is set on the floor has sunk in."""
+    assert problem.start is not None
+    later = problem.dynamics.step(problem.start, problem.nominal_control, problem.dt)
+    return problem.dynamics.touches(np.array([problem.start, later]))
+
+
+def _holding(problem: Problem) -> Array:
+    """Weights (n,) of all states, relative to the path's: the less a state moves with swaying controls, the heavier.
+
+    Derivatives at rest say how controls tilt a robot, but not that the floor ends the tilt after a millimetre. About
+    states of least total cost in which it is tilted, or above the floor, wheels drive nothing.
+    """
+    dynamics, start, ranges = problem.dynamics, problem.start, np.zeros(len(problem.dynamics.state_coordinates))
+    assert start is not None
+    for cycles in SWAYS:
+        state = start
+        for control in sinusoidal_controls(problem, cycles):
+            state = dynamics.step(state, control, problem.dt)
+            if not np.isfinite(state).all():
+                break
+            ranges = np.maximum(ranges, np.abs(state - start))
+    units = np.array(dynamics.state_coordinates.units)
+    largest = np.array([ranges[units == unit].max() for unit in units])
+    ranges = np.maximum(ranges, LEAST * largest)
+    return np.divide(HOLD, ranges**2, out=np.zeros_like(ranges), where=ranges > 0)
 
 
 def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]:
