@@ -63,7 +63,7 @@ class Choice:
 def choose_tolerances(
     model: PlanModel, predicted: Callable[[Weights], list[Prediction]], effort: Array, at_end: float
 ) -> Choice:
-    """Return the tolerances for a law about a plan.
+    """Choose the tolerances whose law is predicted to fail least often.
 
     Args:
       predicted: predicts the results of the laws of C weights.

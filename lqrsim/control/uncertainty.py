@@ -222,7 +222,7 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
     """Numbers as one for each entry, (len(space),); those by name win over those by unit, the rest are 0.
 
     Args:
-      above: a bound that each must exceed; by default they must be nonnegative, and some may be missing.
+      above: a bound that each must exceed; by default numbers may be 0, and names may be left out.
 
     Raises:
       InputError: a name or unit that there is not, another number of them, or one that is out of range.

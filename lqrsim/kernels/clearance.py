@@ -44,7 +44,7 @@ def slope(x, u, t, row, data, gradient):
 
 
 def place(x, row, data):
-    """The place of a row's ball."""
+    """The centre of the ball that a row is about, or the position of a robot that is a point."""
     if BALLS:
         first = 3 * (row // int(data[AT + 2]))
         return x[first], x[first + 1], x[first + 2]

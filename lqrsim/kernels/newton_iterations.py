@@ -46,7 +46,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
 
     Args:
       settings: IterationSettings. model: ProblemModel. work: SmootherArrays, with the plan.
-      memory: row of MEMORY, with the plan's cost and merit; a share below 0 if there was no pass about the plan yet.
+      memory: row of MEMORY, with the plan's cost and merit; its share is negative until there was a pass about it.
       log: rows of LOG. An iteration's optimality is the decrease that the next step promises.
 
     Returns:

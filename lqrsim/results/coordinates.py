@@ -264,7 +264,7 @@ class Coordinates:
 
         Args:
           field: of the message.
-          given: name of an entry, or a unit -> number.
+          given: number by name or unit of an entry.
 
         Returns:
           (n,).

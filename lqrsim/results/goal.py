@@ -99,7 +99,8 @@ class Target:
         """The distance within which the target counts as reached.
 
         Args:
-          robot_radius: in metres, the default where distances are in metres; see `on_the_way`.
+          robot_radius: of the robot in metres; the default goal radius where distances are in metres, see
+            `on_the_way`.
           goal_radius: in metres.
           goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
 

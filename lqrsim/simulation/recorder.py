@@ -88,9 +88,7 @@ class Recorder:
         """Set records and `frames` (K, F, nq) to NaN after a trial was lost or its controller failed."""
         if not self.over(self._steps).any():
             return
-        known_until = np.minimum(
-            self.lost_since, self.failed_since + 1
-        )  # the knot at which a controller fails is known
+        known_until = np.minimum(self.lost_since, self.failed_since + 1)  # where a controller fails, the state is known
         driven_until = np.minimum(self.lost_since, self.failed_since)
         knots = np.arange(self._steps + 1)
         # A frame belongs to the knot at the end of its period: the trial was lost somewhere before that.

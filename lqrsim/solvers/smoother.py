@@ -155,13 +155,10 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
     if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
-            why = 'finish="newton" and stop="optimal"'
-            why = (
-                "without noise, and dynamics that are not of an MJCF"
-                if settings.finish and settings.stop == "optimal"
-                else why
-            )
-            raise InputError(f"elastic: got {settings.elastic:g}, want {why} beside it")
+            why = 'None without finish="newton" and stop="optimal"'
+            if settings.finish and settings.stop == "optimal":
+                why = "None with noise or the dynamics of an MJCF"
+            raise InputError(f"elastic: got {settings.elastic:g}, want {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     if problem.duration is not None and not settings.second_order(problem):
         raise InputError('duration: got one without the interior point, want finish="newton" and stop="optimal"')

@@ -14,7 +14,7 @@
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
-     (`SolveRun.solve`). Where controls stay at their limits, or all of that fails, the interior point.
+     (`SolveRun.solve`). If controls have limits: the interior point where controls stay at them, or all of that fails.
   with constraints: a ladder of plans to begin with, each finished by the interior point (`constrained.py`).
   without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
      smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
@@ -140,7 +140,7 @@ def refine(run: SolveRun, known: Known) -> RunResult:
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
-    """Smoothing and Newton's method; the interior point where controls stay at their limits, or where these fail."""
+    """Smoothing and Newton's method. If controls have limits, the interior point where they stay there or all fails."""
     problem, budget = run.problem, run.budget
     space = problem.control_coordinates
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():

@@ -65,7 +65,7 @@ class ReliabilityProblem:
         `Campaign`.
       failure: "collision": the robot collides, or its simulation diverges; "miss": it does not reach its goal.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
+      goal_tolerance: the same for robots without a position, as a scaled error; by default the scenario's.
       solution: a Solution, or the path of one, to run instead of solving the scenario, as in `run_campaign`.
 
     Raises:

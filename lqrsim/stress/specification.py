@@ -111,7 +111,7 @@ class Campaign:
       seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
+      goal_tolerance: the same for robots without a position, as a scaled error; by default the scenario's.
       shard: trials per file.
       time_limit: seconds after which a shard counts as hung.
 

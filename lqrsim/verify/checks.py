@@ -132,7 +132,7 @@ def verify_run(
       rollout: rollout of `simulate`, with frames.
       trial: row of the rollout.
       solution: the solution that was run, to check the plan in the rollout.
-      progress: called after each frame with the numbers of frames that are done and of all frames.
+      progress: called after each frame with the number of finished frames and their total.
 
     Raises:
       InputError: there is no such trial, nothing can be drawn, or there is no OpenGL.

@@ -82,7 +82,7 @@ class RecordedTrial:
         return flat.reshape(-1, 3), run.balls.radii
 
     def _between(self, places: Array, times: Array, at: Array | float) -> Array:
-        """Points (..., 3) in the world, interpolated between places (k, 2 or 3) at `times`."""
+        """Points (..., 3) in the world at the times `at`, between places (k, 2 or 3) at `times`."""
         return self.rollout.in_world(self._interpolated(places, times, at), height=self.floor)
 
     @staticmethod
@@ -98,7 +98,7 @@ class RecordedTrial:
         return self.force[min(self.step(time), len(self.force) - 1)]
 
     def step(self, time: float) -> int:
-        """The control period of a time; at the end of the plan, the number of periods."""
+        """The number of the control period that a time is in; at the end of the plan, the number of periods."""
         return min(int(time / self.rollout.plan.dt + 1e-9), self.rollout.plan.steps)
 
     def interpolate(self, values: Array, time: float) -> float:
