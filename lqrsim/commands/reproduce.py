@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from lqrsim.commands import console
 from lqrsim.errors import check_name
 from lqrsim.machine import description
@@ -71,7 +69,7 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
     results: dict[str, ScriptResult] = {}
     failures: list[Failure] = []
     begun = time.monotonic()
-    with tqdm(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
+    with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
         for name in chosen:
             bar.set_postfix_str(name)
             clock = time.monotonic()
