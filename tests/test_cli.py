@@ -1,5 +1,6 @@
 """The commands, each on what the one before wrote; and bad input: one line, no traceback, a non-zero exit."""
 
+import os
 import re
 import shlex
 import signal
@@ -267,6 +268,22 @@ def test_what_is_done_quickly_is_not_talked_about(capsys: pytest.CaptureFixture[
         for done in (40, 60, 100):
             progress(done, 100)
     assert capsys.readouterr() == ("40 of 100 trials are done, 60 to go\n", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no semaphores with names")
+def test_a_bar_leaves_no_semaphore_where_a_process_ends_at_once() -> None:
+    """As a signal ends one; processes that are spawned, as by default from Python 3.14 on, would know it by a name."""
+    program = """
+import multiprocessing, os
+multiprocessing.set_start_method("spawn")
+from lqrsim.commands import console
+with console.progress("simulating", "step") as progress:
+    progress(1, 3)
+    console.say("above the bar")
+    os._exit(0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("above the bar\n", "")
 
 
 def test_help_has_a_line_for_each_command(capsys: pytest.CaptureFixture[str]) -> None:

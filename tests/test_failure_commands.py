@@ -50,7 +50,9 @@ def shifted(std: float = 0.1, most: float = 9.0, steps: int = 3) -> ls.Scenario:
     given = ls.scenarios.differential_drive()
     here = ls.QuadraticCost((5000.0, 5000.0, 50.0), about=given.problem.start)
     problem = dataclasses.replace(given.problem, steps=steps, final_cost=here)
-    return dataclasses.replace(given, name="shifted", problem=problem, disturbances=(Shift(std, most),))
+    shift = (Shift(std, most),)  # a robot that is to stay, within its radius of where its plan begins and ends
+    near = given.robot.radius
+    return dataclasses.replace(given, name="shifted", problem=problem, disturbances=shift, goal_radius=near)
 
 
 def pushed() -> ls.Scenario:

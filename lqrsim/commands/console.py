@@ -4,6 +4,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
@@ -144,6 +145,15 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
     return solution
 
 
+def bar(**options: Any) -> "tqdm[Any]":
+    """A progress bar, with the options of tqdm."""
+    from tqdm import tqdm
+
+    # tqdm's own lock is also one of processes: a named semaphore, of which Python complains if a signal ends this one.
+    tqdm.set_lock(threading.RLock())
+    return tqdm(**options)
+
+
 class Progress:
     """How far something is: a bar on a terminal; elsewhere a line now and then. Call it with how much is done.
 
@@ -159,13 +169,11 @@ class Progress:
 
     def __call__(self, done: int, total: int, found: str = "") -> None:
         """Show that `done` of `total` are done, and what has been found so far."""
-        from tqdm import tqdm
-
         now = time.monotonic()
         if self._bar is None:
             self._begun, self._last_line, self._before = now, now, done
             options: dict[str, Any] = {"initial": done, "leave": False, "delay": 1.0, "disable": not self._watched}
-            self._bar = tqdm(desc=self._what, unit=f" {self._unit}s", total=total, **options)
+            self._bar = bar(desc=self._what, unit=f" {self._unit}s", total=total, **options)
             if 1 < done < total:  # a campaign that is resumed
                 say(f"{done} of {total} {self._unit}s are done, {total - done} to go")
         self._bar.set_postfix_str(found, refresh=False)
@@ -177,7 +185,7 @@ class Progress:
         line = f"{self._what}: {done} of {total} {self._unit}s"
         if done > self._before:
             rate = (done - self._before) / (now - self._begun)
-            line += f", {rate:.3g} {self._unit}s/s, {tqdm.format_interval((total - done) / rate)} left"
+            line += f", {rate:.3g} {self._unit}s/s, {self._bar.format_interval((total - done) / rate)} left"
         say(line + (f"; {found}" if found else ""))
 
     def close(self) -> None:

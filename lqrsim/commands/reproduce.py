@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from lqrsim.commands import console
 from lqrsim.errors import InputError, check_name
 from lqrsim.machine import description
@@ -79,7 +77,7 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
     results: dict[str, ScriptResult] = {}
     failures: list[Failure] = []
     begun = time.monotonic()
-    with tqdm(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
+    with console.bar(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
         for name in chosen:
             bar.set_postfix_str(name)
             clock = time.monotonic()
