@@ -66,14 +66,16 @@ CASES = st.builds(
 def coordinates(draw: st.DrawFn, sizes: st.SearchStrategy[int], *, turning: bool) -> ls.types.Coordinates:
     """Names, units, angles and rotation vectors, or limits on both sides, on one, or none."""
     names = draw(st.lists(NAMES, min_size=(size := draw(sizes)), max_size=size, unique=True))
-    units = tuple(draw(st.lists(NAMES, min_size=size, max_size=size)))
+    units = draw(st.lists(NAMES, min_size=size, max_size=size))
     if not turning:
         low = [draw(st.sampled_from([-np.inf, -1.1, -0.3])) for _ in names]
         high = [draw(st.sampled_from([np.inf, 0.7, 0.1])) for _ in names]
-        return ls.types.Coordinates(names=tuple(names), units=units, low=tuple(low), high=tuple(high))
+        return ls.types.Coordinates(names=tuple(names), units=tuple(units), low=tuple(low), high=tuple(high))
     vector = (size - 3,) if size >= 3 and draw(st.booleans()) else ()
     angles = tuple(i for i in range(size - 3 * len(vector)) if draw(st.booleans()))
-    return ls.types.Coordinates(names=tuple(names), units=units, angles=angles, rotation_vectors=vector)
+    for i in (*angles, *(first + k for first in vector for k in range(3))):
+        units[i] = "rad"
+    return ls.types.Coordinates(names=tuple(names), units=tuple(units), angles=angles, rotation_vectors=vector)
 
 
 @st.composite

@@ -601,7 +601,14 @@ def test_a_slope_beyond_what_powers_can_hold_is_compared(slope: float) -> None:
     """From a start that is thrown far off; a merit that falls by so much passes, and one that does not, does not."""
     now, better, worse = (SimpleNamespace(merit=merit) for merit in (-slope, 0.0, -1.1 * slope))
     point: Any = SimpleNamespace(
-        point=now, _off=lambda one: 0.0, _merit=lambda one: one.merit, _farthest=1.0, _filter=[], _gaps=np.zeros(3)
+        point=now,
+        _off=lambda one: 0.0,
+        _merit=lambda one: one.merit,
+        _farthest=1.0,
+        _filter=[],
+        _gaps=np.zeros(3),
+        _gap=lambda one: 0.0,
+        _farthest_gap=1.0,
     )
     acceptable: Any = InteriorPoint._acceptable
     assert acceptable(point, better, 1.0, slope)

@@ -238,7 +238,11 @@ class Dynamics:
         return text_source(made["source"], f"{self.name}(x, u, p)")
 
     def touches(self, states: Array) -> bool:
-        """Whether a contact or a limit acts in one of these states (k, n)."""
+        """Whether a contact or a limit acts in one of some states.
+
+        Args:
+          states: (k, n).
+        """
         return False
 
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:

@@ -106,7 +106,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     }
     return {
         "Dynamics": ({
-            "f": rate, "states": {"x": "m", "v": "m/s"}, "controls": {"force": "N"}, "parameters": {"mass": 1.0},
+            "f": rate, "states": {"x": "rad", "v": "rad/s"}, "controls": {"force": "N"}, "parameters": {"mass": 1.0},
             "position": (), "angles": ("x",), "rotation_vectors": (), "control_limits": (-1.0, 1.0),
             "jacobian": jacobian, "level": "plain",
         },),
@@ -338,6 +338,9 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
         "Multipliers": ls.types.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
         "Certificate": solution.certificate,
+        "ContactCertificate": ls.types.ContactCertificate(
+            pressed=1, across=-0.1, sampled=-0.2, radius=1e-3, samples=50
+        ),
         "Solution": dataclasses.replace(solution, candidates=(candidate,)),
         "Outcomes": ls.stress.outcomes(rollout), **checks,
     }  # fmt: skip

@@ -36,7 +36,16 @@ HOOKS |= {
     "uncertainty",
     "spread",
 }
-HOOKS |= {"solving", "softened", "check_period", "ControllerRun.control", "Plant.nearest", "effect"}
+HOOKS |= {
+    "solving",
+    "softened",
+    "touches",
+    "contact_modes",
+    "check_period",
+    "ControllerRun.control",
+    "Plant.nearest",
+    "effect",
+}
 HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for name in ("step", "states", "place")}
 HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 
