@@ -1,3 +1,4 @@
+import logging
 import signal
 from collections.abc import Iterator
 
@@ -30,6 +31,16 @@ def ctrl_c_is_heard() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(autouse=True)
+def log_as_before() -> Iterator[None]:
+    """Restore what a test changes of the log: commands print it, and hostile calls silence it."""
+    logger = logging.getLogger("lqrsim")
+    level, handlers = logger.level, logger.handlers[:]
+    yield
+    logger.setLevel(level)
+    logger.handlers[:] = handlers
 
 
 @pytest.fixture(scope="session")
