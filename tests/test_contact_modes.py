@@ -16,9 +16,9 @@ from lqrsim.scenes.contact_modes import ContactModes, Switches
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.contact_modes import (
+    CostedPlan,
     Descent,
-    Model,
-    Plan,
+    ModeModel,
     minimize,
     optimality_in_mode,
     rolled_out,
@@ -206,7 +206,7 @@ def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None
     where, about, *_ = flown(mass, speed)
     if (where[:-1] @ plan.controls[:, 0] + about[:-1] > 1).any():
         return  # it touches
-    model = Model(problem, modes, Plan(plan.states, plan.controls, plan.cost))
+    model = ModeModel(problem, modes, CostedPlan(plan.states, plan.controls, plan.cost))
     step = minimize(model, model.hessian)
     assert step is not None
     parts = np.split(step.multipliers, model.first[1:-1])

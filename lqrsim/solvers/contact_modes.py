@@ -43,7 +43,7 @@ SAMPLES, RAY = 50, 8  # plans beside a plan; how often the way across a switch d
 
 
 @dataclass(frozen=True)
-class Plan:
+class CostedPlan:
     """A plan and its cost: states (T+1, n) and controls (T, m)."""
 
     states: Array
@@ -51,7 +51,7 @@ class Plan:
     cost: float
 
 
-class Model:
+class ModeModel:
     """The cost and the switches about a plan in the offsets d (T m,) of its policy.
 
     Attributes:
@@ -60,7 +60,7 @@ class Model:
       responses: (T m, T m) of the controls. low, high: (T, m) room of the controls. periods: the linearised periods.
     """
 
-    def __init__(self, problem: Problem, modes: ContactModes, plan: Plan) -> None:
+    def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
         states, controls, steps = plan.states, plan.controls, problem.steps
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
@@ -113,7 +113,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Step:
+class ModeStep:
     """A minimiser of the model, (T m,), and the decrease that it predicts.
 
     With the multipliers of the switches, (K,), and of the limits of the controls, (T, m), negative for upper ones.
@@ -125,7 +125,7 @@ class Step:
     limits: Array
 
 
-def minimize(model: Model, curvature: Array, *, across: int | None = None, depth: float = 0.0) -> Step | None:
+def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, depth: float = 0.0) -> ModeStep | None:
     """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
 
     Args:
@@ -179,20 +179,22 @@ def minimize(model: Model, curvature: Array, *, across: int | None = None, depth
     pulls[which] = weights / lengths
     multipliers, lower, upper = np.split(pulls, [len(model.values), len(model.values) + size])
     decrease = -float(model.gradient @ change + 0.5 * change @ model.hessian @ change)
-    return Step(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
+    return ModeStep(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
 
 
 class Descent:
     """Descent from a plan, mode by mode.
 
     Attributes:
-      plan: the best so far. model: about it. step: the last one from it.
+      plan: the best so far. model: about it.
     """
 
-    def __init__(self, problem: Problem, modes: ContactModes, plan: Plan, tolerance: float, budget: Budget) -> None:
+    def __init__(
+        self, problem: Problem, modes: ContactModes, plan: CostedPlan, tolerance: float, budget: Budget
+    ) -> None:
         self._problem, self._modes, self._tolerance, self._budget = problem, modes, tolerance, budget
         self._damping, self._clock = 0.0, time.perf_counter()
-        self.plan, self.model = plan, Model(problem, modes, plan)
+        self.plan, self.model = plan, ModeModel(problem, modes, plan)
 
     def run(self) -> Status:
         """Descend until the plan is optimal, nothing lowers the cost, or the budget is over."""
@@ -213,7 +215,7 @@ class Descent:
             self._go_to(beyond)
         return Status.TIME_LIMIT if self._budget.stop.due else Status.MAX_ITERATIONS
 
-    def _descended(self) -> Plan | None:
+    def _descended(self) -> CostedPlan | None:
         """A step that lowers the cost in the plan's mode; None if none was found with this damping, which grows."""
         model, cost = self.model, self.plan.cost
         diagonal = np.diag(np.diag(model.hessian))
@@ -231,7 +233,7 @@ class Descent:
         self._damping = max(10 * self._damping, DAMPING)
         return None
 
-    def _pushed_back(self, there: Plan, change: Array, multipliers: Array) -> Plan:
+    def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
         """The plan after a change of the offsets, corrected until it crosses no switch; or the last one tried."""
         model, wanted, factor = self.model, self.model.values + self.model.slopes @ change, None
         for _ in range(PUSHES):
@@ -264,7 +266,7 @@ class Descent:
             there = changed(self._problem, self.plan, model, change)
         return there
 
-    def _crossed(self, step: Step) -> Plan | None:
+    def _crossed(self, step: ModeStep) -> CostedPlan | None:
         """A cheaper plan across a switch that this one is pressed against; None if there is none."""
         for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
             best = beyond(self._problem, self.plan, self.model, which)
@@ -280,10 +282,10 @@ class Descent:
         pulls = [Switches(one.switches.names, part) for one, part in zip(self.model.periods, parts, strict=True)]
         return pulls, np.zeros_like(self.model.low) if step is None else step.limits
 
-    def _go_to(self, plan: Plan) -> None:
+    def _go_to(self, plan: CostedPlan) -> None:
         """Take a plan, and linearise about it."""
         before, self.plan = self.plan, plan
-        self.model = Model(self._problem, self._modes, plan)
+        self.model = ModeModel(self._problem, self._modes, plan)
         now = time.perf_counter()
         improvement = (before.cost - plan.cost) / abs(plan.cost)
         nan = float("nan")
@@ -300,20 +302,20 @@ def linearized(problem: Problem, modes: ContactModes, state: Array, control: Arr
     return Period(end, jacobian, switches, np.zeros((0, jacobian.shape[1])), True)
 
 
-def changed(problem: Problem, plan: Plan, model: Model, change: Array) -> Plan:
+def changed(problem: Problem, plan: CostedPlan, model: ModeModel, change: Array) -> CostedPlan:
     """The plan after a change (T m,) of the offsets of its policy."""
     return rolled_out(problem, plan.states, plan.controls + change.reshape(plan.controls.shape), model.gain)
 
 
-def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> Plan:
+def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> CostedPlan:
     """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
     offset = controls - np.einsum("tij,tj->ti", gain, states[:-1])
     states, controls = compiled.rollout(problem, gain, offset, states[0])
     cost = compiled.costs_of(problem, states[None], controls[None])[0] if np.isfinite(states).all() else np.inf
-    return Plan(states, controls, float(cost))
+    return CostedPlan(states, controls, float(cost))
 
 
-def beyond(problem: Problem, plan: Plan, model: Model, which: int) -> Plan | None:
+def beyond(problem: Problem, plan: CostedPlan, model: ModeModel, which: int) -> CostedPlan | None:
     """The cheapest plan across a switch, on a ray that crosses it by the least change; None if it cannot be crossed.
 
     The ray begins where a control has changed by half of SMALL, and doubles that RAY times.
@@ -336,7 +338,7 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     modes = dynamics.contact_modes(problem.dt)
     if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
         return None
-    plan = Plan(found.states.copy(), found.controls.copy(), found.cost)
+    plan = CostedPlan(found.states.copy(), found.controls.copy(), found.cost)
     pairs = zip(plan.states[:-1], plan.controls, strict=True)
     if not np.isfinite(plan.cost) or not any(len(modes.step(x, u)[1].names) for x, u in pairs):
         return None
@@ -367,7 +369,7 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
 
 
 def optimality_in_mode(
-    problem: Problem, modes: ContactModes, plan: Plan, gain: Array, pulls: Sequence[Switches], limits: Array
+    problem: Problem, modes: ContactModes, plan: CostedPlan, gain: Array, pulls: Sequence[Switches], limits: Array
 ) -> tuple[float, Quadratic]:
     """The most that a plan's own mode still allows the cost to fall, relative to it; and the policy's cost-to-go.
 
@@ -411,7 +413,7 @@ def optimality_in_mode(
     return decrease / max(abs(plan.cost), 1e-300), Quadratic(hessian, slope - bent, constant)
 
 
-def surroundings(problem: Problem, model: Model, plan: Plan, pulls: Sequence[Switches]) -> ContactCertificate:
+def surroundings(problem: Problem, model: ModeModel, plan: CostedPlan, pulls: Sequence[Switches]) -> ContactCertificate:
     """What the true cost is beside a plan: across each switch that it is pressed against, and at random."""
     pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
     plans = [beyond(problem, plan, model, which) for which in pressed]
