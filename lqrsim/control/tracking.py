@@ -47,15 +47,8 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Choice:
-    """Tolerances, with the prediction for their law.
+    """Tolerances, as the weights of a law, and the prediction for it."""
 
-    Attributes:
-      tolerate: tolerated deviation of each state, (n,). settle: their settling time in s. weights: for the law.
-        predicted: prediction with it.
-    """
-
-    tolerate: Array
-    settle: float
     weights: Weights
     predicted: Prediction
 
@@ -72,13 +65,10 @@ def choose_tolerances(
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
     reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
-    tried = {periods: unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest}
-    each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried.values()]
+    tried = [unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest]
+    each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
     all_weights = Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
-    found = [
-        Choice(tolerate, periods * model.plan.dt, weights, prediction)
-        for (periods, tolerate), weights, prediction in zip(tried.items(), each, predicted(all_weights), strict=True)
-    ]
+    found = [Choice(*one) for one in zip(each, predicted(all_weights), strict=True)]
     # A thousandth of the plan's extent is narrow enough.
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
     narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)

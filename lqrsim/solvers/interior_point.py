@@ -94,7 +94,7 @@ class Found:
     Attributes:
       plan: states and controls, a motion except for gaps. gain: (T, m, n) about it. measures: its measures.
       multipliers: multipliers of each constraint (T+1, rows); of the limits (T, m), positive where a control presses
-        against the upper one. solved: whether all measures are within tolerance. iterations: how many there were.
+        against the upper one. solved: whether all measures are within tolerance.
       control_size, row_size: typical sizes of controls (m,) and rows (R,). scale: the cost that measures are relative
         to.
     """
@@ -105,7 +105,6 @@ class Found:
     multipliers: tuple[Array, ...]
     pressing: Array
     solved: bool
-    iterations: int
     control_size: Array
     row_size: Array
     scale: float
@@ -564,7 +563,7 @@ class InteriorPoint:
             pressing[:, i] -= sign * spread[:-1, row]
         return Found(
             plan=self.point.plan, gain=stages.gain, measures=self.measures, multipliers=known, pressing=pressing,
-            solved=solved, iterations=self.iterations, control_size=self._range, row_size=self._row_size,
+            solved=solved, control_size=self._range, row_size=self._row_size,
             scale=self._scale,
         )  # fmt: skip
 
