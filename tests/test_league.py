@@ -54,6 +54,17 @@ def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -
     assert found.cost == pytest.approx(solution.cost, rel=1e-9)
 
 
+@pytest.mark.long
+def test_an_arm_among_posts_that_are_constraints_alone_folds_up_between_them() -> None:
+    problem, _ = problems.FAMILIES["arm"].make(0)
+    solution = ls.smooth(problem, constraint_tolerance=1e-6, threads=1)
+    assert solution.status is ls.Status.CONVERGED
+    assert "a motion along a path" in next(one.start for one in solution.candidates if one.cost == solution.cost)
+    assert verification.verify(problem, solution.trajectory, solution.cost).faults == ()
+    # IPOPT's plan from rest costs 1407, and stops before the posts: `solver_league.py --problems arm`.
+    np.testing.assert_allclose(solution.trajectory.states[-1][:3], problem.goal[:3], atol=0.01)
+
+
 def moved(which: str, row: int, entry: int, to: float) -> Callable[[ls.Trajectory], ls.Trajectory]:
     """A plan with one number changed."""
 

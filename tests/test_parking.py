@@ -46,6 +46,12 @@ def test_a_plan_that_is_hard_to_find_is_found(number: int) -> None:
     assert found.cost < found.known
 
 
+def test_where_all_starts_are_stuck_at_one_obstacle_a_motion_around_it_is_found() -> None:
+    """The least violation behind a post is stationary, and all controls that do not steer around it lead there."""
+    found = outcomes.look(1709, time_limit=None)
+    assert (found.verdict, found.status) == ("right", "CONVERGED"), found.said
+
+
 @pytest.mark.parametrize("number", [13, 133])
 def test_what_has_no_plan_is_infeasible(number: int) -> None:
     found = outcomes.look(number)

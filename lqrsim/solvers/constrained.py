@@ -105,6 +105,7 @@ class Ladder:
         if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
             self._given = start  # the answer is no worse
         rungs: list[Callable[[], RunResult | None]] = []
+        retried = False  # whether the start itself would be tried twice
         if guess.found is not None:
             rungs.append(lambda: self._finished(guess.found))
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
@@ -117,10 +118,11 @@ class Ladder:
             begin = guess.trajectory or start
             kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
             rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
+            retried = not kept and np.array_equal(begin.states, start.states)
         if not stay:
             rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
         if stay or not self._known.from_start:  # the runs of a search have the same start
-            self._untried = start
+            self._untried = None if retried else start
             rungs += [self._from_itself, lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()

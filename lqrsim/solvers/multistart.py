@@ -30,6 +30,9 @@ FOLD = 0.9  # the same for the states that move collision spheres: an arm must f
 # for a state that moves by 1, and the least range of a state, relative to the largest of its unit.
 HOLD, LEAST = 0.01, 1e-3
 HALVE, CHOOSE = 3, 4  # iterations after which half of the starts remain, and one
+# Motions along paths, where constraints have no plan yet: how many, the weight of the path relative to a plan's cost,
+# and the iterations in which it acts.
+MOTIONS, FOLLOWED, FOLLOW = 5, 100.0, 8
 # Where controls at rest have no effect alone, as for a swimmer: cycles of oscillating controls along the plan, and
 # their amplitude relative to the room within the limits.
 SWAYS, SWAY = (1, 2, 4, 8), 0.3
@@ -107,6 +110,28 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
         states[:, place] = path(begin[place], goal[place], bend, problem.steps)
         controls = np.tile(problem.nominal_control, (problem.steps, 1))
         found[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+    return found
+
+
+def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[str, InitialPrior]:
+    """Starts whose first iterations follow paths from start to goal, by name; none without two such ends.
+
+    Smoothed, they are motions on one side of an obstacle or another, where a path alone is none.
+
+    Args:
+      moving: the states that paths are of. cost: typical of a plan.
+    """
+    begin, goal, place = problem.start, problem.goal, list(moving)
+    if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
+        return {}
+    found, unit, space = {}, problem.dynamics.state_coordinates.units[place[0]], problem.dynamics.state_coordinates
+    distance = float(np.linalg.norm((goal - begin)[place]))
+    ring, count = (RING, MOTIONS) if space.position else (FOLD, STARTS)
+    for name, bend in bends((goal - begin)[place], count, ring=ring, unit=unit):
+        about, weight = np.tile(begin, (problem.steps + 1, 1)), np.zeros(len(begin))
+        about[:, place] = path(begin[place], goal[place], bend, problem.steps)
+        weight[place] = FOLLOWED * cost / (problem.steps * max(STEP * distance, float(np.linalg.norm(bend))) ** 2)
+        found[f"a motion along a path {name}"] = InitialPrior(weight, about=about, iterations=FOLLOW)
     return found
 
 

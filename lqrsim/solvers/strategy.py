@@ -4,7 +4,8 @@
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
      With constraints, the others follow as long as they may cost less.
   2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
-     ways round by heavier obstacles and goal, other starts, or oscillating controls (`Search.widen`).
+     ways round by heavier obstacles and goal; or, where there is no ObstacleCost, motions along other paths and
+     oscillating controls (`Search.widen`).
   3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
   4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
@@ -47,7 +48,9 @@ from lqrsim.solvers.free_duration import find_duration, settled
 from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import Measures, iteration_of
-from lqrsim.solvers.multistart import SWAYS, choose, detours, guides, passable, pull, reweighted, sinusoidal_controls
+from lqrsim.solvers.multistart import (
+    FOLLOW, SWAYS, along_paths, choose, detours, guides, passable, pull, reweighted, sinusoidal_controls,
+)  # fmt: skip
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
 
@@ -203,7 +206,7 @@ class Search:
         problem = self._problem
         space = problem.dynamics.state_coordinates
         if pull(problem) == 0 or problem.goal is None:
-            return self._idle() or self._stuck
+            return self._idle() or (bool(problem.constraints) and not self.best[1].success)
         (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
             return run.budget.left > 0
@@ -236,7 +239,7 @@ class Search:
 
     def widen(self) -> None:
         """Try other starts: another way round, or, where there is nothing to go round, other controls and paths."""
-        if self._stuck and pull(self._problem) == 0:
+        if not self.best[1].success and self._problem.constraints and pull(self._problem) == 0:
             self._try_elsewhere()
         elif pull(self._problem) == 0:
             self._try_sinusoidal_controls()
@@ -257,17 +260,41 @@ class Search:
 
     def _try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        problem = self._problem
-        starts: dict[str, StartLike] = {
-            f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
-        }
-        exact = self.best[0].second_order
-        for name, one in (starts | detours(problem) if exact else starts).items():
+        problem, exact = self._problem, self.best[0].second_order
+        starts: dict[str, StartLike] = dict(self._motions()) if exact else {}
+        sways = {f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
+        for name, one in (starts | sways).items():
             if self._budget.stop.due or self.best[1].success:
                 return
             self._known.from_start = False
-            # The augmented Lagrangian keeps to a start only where it begins with the start's own plan.
-            self._finish_from(name, one, finish if exact else refine)
+            # The augmented Lagrangian keeps to a start only where it begins with the start's own plan. A motion is on
+            # its side of the obstacles, which smoothing without the constraints leaves.
+            self._finish_from(name, one, finish if exact and name in sways else refine)
+
+    def _motions(self) -> list[tuple[str, Trajectory]]:
+        """Motions along paths from start to goal, by name: those first that violate the constraints least."""
+        problem, found = self._problem, list[tuple[float, str, Trajectory]]()
+        cost = self.best[1].cost
+        for name, prior in along_paths(problem, self._moving(), cost if 0 < cost < np.inf else 1.0).items():
+            run = self._another(resolve(prior, problem))
+            run.smooth(FOLLOW)
+            motion = Trajectory(*(part.copy() for part in run.work.arrays.rollout), problem.dt)
+            if np.isfinite(motion.states).all():
+                values = run.work.constraint_values(motion.states, motion.controls)
+                found.append((run.work.violation(values), name, motion))
+        return [(name, motion) for _, name, motion in sorted(found, key=lambda one: one[0])]
+
+    def _moving(self) -> list[int]:
+        """The states that place the robot: its position, or else those on which constraints to be passed depend."""
+        problem, work, controls = self._problem, self._named[0][1].work, self._problem.nominal_control
+        position, moving = list(problem.dynamics.state_coordinates.position), set[int]()
+        if position or problem.start is None or problem.goal is None:
+            return position
+        for k, one in enumerate(passable(problem)):
+            for row in range(problem.constraint_terms[k].rows if one else 0):
+                for state in (problem.start, problem.goal):
+                    moving |= set(np.flatnonzero(work.constraint_slope(k, row, state, controls, 1)).tolist())
+        return sorted(moving & set(range(len(problem.start))))
 
     def look_aside(self) -> None:
         """Finish plans from paths aside, if the best plan touches a constraint that may be passed on another side."""
