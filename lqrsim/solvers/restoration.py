@@ -17,8 +17,9 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Limits, Motion
-from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
+from lqrsim.kernels.records import Limits, Motion, Policy
+from lqrsim.solvers.interior_point import MIXES
+from lqrsim.solvers.stages import Sizes, Stages, joined
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; its factor
 SETTLED = 0.1  # promised decrease per row, relative to the parameter, below which that falls
@@ -64,7 +65,7 @@ def restore(
     edge = EDGE * np.where(np.isfinite(stages.high - stages.low), stages.high - stages.low, 0.0)
     controls = np.clip(plan.controls, stages.low + edge, stages.high - edge)
     begun = Motion(plan.states, in_c_order(controls))
-    still = np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m))
+    still = Policy(np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m)))
     plan = stages.follow(begun, 0.0, still, _limits(stages, begun.controls))
     parameter = FIRST * price * sizes.cost / max(len(size), 1)
     least = LEAST * price * sizes.cost / max(len(size), 1)
@@ -104,18 +105,16 @@ def restore(
             barrier[:, diagonal, diagonal] += damping * DAMPING * price * sizes.cost / sizes.controls**2 / stages.steps
             if not _direction(stages, barrier, gradient, sizes, price):
                 return None
-            joined = stages.joined()
-            slope = float((gradient * joined).sum())
+            slope = float((gradient * joined(stages.changes)).sum())
             if -slope > SETTLED * parameter * len(size) or parameter <= least:
                 break
             parameter = max(FALL * parameter, least)
         costates = stages.to_go.gradient.copy()
         now = merit(numbers, cost)
         part, taken = 1.0, None
-        policy = stages.gain, stages.offset
         limits = _limits(stages, plan.controls)
         while part > SHORTEST:
-            tried = stages.follow(plan, part, policy, limits)
+            tried = stages.follow(plan, part, stages.policy, limits)
             if np.isfinite(tried.states).all():
                 value = merit(stages.values(tried)[live], stages.trial(tried)[0])
                 if value <= now + ARMIJO * part * slope + 1e-13 * abs(now):
