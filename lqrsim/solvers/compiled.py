@@ -94,13 +94,12 @@ def arguments(
       multipliers: those of each constraint; by default none act.
       second_order: whether the passes need second derivatives of the dynamics.
     """
-    multipliers = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
-    pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
+    acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
     space, term = problem.control_coordinates, problem.noise_term
     return ProblemModel(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
-        initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", pairs),
-        final=_cost(problem, "final_cost", [pair for pair in pairs if not pair[0].uses_control]),
+        initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", acting),
+        final=_cost(problem, "final_cost", [one for one in acting if not one.term.uses_control]),
         limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
         noise=() if term is None else _noise(problem, term),
     )  # fmt: skip
@@ -125,13 +124,13 @@ def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
     return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
 
 
-def _cost(problem: Problem, field: str, constraints: list[tuple[ConstraintTerm, "ConstraintMultipliers"]]) -> CostModel:
+def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipliers"]) -> CostModel:
     terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
-    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one, _ in constraints)
+    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one in (own.term for own in constraints))
     acting = Constraints(
-        _constraint_functions(stated, sizes), tuple(numbers(one) for one, _ in constraints),
-        tuple(own.array for _, own in constraints), len(constraints),
+        _constraint_functions(stated, sizes), tuple(numbers(own.term) for own in constraints),
+        tuple(own.array for own in constraints), len(constraints),
     )  # fmt: skip
     indefinite = sum(term.nonconvex_in is not None for term in terms)
     return CostModel(functions, tuple(map(numbers, terms)), len(terms), indefinite, project, acting)
@@ -251,11 +250,13 @@ class ConstraintMultipliers:
       margin: by how much an inequality is to be kept. price: of missing it, in cost per unit.
 
     Attributes:
-      array: all numbers, as `kernels/augmented_lagrangian.py` has them. values: ((T+1) rows,) the multipliers, which
-        can be written. first: the first step at which the constraint acts. margin, price: as given.
+      term: the constraint. margin, price: as given; the margin of an equality is 0. first: the first step at which it
+        acts.
+      array: all numbers, as `kernels/augmented_lagrangian.py` has them. values: ((T+1) rows,) the multipliers in it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:
+        self.term = term
         # A fixed start cannot change; its control can.
         first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
         self.first = problem.steps if term.final_only else first

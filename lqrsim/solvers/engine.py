@@ -747,17 +747,17 @@ class Workspace:
 
     def violation(self, values: list[Array]) -> float:
         """The largest violation of a constraint, given their values; infinite if one is NaN."""
-        terms = self._problem.constraint_terms
-        return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
+        pairs = zip(self.multipliers, values, strict=True)
+        return max((violation_of(own.term, one) for own, one in pairs), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance.
 
         Elastic constraints, which have a price, count as kept.
         """
-        pairs = zip(self._problem.constraint_terms, values, strict=True)
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
-        return self.priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
+        pairs = zip(self.multipliers, values, strict=True)
+        return self.priced or all(violation_of(own.term, one) <= allowed(own.term) for own, one in pairs)
 
 
 def _cost_of(iteration: Iteration | None) -> float:

@@ -164,13 +164,13 @@ class InteriorRun:
 
     def _take_multipliers(self, found: Found, values: list[Array]) -> None:
         """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
-        for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
-            own, known = self._run.work.multipliers[k], found.multipliers[k]
+        each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
+        for k, (own, known, numbers) in enumerate(each):
             size = found.sizes.rows[self.stages.owners == k]
             own.penalty = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
             presses = known > own.penalty * (numbers - own.margin)  # others are left over from the barrier
-            acts = np.isfinite(numbers) & (term.equality | presses)
+            acts = np.isfinite(numbers) & (own.term.equality | presses)
             own.values[...] = np.where(acts, force, 0.0).ravel()
 
     def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:

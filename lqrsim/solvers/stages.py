@@ -86,9 +86,9 @@ class Stages:
         self.equality = np.repeat([*(term.equality for term in terms), False], counts).astype(bool)
         self.owners = np.repeat([*range(len(terms)), -1], counts)
         self.live = np.ones((steps + 1, sum(counts)), dtype=bool)
-        for k, (term, one) in enumerate(zip(terms, own, strict=True)):
+        for k, one in enumerate(own):
             self.live[: one.first, self.owners == k] = False
-            self.live[steps, self.owners == k] &= not term.uses_control
+            self.live[steps, self.owners == k] &= not one.term.uses_control
         self.live[steps, self.owners == -1] = False
 
     def renewed(self, problem: Problem) -> "Stages":

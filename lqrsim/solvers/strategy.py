@@ -115,12 +115,10 @@ def solve(
 
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
-    if run.initial_guess.found is not None:
+    if run.initial_guess.found is not None or (run.problem.constraints and run.second_order):
         return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
-    if run.second_order:
-        return Ladder(run, known).climb()
     found = augmented_lagrangian.finish(run)
     # It begins with the optimum without the constraints, which is often the same from all starts: they count as one.
     if found.stuck and not known.evidence:
