@@ -61,6 +61,12 @@ _STATUS = {
     declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
     declarations.IN_VALLEY: Status.MAX_ITERATIONS,
 }
+_DETAILS = {
+    declarations.NO_START: "rollout of the initial controls",
+    declarations.CYCLING: "the iterations repeat themselves",
+    declarations.NO_PROGRESS: "the least cost so far no longer falls",
+    declarations.STALLED: "the line search found no lower cost",
+}
 ATTENTION = 0.1  # s, after which compiled code returns to heed Ctrl-C
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the next solve, and bytes of each
 # Newton's method takes over where the states of least total cost are so near to the rollout, relative to its range:
@@ -113,13 +119,7 @@ class Ending:
                 return ""
             which = "backward" if self.backward else "forward"
             return f"{which} pass of iteration {self.done + 1}, step {self.failed} of {steps}"
-        if self.outcome == declarations.NO_START:
-            return "rollout of the initial controls"
-        if self.outcome == declarations.CYCLING:
-            return "the iterations repeat themselves"
-        if self.outcome == declarations.NO_PROGRESS:
-            return "the least cost so far no longer falls"
-        return "the line search found no lower cost" if self.outcome == declarations.STALLED else ""
+        return _DETAILS.get(self.outcome, "")
 
 
 def iterate(
@@ -474,10 +474,6 @@ class SolveRun:
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
-    def law_about_plan(self) -> tuple[Array, Array]:
-        """Gain and offset of the policy about the plan in memory."""
-        return compiled.law_about(*self.work.plan, self.work.arrays.policy.gain)
-
     # What it leads to.
 
     def result(self, ending: Ending) -> RunResult:
@@ -621,6 +617,7 @@ class Workspace:
       arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
       memory: the safeguard's state between two iterations, a row of `MEMORY`; memory_rows: (1,) that row.
       multipliers: those of each constraint; changes act at once.
+      start: (n,) the start state. plan: the best so far. states, controls: of the last rollout, (T+1, n) and (T, m).
       trial: the rollout that a line search tries. core: the compiled iterations.
       fixed: whether the start is given exactly. dual: which form it is.
     """
@@ -649,7 +646,8 @@ class Workspace:
             homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
-        self.trial = plan()
+        self.start, self.plan, self.trial = self.arrays.start, self.arrays.plan, plan()
+        self.states, self.controls = self.arrays.rollout
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
@@ -683,26 +681,6 @@ class Workspace:
         for array in (arrays.guess, arrays.plan):
             array.states[...] = start if plan is None else plan.states
             array.controls[...] = initial_guess.offset if plan is None else plan.controls
-
-    @property
-    def start(self) -> Array:
-        """The start state, (n,)."""
-        return self.arrays.start
-
-    @property
-    def plan(self) -> Motion:
-        """The best plan so far."""
-        return self.arrays.plan
-
-    @property
-    def states(self) -> Array:
-        """States of the last rollout, (T+1, n)."""
-        return self.arrays.rollout.states
-
-    @property
-    def controls(self) -> Array:
-        """Controls of the last rollout, (T, m)."""
-        return self.arrays.rollout.controls
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""

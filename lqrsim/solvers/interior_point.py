@@ -184,10 +184,6 @@ class Rows:
         """Distances of multipliers from their bounds, (P,)."""
         return self.sign * (force[self.row] - self.bound)
 
-    def moved(self, multipliers: Array) -> Array:
-        """Changes of these distances when multipliers (K,) change."""
-        return self.sign * multipliers[self.row]
-
     def violation(self, numbers: Array) -> Array:
         """How far values are on the wrong side of zero, (K,); negative for inequalities that are kept."""
         return np.where(self.equality, np.abs(numbers), -numbers)
@@ -333,8 +329,6 @@ class InteriorPoint:
             solved=solved, sizes=self.sizes, scale=self._scale,
         )  # fmt: skip
 
-    # Models and measures of the iterate.
-
     def _linearize(self, least: float) -> None:
         """Compute the models about the plan; multipliers up to `least` count as zero."""
         self.stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), least)
@@ -369,8 +363,6 @@ class InteriorPoint:
         if self._rows.elastic:  # the violation is in the slacks
             return others and self._rows.largest_miss(self.point) < tolerance
         return others and found.violation <= violation
-
-    # Steps without a barrier, at the end, or where the plan may be next to the answer.
 
     def _settle(self, tolerance: float, violation: float) -> bool:
         """Take Newton steps without a barrier from the given plan and multipliers; return whether they converge."""
@@ -443,8 +435,6 @@ class InteriorPoint:
         self._linearize(0.0)
         self._measure()
         return True
-
-    # Iterations with the barrier.
 
     def _iterate(self, tolerance: float) -> bool:
         """Do one iteration; return whether there was a step."""
@@ -552,12 +542,12 @@ class InteriorPoint:
 
     def _step(self, system: System, corrections: Array, beyond: Array | float = 0.0) -> Step:
         """Complete the step in `stages` by slacks and multipliers."""
-        stages, point, duals = self.stages, self.point, system.duals
+        stages, slack, duals, rows = self.stages, self.point.slack, system.duals, self._rows
         multipliers = -system.sigma * (stages.moved() + self._target(system, corrections) + beyond)
-        ratio = point.slack / duals
-        slack = (self.parameter - corrections) / duals - point.slack - ratio * self._rows.moved(multipliers)
+        moved = rows.sign * multipliers[rows.row]
+        change = (self.parameter - corrections) / duals - slack - slack / duals * moved
         plan = Motion(stages.changes.states.copy(), stages.changes.controls.copy())
-        return Step(plan, slack, multipliers, stages.to_go.gradient.copy())
+        return Step(plan, change, multipliers, stages.to_go.gradient.copy())
 
     def _predict(self, system: System, least: float) -> Array:
         """Mehrotra's rule: set the barrier parameter by an affine step; return its second-order corrections, (P,)."""
@@ -565,7 +555,7 @@ class InteriorPoint:
         self.parameter = 0.0
         self._solve(system, none)
         step = self._step(system, none)
-        moved = self._rows.moved(step.multipliers)
+        moved = self._rows.sign * step.multipliers[self._rows.row]
         primal, dual = self._longest(point.slack, step.slack, 1.0), self._longest(duals, moved, 1.0)
         average = float(self._products.mean())
         after = float(((point.slack + primal * step.slack) * (duals + dual * moved)).mean())
@@ -579,7 +569,8 @@ class InteriorPoint:
         Its corrections bring the outliers among the products, as they would be a little further on, back to within a
         factor of `OUTLIER` of the barrier's parameter (Gondzio, 1996).
         """
-        moved, slack, duals = self._rows.moved(step.multipliers), self.point.slack, system.duals
+        rows, slack, duals = self._rows, self.point.slack, system.duals
+        moved = rows.sign * step.multipliers[rows.row]
         part, dual_part = self._longest(slack, step.slack), self._longest(duals, moved)
         if part >= LONG:
             return step, corrections
@@ -649,7 +640,7 @@ class InteriorPoint:
             if not stages.direction(system.hessian, stages.pull(sigma * missed), gaps):
                 break
             multipliers = -sigma * (stages.moved() + missed)
-            slack = -(self.point.slack / system.duals) * self._rows.moved(multipliers)
+            slack = -(self.point.slack / system.duals) * (self._rows.sign * multipliers[self._rows.row])
             change = Step(stages.changes, slack, multipliers, self._costates)
             closer = self._at(change, self._longest(tried.slack, slack), about=tried)
             if closer is None or self._off(closer) > CLOSER * off or not self._acceptable(closer, part, slope):
@@ -683,7 +674,7 @@ class InteriorPoint:
         self._part = part
         if part >= LONG:
             self._soft = max(1.0, self._soft / SOFTER)
-        dual_part = self._longest(duals, rows.moved(step.multipliers))
+        dual_part = self._longest(duals, rows.sign * step.multipliers[rows.row])
         self._force = self._force + np.where(rows.regularised > 0, part, dual_part) * step.multipliers
         self._costates = self._costates + part * (step.costates - self._costates)
         # The products of slacks and multipliers stay within reach of the barrier's parameter, where rows are hard.
@@ -692,8 +683,6 @@ class InteriorPoint:
         least, self.point = 1e-10 * self._scale, new
         self._linearize(least)
         self._measure()
-
-    # Trial points, and what the filter weighs.
 
     def _at(self, step: Step, part: float, *, about: Point | None = None) -> Point | None:
         """The point a part of a step further than this one, or another; None where it is not finite."""

@@ -370,7 +370,7 @@ class _Best:
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
-                there = *arrays.plan, *self._run.law_about_plan()
+                there = *arrays.plan, *compiled.law_about(*arrays.plan, arrays.policy.gain)
             else:
                 there = *arrays.rollout, *arrays.kept, *arrays.to_go
             # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.

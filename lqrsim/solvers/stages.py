@@ -134,7 +134,8 @@ class Stages:
 
         Constraints whose multipliers are up to `least` count as linear.
         """
-        self._look(plan, costates, self.active._replace(size=0), in_c_order(multipliers), least)
+        rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
+        self._look(plan, costates, rows, self.active._replace(size=0))
         self.convexify(plan)
 
     def convexify(self, plan: Motion) -> None:
@@ -216,7 +217,7 @@ class Stages:
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Compute the step to the minimum of the models, and the costates there; return whether there is a minimum."""
         models = self.models._replace(hessian=in_c_order(hessian), gradient=in_c_order(gradient))
-        return self._solve(models, self.active._replace(size=0), in_c_order(gaps))[0]
+        return self.pivot(in_c_order(gaps), models, self.active._replace(size=0))[0]
 
     def moved(self) -> Array:
         """The changes of the live rows' values, (K,)."""
@@ -224,12 +225,12 @@ class Stages:
 
     def look(self, plan: Motion, costates: Array, *, own: bool = False) -> float:
         """Compute the models about a plan, and the margins of the rows; return its cost. See the kernel."""
-        return self._look(plan, costates, self.active, self.active.force, 0.0, own=own)
+        rows = self._rows._replace(least=0.0, multipliers=self.active.force)
+        return self._look(plan, costates, rows, self.active, own=own)
 
     def _look(
-        self, plan: Motion, costates: Array, active: ActiveRows, multipliers: Array, least: float, *, own: bool = False
+        self, plan: Motion, costates: Array, rows: ConstraintRows, active: ActiveRows, *, own: bool = False
     ) -> float:
-        rows = self._rows._replace(least=float(least), multipliers=multipliers.reshape(-1))
         return self._call(
             "linearize_plan", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows,
             self.models, active, module=self._active,
@@ -240,14 +241,12 @@ class Stages:
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
         return self._call("optimality_measures", self.steps, *of, module=self._active)
 
-    def pivot(self, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0) -> tuple[bool, int]:
-        """`direction` with held rows; also returns the number of wrong rows. See the kernel."""
-        return self._solve(self.models, self.active, gaps, share, scale, weight, price)
-
-    def _solve(
-        self, models: StageModels, rows: ActiveRows, gaps: Array, share: float = 0.0, scale: float = 1.0,
-        weight: float = 1.0, price: float = 1.0,
+    def pivot(
+        self, gaps: Array, models: StageModels | None = None, rows: ActiveRows | None = None, *,
+        share: float = 0.0, scale: float = 1.0, weight: float = 1.0, price: float = 1.0,
     ) -> tuple[bool, int]:  # fmt: skip
+        """`direction` with held rows; also returns the number of wrong rows. See the kernel."""
+        models, rows = self.models if models is None else models, self.active if rows is None else rows
         failed, wrong = self._call(
             "pivot", self.steps, self.free, share, scale, weight, price, models, gaps, rows, self.policy, self.to_go,
             self.changes, module=self._active,
