@@ -64,7 +64,15 @@ FLOORS_WITHIN = {
         ("clearance",),
         ("problem",),
     ),
-    "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
+    "solvers": (
+        ("budget", "compiled", "initial_guess"),
+        ("certify", "settings", "stages"),
+        ("engine", "interior_point", "parallel"),
+        ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
+        ("interior_run", "restoration", "risk"),
+        ("constrained", "free_duration"),
+        ("strategy",),
+    ),
     "simulation": (("plant_validation", "plant", "simulator"), ("physics", "mujoco_physics"), ("disturbances",)),
 }
 

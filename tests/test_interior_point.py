@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import hypothesis.strategies as st
@@ -15,7 +14,7 @@ from shooting import Shooting
 import lqrsim as ls
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers.interior_point import InteriorPoint
+from lqrsim.solvers.interior_point import InteriorPoint, Step
 
 DT = 0.1
 # A state, a speed, a control and the cost in another unit: by how much their numbers are larger.
@@ -596,20 +595,29 @@ def test_what_cannot_be_kept_is_not_called_converged() -> None:
     assert found.violation >= 1.5 - 2.0 * DT - 0.5 - 1e-9
 
 
-@pytest.mark.parametrize("slope", [-1e100, -1e134, -1e300])
-def test_a_slope_beyond_what_powers_can_hold_is_compared(slope: float) -> None:
-    """From a start that is thrown far off; a merit that falls by so much passes, and one that does not, does not."""
-    now, better, worse = (SimpleNamespace(merit=merit) for merit in (-slope, 0.0, -1.1 * slope))
-    point: Any = SimpleNamespace(
-        point=now,
-        _off=lambda one: 0.0,
-        _merit=lambda one: one.merit,
-        _farthest=1.0,
-        _filter=[],
-        _gaps=np.zeros(3),
-        _gap=lambda one: 0.0,
-        _farthest_gap=1.0,
-    )
-    acceptable: Any = InteriorPoint._acceptable
-    assert acceptable(point, better, 1.0, slope)
-    assert not acceptable(point, worse, 1.0, slope)
+@pytest.mark.parametrize("far", [1e30, 1e67, 1e70, 1e150])
+def test_from_a_start_thrown_far_off_the_merit_falls(far: float) -> None:
+    """A slope of up to 1e300 is beyond what powers can hold. The cost is quadratic, so that its optimum is known."""
+    of = problem(start=(far, far), limit=10 * far)
+    times = DT * np.arange(16)
+    coasting = Motion(far * np.column_stack([1 + times, np.ones(16)]), np.zeros((15, 1)))
+    since = np.maximum(times[:, None] - times[1:], 0.0)  # from the end of each control's step
+    led = times[:, None] > times[:-1]
+    moved, sped = led * (DT**2 / 2 + DT * since), led * DT  # (time, control): what a unit of control does
+    off = np.concatenate([[1.0, 0.0] - coasting.states[-1], np.zeros(15)])
+    best = np.linalg.lstsq(np.vstack([moved[-1], sped[-1], np.eye(15)]), off, rcond=None)[0]
+    with np.errstate(all="ignore"):
+        point = InteriorPoint(of, coasting)
+        change = Motion(np.column_stack([moved @ best, sped @ best]), best[:, None])
+        step = Step(change, np.column_stack([best, -best]).ravel(), np.zeros(0), np.zeros(0))  # slacks: the limits'
+        slope, cost = point._slope(step), point.point.cost
+        there, away = (point._at(step, part) for part in (1.0, -1.0))
+        assert there is not None
+        assert away is not None
+        assert slope < -0.1 * cost
+        assert point._acceptable(there, 1.0, slope)
+        assert not point._acceptable(away, 1.0, slope)
+        found = point.run(tolerance=1e-8, violation=1e-6, most=20)
+    assert found.solved
+    # No control is at its limit; relative to the largest, for rounding is.
+    np.testing.assert_allclose(found.plan.controls[:, 0], best, rtol=0, atol=1e-10 * np.abs(best).max())

@@ -85,8 +85,8 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
-from lqrsim.solvers.interior_point import Stages
 from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.stages import Stages
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Entry] = {}  # what was compiled, by all that it depends on
@@ -326,9 +326,8 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     begin = np.zeros(3) if one.start is None else one.start
     run = SolveRun(one, wanted, resolve(start, one), begin, Budget(wanted.max_iterations))
     work, log = run.work, np.zeros(3, LOG)
-    for array in work.multipliers:
-        array[0] = penalty
-        array[declarations.HEADER :] = 0.5
+    for own in work.multipliers:
+        own.penalty, own.values[...] = penalty, 0.5
     source, sizes = compiled.with_form(form), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
@@ -342,10 +341,9 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     run.roll_out()
     work.memory["merit"] = work.memory["plan_cost"]
     work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
-    trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
-        arguments = run._damped_arguments(done, done + 1, log, 2, trial)
+        arguments = run._plan_arguments(declarations.DAMP, done, done + 1, log)
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
@@ -478,8 +476,7 @@ class Begun:
     def damped(self, first: int, last: int, **memory: float) -> tuple[Any, ...]:
         for name, number in memory.items():
             self.work.memory[name] = number
-        trial = Motion(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
-        given = self.run._damped_arguments(first, last, self.log, last + 1, trial)
+        given = self.run._plan_arguments(declarations.DAMP, first, last, self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
@@ -501,12 +498,11 @@ def descended(
     stage = work.model.stage
     if factor != 1:
         work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
-    trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     source, sizes = compiled.with_form(form), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
-            arguments = run._newton_arguments(done, done + 1, log, count, trial)
+            arguments = run._plan_arguments(declarations.FINISH, done, done + 1, log)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     return outcome
 
@@ -1085,9 +1081,8 @@ class TestInteriorPoint:
         multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
         begun, costates = (3, 1), rng.normal(size=(4, 3))
-        for second in (0, 1):
-            given = *begun, second, 0, plan, costates, stages._model, stages._values, rows, stages.models
-            replay(source_of(active_set), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
+        given = *begun, 0, plan, costates, stages._model, stages._values, rows, stages.models
+        replay(source_of(active_set), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
         replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
         replay(source, SIZES, "trial_cost", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
@@ -1140,7 +1135,7 @@ class TestActiveSet:
         known = stages._rows._replace(least=0.0, multipliers=force)
         gaps, costates = np.zeros((3, 3)), rng.normal(size=(4, 3))
         for own in (0, 1):
-            given = 3, 1, 1, own, plan, costates, stages._model, stages._values, known, stages.models
+            given = 3, 1, own, plan, costates, stages._model, stages._values, known, stages.models
             replay(source, SIZES, "linearize_plan", *given, active)
         replay(
             source, SIZES, "optimality_measures", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0)

@@ -6,7 +6,7 @@ The rows are those of all constraints, then the limits of the controls; the acti
 
 from math import inf
 
-from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.declarations import ROWS, M, N, W, stack
 from lqrsim.kernels.interior_point import (
     add_initial,
     closed_loop_rollout,
@@ -15,9 +15,8 @@ from lqrsim.kernels.interior_point import (
     forward_sweep,
     riccati_step,
     stage_models,
-    terminal_cost_to_go,
 )
-from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
 from lqrsim.kernels.rollouts import larger
 
@@ -28,11 +27,11 @@ INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
 ROUNDING = 1e-10  # relative to a row's size: the violation that a model may have
 
 
-def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows, out, active):
+def linearize_plan(steps, soft, own, plan, costates, model, values, rows, out, active):
     """Write the models of all stages at a plan, and the values of the active set's rows, if it has any.
 
     Args:
-      soft: 1 if there is an initial cost. second: 1 to include second derivatives of steps and constraints.
+      soft: 1 if there is an initial cost.
       own: 1 to compute the costates here, for this plan and the forces of its rows. costates: (T+1, N).
       values: a vector for each constraint, written. rows: ConstraintRows. out: StageModels, written.
       active: ActiveRows; rows that do not act leave the active set.
@@ -46,7 +45,7 @@ def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows
     constraint_slopes(steps, plan, model.stage.constraints, rows, out)
     total, slope = 0.0, stack(W)
     for t in range(steps, -1, -1):
-        total += stage_models(t, steps, second, plan, costates, model, rows, out)
+        total += stage_models(t, steps, plan, costates, model, rows, out)
         if own == 1 and t > 0:
             lagrangian_slope(t, steps, costates[min(t + 1, steps)], out, active, slope)
             copy(slope, N, costates[t])
@@ -60,7 +59,7 @@ def read_row_values(steps, plan, constraints, values, rows, active):
     for t in range(steps + 1):
         u = plan.controls[min(t, steps - 1)]
         for k in range(constraints.size):
-            count = int(constraints.multipliers[k][1])
+            count = int(constraints.multipliers[k][ROWS])
             for row in range(count):
                 active.numbers[active.size * t + int(rows.first[k]) + row] = values[k][count * t + row]
         for row in range(active.size):
@@ -143,7 +142,8 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
         blend(share, models.hessian[t], models.convex[t], stage)
         add_held_rows(t, weight, price, models, active, stage, slope)
         if t == steps:
-            terminal_cost_to_go(steps, stage, slope, to_go)
+            copy(slope, N, to_go.gradient[steps])
+            copy_matrix(stage, N, N, to_go.hessian[steps])
         elif not riccati_step(t, stage, slope, models.jacobian[t], gaps[t], policy, to_go):
             return t, 0
     if not forward_sweep(steps, free, models.jacobian, gaps, policy, to_go, changes):

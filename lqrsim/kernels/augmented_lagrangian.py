@@ -10,9 +10,10 @@ the tolerance to which the constraint is solved, so that a plan within the toler
 constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where its
 force would be. Only the part `mu n n'` of its curvature is used, with n the gradient of d: the rest can be negative.
 
-`multipliers` is one array per constraint: mu (0 where the constraint does not act yet), the number of values at a step,
-the first step at which they act, the tolerance, the price (infinite where there is none), and from HEADER on lambda,
-step by step.
+`multipliers` is one array per constraint: the penalty mu (0 where the constraint does not act yet), the number of rows
+at a step, the first step at which they act, the margin, which is the tolerance, the price (infinite where there is
+none), and from MULTIPLIERS on lambda, step by step. The indices are names of `declarations.py`; Python has the class
+`ConstraintMultipliers` of `solvers/compiled.py`.
 
 A constraint whose rows share numbers, such as the centres of a robot's balls, computes these once a step, by `places`.
 Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of state and control.
@@ -22,7 +23,12 @@ from math import inf
 
 from lqrsim.kernels.declarations import (
     EQUALITY,
-    HEADER,
+    FIRST,
+    MARGIN,
+    MULTIPLIERS,
+    PENALTY,
+    PRICE,
+    ROWS,
     N,
     W,
     constraint_slope,
@@ -40,7 +46,7 @@ SHARED = 0  # numbers that the rows share; 0 for a constraint on state and contr
 def augment(x, u, t, data, multipliers, hessian, gradient):
     """Add the quadratic model at (x, u) to hessian (W, W) and gradient (W,), and return the value."""
     total = 0.0
-    if multipliers[0] > 0 and t >= multipliers[2]:
+    if multipliers[PENALTY] > 0 and t >= multipliers[FIRST]:
         if SHARED:
             shared, jacobian = stack(SHARED), zeros(SHARED, N)
             places_jacobian(x, data, shared, jacobian)
@@ -52,25 +58,25 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
 
 def augment_at(x, u, t, data, multipliers, hessian, gradient):
     """Add the quadratic model, and return the value; x and u may be the shared numbers and their Jacobian."""
-    rows, slope, total = int(multipliers[1]), stack(W), 0.0
+    rows, slope, total = int(multipliers[ROWS]), stack(W), 0.0
     for row in range(rows):
         force, held, value = force_of(x, u, t, row, data, multipliers)
         total += value
         if EQUALITY or force > 0:
-            curvature = multipliers[0] if held == force else 0.0
+            curvature = multipliers[PENALTY] if held == force else 0.0
             fill(slope, W, 0.0)
             constraint_slope(x, u, t, row, data, slope)
             for i in range(W):
                 gradient[i] -= held * slope[i]
                 for j in range(W):
                     hessian[i, j] += curvature * slope[i] * slope[j]
-    return total / (2 * multipliers[0])
+    return total / (2 * multipliers[PENALTY])
 
 
 def augmentation(x, u, t, data, multipliers):
     """The value alone."""
     total = 0.0
-    if multipliers[0] > 0 and t >= multipliers[2]:
+    if multipliers[PENALTY] > 0 and t >= multipliers[FIRST]:
         if SHARED:
             shared = stack(SHARED)
             places(x, data, shared)
@@ -83,19 +89,19 @@ def augmentation(x, u, t, data, multipliers):
 def augmentation_at(x, u, t, data, multipliers):
     """The value alone; x may be the shared numbers."""
     total = 0.0
-    for row in range(int(multipliers[1])):
+    for row in range(int(multipliers[ROWS])):
         _, _, value = force_of(x, u, t, row, data, multipliers)
         total += value
-    return total / (2 * multipliers[0])
+    return total / (2 * multipliers[PENALTY])
 
 
 def force_of(x, u, t, row, data, multipliers):
     """The force lambda - mu d of one value, the same within its price, and its part of the Lagrangian times 2 mu."""
-    multiplier = multipliers[HEADER + int(multipliers[1]) * t + row]
-    force = multiplier - multipliers[0] * (constraint_value(x, u, t, row, data) - multipliers[3])
+    multiplier = multipliers[MULTIPLIERS + int(multipliers[ROWS]) * t + row]
+    force = multiplier - multipliers[PENALTY] * (constraint_value(x, u, t, row, data) - multipliers[MARGIN])
     held, value = 0.0, -multiplier * multiplier
     if EQUALITY or force > 0:
-        held = min(max(force, -multipliers[4]), multipliers[4])
+        held = min(max(force, -multipliers[PRICE]), multipliers[PRICE])
         value += held * (2 * force - held)
     return force, held, value
 
@@ -115,10 +121,10 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
 
 def values_at(x, u, t, acts, data, multipliers, values):
     """Write the values; x may be the shared numbers."""
-    rows = int(multipliers[1])
+    rows = int(multipliers[ROWS])
     for row in range(rows):
         satisfied = 0.0 if EQUALITY else inf
-        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else satisfied
+        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[FIRST] else satisfied
 
 
 def add_slope(x, u, t, row, data, gradient):

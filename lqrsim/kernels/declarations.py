@@ -28,7 +28,8 @@ LONGEST_CYCLE = 8
 # `python experiments/benchmark_reliability.py --sections overhead`.
 NO_FALL, SLOW_FALL = 12, 30
 ROW = 16  # numbers of an obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
-HEADER = 5  # numbers before the multipliers of a constraint; see `augmented_lagrangian.py`
+# Where the numbers of a constraint stand in its array, and where its multipliers begin; see `augmented_lagrangian.py`.
+PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
 ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4

@@ -5,13 +5,12 @@ iterations close. `solvers/interior_point.py` has the method.
 """
 
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
-from lqrsim.kernels.declarations import M, N, W, stack, zeros
+from lqrsim.kernels.declarations import FIRST, ROWS, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
     cholesky_solve,
     copy,
-    copy_matrix,
     entry,
     fill,
     set_entry,
@@ -23,7 +22,6 @@ from lqrsim.kernels.model_functions import (
     cost_quadratic,
     cost_value,
     slope_of_constraint,
-    step_jacobian,
     step_second_order,
 )
 from lqrsim.kernels.records import LinearStep, QuadraticStage
@@ -32,25 +30,21 @@ TINY = 1e-12  # least curvature that a control block must have, relative to the 
 STEP = 6e-6  # of differences of gradients, relative to a number and at least to 1: the cube root of the precision
 
 
-def stage_models(t, steps, second, plan, costates, model, rows, out):
-    """Write the models of cost and step at t, and of the constraints if `second` is 1; return the cost.
+def stage_models(t, steps, plan, costates, model, rows, out):
+    """Write the models of cost, step and constraints at t; return the cost.
 
     Args:
-      second: 1 to include second derivatives of step and constraints. costates: (T+1, N). rows: ConstraintRows.
+      costates: (T+1, N). rows: ConstraintRows.
       out: StageModels; the constraints' gradients are those that `constraint_slopes` wrote.
     """
     none = zeros(M)
     x, u = plan.states[t], plan.controls[min(t, steps - 1)]
     if t < steps:
         total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
-        if second == 1:
-            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
-        else:
-            step_jacobian(x, u, model, model.dt, out.arrived[t], out.jacobian[t])
+        step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
     else:
         total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
-    if second == 1:
-        subtract_curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
+    subtract_curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
     return total
 
 
@@ -84,7 +78,7 @@ def constraint_slopes(steps, plan, constraints, rows, out):
         x, u = plan.states[t], plan.controls[min(t, steps - 1)]
         for k in range(constraints.size):
             acts = acts_at(k, t, steps, constraints)
-            for row in range(int(constraints.multipliers[k][1])):
+            for row in range(int(constraints.multipliers[k][ROWS])):
                 place = int(rows.first[k]) + row
                 slope = out.slopes[rows.size * t + place]
                 fill(slope, W, 0.0)
@@ -97,7 +91,7 @@ def constraint_slopes(steps, plan, constraints, rows, out):
 
 def acts_at(k, t, steps, constraints):
     """Whether constraint k acts at a step."""
-    return t >= constraints.multipliers[k][2] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
+    return t >= constraints.multipliers[k][FIRST] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
 
 
 def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
@@ -105,7 +99,7 @@ def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
     for k in range(constraints.size):
         if not acts_at(k, t, steps, constraints):
             continue
-        for row in range(int(constraints.multipliers[k][1])):
+        for row in range(int(constraints.multipliers[k][ROWS])):
             if abs(rows.multipliers[rows.size * t + int(rows.first[k]) + row]) > rows.least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
@@ -164,12 +158,6 @@ def adjoint(steps, gradient, jacobian, costates, slopes):
             for i in range(N):
                 total += jacobian[t, i, j] * costates[t + 1, i]
             set_entry(costates[t], slopes[t], j, total)
-
-
-def terminal_cost_to_go(steps, stage, slope, to_go):
-    """Write the cost-to-go at T."""
-    copy(slope, N, to_go.gradient[steps])
-    copy_matrix(stage, N, N, to_go.hessian[steps])
 
 
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):

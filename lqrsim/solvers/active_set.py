@@ -18,8 +18,9 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
+from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures
 from lqrsim.solvers.settings import INSIDE
+from lqrsim.solvers.stages import Stages
 
 STEPS = 12  # at most: a solve that needs more does not converge
 PIVOTS, FEW = 15, 4  # most pivots of a convex problem, and of one that need not be convex
@@ -48,9 +49,7 @@ class ActiveSet:
         self.hopeless = False
         shape, limit, rows = stages.live.shape, stages.owners == -1, stages.active
         live, self.held, numbers, self.force, self._pressing = (one.reshape(shape) for one in rows[2:-1])
-        live[...], self.held[...], self.force[...] = stages.live, 0.0, 0.0
-        for k, one in enumerate(multipliers):
-            self.force[:, stages.owners == k] = one
+        live[...], self.held[...], self.force[...] = stages.live, 0.0, stages.of_constraints(multipliers)
         self._equality = stages.equality
         kind = np.where(self._equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
         rows.table[:, KIND], rows.table[:, SIZE] = kind, 1.0
@@ -99,8 +98,8 @@ class ActiveSet:
             if self._solve(share, price=PENALTY * REGULARISATION)[0]:
                 break
         else:
-            stages.gain[...] = 0.0
-        gain = stages.gain.copy()
+            stages.policy.gain[...] = 0.0
+        gain = stages.policy.gain.copy()
         plan, cost, values = stages.carry_out(Motion(self.plan.states, self.plan.controls.copy()), gain)
         return plan, gain, cost, values
 

@@ -10,18 +10,19 @@ is one rung of the ladder among obstacles, see `strategy.py`. The compiled part 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG
-from lqrsim.problem.constraints import ConstraintTerm, allowed_violation, violation_of
+from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Multipliers, Status
 from lqrsim.results.value_functions import Moments
+from lqrsim.solvers.compiled import ConstraintMultipliers
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess
 
@@ -237,18 +238,24 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
     return dataclasses.replace(found, multipliers=lagrangian.multipliers(), stuck=stuck and not budget.stop.due)
 
 
-def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
+def _forces(own: ConstraintMultipliers, values: Array) -> Array:
     """The new multipliers: lambda - mu d, for inequalities not below 0; 0 where they do not act."""
     acting = np.where(np.isinf(values), 0.0, values)
-    forces = np.clip(array[declarations.HEADER :] - array[0] * acting, -array[4] if term.equality else 0.0, array[4])
+    forces = np.clip(own.values - own.penalty * acting, -own.price if own.term.equality else 0.0, own.price)
     return np.where(np.isinf(values), 0.0, forces)
 
 
-def _missed(term: ConstraintTerm, array: Array, values: Array) -> float:
+def _added(own: ConstraintMultipliers, values: Array) -> float:
+    """The augmented Lagrangian's terms in the cost."""
+    known, acting, forces = own.values, np.where(np.isinf(values), 0.0, values), _forces(own, values)
+    return float((forces @ (2 * (known - own.penalty * acting) - forces) - known @ known) / (2 * own.penalty))
+
+
+def _missed(own: ConstraintMultipliers, values: Array) -> float:
     """By how much a constraint is missed, or an inequality's multipliers are off, at most."""
-    if term.equality:
+    if own.term.equality:
         return float(np.abs(values).max(initial=0.0))
-    forces = array[declarations.HEADER :] / array[0] if array[0] > 0 else 0.0
+    forces = own.values / own.penalty if own.penalty > 0 else 0.0
     return float(np.abs(np.minimum(values, forces)).max(initial=0.0))
 
 
@@ -266,14 +273,14 @@ class AugmentedLagrangian:
     """
 
     def __init__(self, run: SolveRun) -> None:
-        self._problem, self._work = run.problem, run.work
-        self._terms = run.problem.constraint_terms
+        self._problem, self._work, self._own = run.problem, run.work, run.work.multipliers
         self._near = tolerance = run.settings.violation_tolerance(run.problem)
         # The tolerances of inequalities and of equalities, if there are any.
-        self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
+        terms = run.problem.constraint_terms
+        self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [array[0] for array in self._work.multipliers]  # zero, except those of another solution
+        self._first = [own.penalty for own in self._own]  # zero, except those of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
@@ -288,31 +295,31 @@ class AugmentedLagrangian:
         self._plan = states, controls
         stated = self._work.constraint_values(states, controls)
         self.kept = self._work.keeps(stated)
-        self._values = [values.ravel() - array[3] for values, array in zip(stated, self._work.multipliers, strict=True)]
-        missed = zip(self._terms, self._each(_missed), strict=True)
-        self.solved = all(off <= self._tolerance[term.equality] for term, off in missed)
-        pairs = zip(self._terms, stated, strict=True)
-        beyond = max((violation_of(term, values) - term.equality * self._near for term, values in pairs), default=0.0)
-        self.nearly = not self.kept and beyond <= 0
+        beyond = [
+            violation_of(own.term, values) - own.term.equality * self._near
+            for own, values in zip(self._own, stated, strict=True)
+        ]
+        self.nearly = not self.kept and max(beyond, default=0.0) <= 0
+        self._values = [values.ravel() - own.margin for own, values in zip(self._own, stated, strict=True)]
+        self.solved = all(_missed(own, values) <= self._tolerance[own.term.equality] for own, values in self._each())
 
     def start(self) -> None:
         """No multipliers, and for each constraint a penalty that fits the cost of changing it."""
         self._restart()
-        for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
-            array[declarations.HEADER :] = 0.0
+        for which, (own, values) in enumerate(self._each()):
+            own.values[...] = 0.0
             if not self._first[which] > 0:
                 # Only now: once there is a penalty, the passes' curvature contains it.
                 self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
-            array[0] = self._first[which]
+            own.penalty = self._first[which]
 
     def update(self, growth: float = GROWTH) -> None:
         """Take the forces for the multipliers; let the penalty grow where that helps too little."""
-        for term, array, values in self._constraints():
-            array[declarations.HEADER :] = _forces(term, array, values)
         missed = dict.fromkeys(self._tolerance, -np.inf)
-        for term, _, values in self._constraints():
-            short = np.abs(values).max(initial=0.0) if term.equality else -values.min(initial=np.inf)
-            missed[term.equality] = max(missed[term.equality], short)
+        for own, values in self._each():
+            own.values[...] = _forces(own, values)
+            short = np.abs(values).max(initial=0.0) if own.term.equality else -values.min(initial=np.inf)
+            missed[own.term.equality] = max(missed[own.term.equality], short)
         worst = max(missed, key=lambda kind: missed[kind])
         # Equalities that nearly hold can be met: they need a better inner minimum, not a larger penalty.
         near = {kind: kind and short <= self._near for kind, short in missed.items()}
@@ -321,60 +328,47 @@ class AugmentedLagrangian:
             more = growth * self._grown[kind] <= LARGEST or not near[kind]
             if more and missed[kind] > max(0.5 * self._last[kind], tolerance):
                 self._grown[kind] *= growth
-                for term, array, _ in self._constraints():
-                    array[0] *= growth if term.equality == kind else 1.0
+                for own in self._own:
+                    own.penalty *= growth if own.term.equality == kind else 1.0
         self._last = missed
 
     def added(self) -> float:
         """The augmented Lagrangian's terms in the cost of the plan."""
-
-        def one(term: ConstraintTerm, array: Array, values: Array) -> float:
-            known, acting = array[declarations.HEADER :], np.where(np.isinf(values), 0.0, values)
-            forces = _forces(term, array, values)
-            return float((forces @ (2 * (known - array[0] * acting) - forces) - known @ known) / (2 * array[0]))
-
-        return sum(self._each(one))
+        return sum(_added(own, values) for own, values in self._each())
 
     def multipliers(self) -> tuple[Multipliers, ...]:
         """As a solution has them: with the last plan taken into account."""
-
-        def one(term: ConstraintTerm, array: Array, values: Array) -> Multipliers:
-            return Multipliers(_forces(term, array, values).reshape(self._problem.steps + 1, -1), float(array[0]))
-
-        return tuple(self._each(one))
+        rows = self._problem.steps + 1, -1
+        return tuple(Multipliers(_forces(own, values).reshape(rows), own.penalty) for own, values in self._each())
 
     def worst(self) -> str:
         """The worst violated constraint, by how much, and when."""
         if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
-            (np.abs(values) if term.equality else -(values + array[3])).max(initial=-np.inf)
-            for term, array, values in self._constraints()
+            (np.abs(values) if own.term.equality else -(values + own.margin)).max(initial=-np.inf)
+            for own, values in self._each()
         ]
-        beyond = [one - allowed_violation(term, self._near) for one, term in zip(missed, self._terms, strict=True)]
+        beyond = [one - allowed_violation(own.term, self._near) for one, own in zip(missed, self._own, strict=True)]
         which = int(np.argmax(beyond))
-        step, row = divmod(self._worst_of(which), self._terms[which].rows)
+        term, (step, row) = self._own[which].term, self._worst_of(which)
         time = step * self._problem.dt
-        return f"{self._terms[which].describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
+        return f"{term.describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
 
-    def _constraints(self) -> Iterator[tuple[ConstraintTerm, Array, Array]]:
-        """For each constraint: its term, its multipliers, and its values relative to its target."""
-        return zip(self._terms, self._work.multipliers, self._values, strict=True)
+    def _each(self) -> Iterator[tuple[ConstraintMultipliers, Array]]:
+        """For each constraint its multipliers, and its values relative to its target."""
+        return zip(self._own, self._values, strict=True)
 
-    def _each(self, function: Callable[[ConstraintTerm, Array, Array], "float | Multipliers"]) -> list:
-        return [function(*one) for one in self._constraints()]
-
-    def _worst_of(self, which: int) -> int:
-        """The worst violated entry of a constraint: the first of equal ones, or an equality's last, which acts."""
-        values = self._values[which]
-        if self._terms[which].equality:
-            return len(values) - 1 - int(np.abs(values[::-1]).argmax())
-        return int(values.argmin())
+    def _worst_of(self, which: int) -> tuple[int, int]:
+        """Step and row of a constraint's worst violation: the first of equal ones, an equality's last, which acts."""
+        values, term = self._values[which], self._own[which].term
+        last = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
+        return divmod(last, term.rows)
 
     def _curvature(self, which: int) -> float:
         """The cost of changing the worst violation; for an equality, the largest cost for any of its entries."""
-        step, row = divmod(self._worst_of(which), self._terms[which].rows)
-        rows = range(self._terms[which].rows) if self._terms[which].equality else (row,)
+        term, (step, row) = self._own[which].term, self._worst_of(which)
+        rows = range(term.rows) if term.equality else (row,)
         return max(self._curvature_of(which, step, row) for row in rows)
 
     def _curvature_of(self, which: int, step: int, row: int) -> float:

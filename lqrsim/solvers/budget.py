@@ -67,6 +67,14 @@ class Stop:
             return contextlib.nullcontext()
         return reported(what, lambda: self.found, lambda: self.told)
 
+    @contextlib.contextmanager
+    def heeding(self) -> Iterator[None]:
+        """A block that any exception ends, Ctrl-C too; it is raised again when there is a solution."""
+        try:
+            yield
+        except BaseException as error:
+            self.error = error
+
     def finish(self, solution: Solution) -> Solution:
         """Return the solution; or raise what ended the solve, with the solution attached."""
         if self.error is None:
@@ -128,11 +136,9 @@ class Budget:
         if self._callback is None:
             return
         self.stop.told = time.perf_counter()
-        try:
+        with self.stop.heeding():
             for iteration in iterations:
                 self._callback(iteration)
-        except BaseException as error:  # Ctrl-C, too; raised again when there is a solution
-            self.stop.error = error
 
     @contextlib.contextmanager
     def limited(self, most: int) -> Iterator[None]:
@@ -174,6 +180,26 @@ class Budget:
                 self.log[begin - 1 :] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
             else:
                 self._tell(self.log[begin:])
+
+
+class Laps:
+    """Records the iterations of a method that Python runs itself, with their seconds and improvements.
+
+    Args:
+      budget: whose log they join. cost: that the first one improves on.
+
+    Attributes:
+      ended: when the last one did, on the clock of `time.perf_counter`.
+    """
+
+    def __init__(self, budget: Budget, cost: float = np.inf) -> None:
+        self._budget, self._cost, self.ended = budget, cost, time.perf_counter()
+
+    def record(self, method: str, cost: float, *, optimality: float, gap: float = 0.0, violation: float = 0.0) -> None:
+        """Record an iteration that ends now."""
+        now, improvement = time.perf_counter(), (self._cost - cost) / max(abs(cost), 1e-300)
+        seconds, self._cost, self.ended = now - self.ended, cost, now
+        self._budget.record(Iteration(cost, improvement, gap, optimality, gap, violation, seconds, method))
 
 
 @contextlib.contextmanager

@@ -58,7 +58,8 @@ def certified(
     if value is None and problem.noise_term is not None:  # what noise costs is weighed by the policy's own cost-to-go
         work(declarations.EVALUATE, none(), numbers)
     else:
-        work(declarations.CERTIFY, none() if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
+        parts = () if value is None else (value.hessian, value.gradient, np.asarray(value.constant))
+        work(declarations.CERTIFY, CostToGo(*map(in_c_order, parts)) if parts else none(), numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
@@ -72,10 +73,6 @@ def certified(
         certificate = replace(certificate, optimality=optimality)
     rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
-
-
-def _parts(value: Quadratic) -> tuple[Array, Array, Array]:
-    return value.hessian, value.gradient, np.asarray(value.constant)
 
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:

@@ -23,6 +23,7 @@ from lqrsim.kernels import (
     model_functions,
     projection,
 )
+from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import (
     Constraints,
     CostModel,
@@ -84,20 +85,21 @@ def structure(problem: Problem) -> tuple[Any, ...]:
 _FIELDS = ("initial", "stage_cost", "final_cost")
 
 
-def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_order: bool = False) -> ProblemModel:
+def arguments(
+    problem: Problem, *, multipliers: Sequence["ConstraintMultipliers"] = (), second_order: bool = False
+) -> ProblemModel:
     """The arguments of the passes; compiles the problem's functions if they are new.
 
     Args:
-      multipliers: multipliers of each constraint, as `augmented_lagrangian.py` has them; by default none act.
+      multipliers: those of each constraint; by default none act.
       second_order: whether the passes need second derivatives of the dynamics.
     """
-    multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
-    pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
+    acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
     space, term = problem.control_coordinates, problem.noise_term
     return ProblemModel(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
-        initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", pairs),
-        final=_cost(problem, "final_cost", [pair for pair in pairs if not pair[0].uses_control]),
+        initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", acting),
+        final=_cost(problem, "final_cost", [one for one in acting if not one.term.uses_control]),
         limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
         noise=() if term is None else _noise(problem, term),
     )  # fmt: skip
@@ -122,13 +124,13 @@ def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
     return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
 
 
-def _cost(problem: Problem, field: str, constraints: list[tuple[ConstraintTerm, Array]]) -> CostModel:
+def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipliers"]) -> CostModel:
     terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
-    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one, _ in constraints)
+    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one in (own.term for own in constraints))
     acting = Constraints(
-        _constraint_functions(stated, sizes), tuple(numbers(one) for one, _ in constraints),
-        tuple(own for _, own in constraints), len(constraints),
+        _constraint_functions(stated, sizes), tuple(numbers(own.term) for own in constraints),
+        tuple(own.array for own in constraints), len(constraints),
     )  # fmt: skip
     indefinite = sum(term.nonconvex_in is not None for term in terms)
     return CostModel(functions, tuple(map(numbers, terms)), len(terms), indefinite, project, acting)
@@ -236,9 +238,38 @@ def rollout(
     return states, controls
 
 
-def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0, price: float = np.inf) -> Array:
-    """The multipliers of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
-    # A fixed start cannot change; its control can.
-    first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
-    first, spare = problem.steps if term.final_only else first, 0.0 if term.equality else tolerance
-    return np.concatenate([[0.0, term.rows, first, spare, price], np.zeros((problem.steps + 1) * term.rows)])
+def law_about(states: Array, controls: Array, gain: Array) -> tuple[Array, Array]:
+    """The policy with these gains (T, m, n) that keeps to a plan: the gains, and its offsets (T, m)."""
+    return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
+
+
+class ConstraintMultipliers:
+    """A constraint's multipliers, in the memory that compiled code reads; at first it does not act.
+
+    Args:
+      margin: by how much an inequality is to be kept. price: of missing it, in cost per unit.
+
+    Attributes:
+      term: the constraint. margin, price: as given; the margin of an equality is 0. first: the first step at which it
+        acts.
+      array: all numbers, as `kernels/augmented_lagrangian.py` has them. values: ((T+1) rows,) the multipliers in it.
+    """
+
+    def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:
+        self.term = term
+        # A fixed start cannot change; its control can.
+        first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
+        self.first = problem.steps if term.final_only else first
+        self.margin, self.price = 0.0 if term.equality else margin, price
+        self.array = np.zeros(MULTIPLIERS + (problem.steps + 1) * term.rows)
+        self.array[[ROWS, FIRST, MARGIN, PRICE]] = term.rows, self.first, self.margin, price
+        self.values = self.array[MULTIPLIERS:]
+
+    @property
+    def penalty(self) -> float:
+        """The penalty, in cost per square of the constraint's unit; 0 where it does not act."""
+        return float(self.array[PENALTY])
+
+    @penalty.setter
+    def penalty(self, penalty: float) -> None:
+        self.array[PENALTY] = penalty

@@ -12,39 +12,35 @@ If none of these converges, the plan that violates the constraints least is the 
 lead to plans whose violation is stationary and equally large.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
-from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
-from lqrsim.solvers import augmented_lagrangian, compiled
+from lqrsim.results.solution_parts import Status
+from lqrsim.solvers import augmented_lagrangian
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
-from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
+from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
+from lqrsim.solvers.stages import Sizes
 
 FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
 # Iterations of the augmented Lagrangian: from the plan of smoothing; of these, undamped ones that come no closer; and
 # damped ones from a plan of the search, which creep along a wall's corner to optima that cost less.
 AUGMENTED, STALE, REFINED = 50, 25, 100
 DEEP = 0.03  # part of a row's typical size by which the plan of smoothing may miss it for the interior point
-OPENING, GUIDED = 6, 60  # iterations of smoothing before constraints act; the same with an ObstacleCost
-MOST, RESTORED = 300, 150  # iterations of the interior point from one plan, and of a descent at one price
+GUIDED = 60  # iterations of smoothing before constraints act, with an ObstacleCost
+RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
-PENALTY = 8.0  # of the augmented Lagrangian that makes the policy keep the constraints, in the same unit
-UPDATES = 5  # of multipliers, if Newton's steps at the end violate constraints
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
-AT_LIMIT = 1e-9  # distance from its limit, relative to its range, at which a pressing control is put there
 
 
 @dataclass
@@ -61,26 +57,13 @@ class Known:
     rows: Array | None = None
 
 
-class Barrier(NamedTuple):
-    """How the interior point begins: barrier parameter, least slacks, and whether the plan may be near the optimum."""
-
-    parameter: float
-    room: float
-    near: bool
-
-
-MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
-
-
 class Ladder:
     """Tries one way to a plan that keeps the constraints after another."""
 
     def __init__(self, run: SolveRun, known: Known) -> None:
-        self._run, self._problem, self._budget = run, run.problem, run.budget
-        self._allowed = run.settings.violation_tolerance(run.problem)
-        clock = time.perf_counter()
-        self._stages = Stages(run.problem)
-        run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
+        self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
+        self._point = InteriorRun(run)
+        self._allowed, self._stages = self._point.allowed, self._point.stages
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self._given: RunResult | None = None
@@ -88,36 +71,30 @@ class Ladder:
         self._untried: RunResult | None = None  # the start, until the interior point has begun there
         # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
-        self._known = known
         if run.settings.penalty is None:
-            self._without_multipliers()
-
-    def _without_multipliers(self) -> None:
-        """Set multipliers and penalties to zero."""
-        for array in self._run.work.multipliers:
-            array[0], array[declarations.HEADER :] = 0.0, 0.0
+            self._point.without_multipliers()
 
     def climb(self, *, stay: bool = False) -> RunResult:
         """Try the rungs in turn; with `stay`, only those that begin from the rollout of the first policy."""
         guess = self._run.initial_guess
-        start = self.start()
+        start = self._point.start()
         given = guess.trajectory is not None or guess.gain.any() or stay
         if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
             self._given = start  # the answer is no worse
         rungs: list[Callable[[], RunResult | None]] = []
         retried = False  # whether the start itself would be tried twice
-        if guess.found is not None:
-            rungs.append(lambda: self._finished(guess.found))
+        if (found := guess.found) is not None:
+            rungs.append(lambda: self._remember(self._point.finish(found)))
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
             values = tuple(one.values for one in guess.multipliers)
-            rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=values))
+            rungs.append(lambda: self._interior(copied(start), LITTLE, multipliers=values))
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
             # A sketch of a path is not near the answer, even where standing still keeps the constraints.
             begin = guess.trajectory or start
             kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
-            rungs.append(lambda: self._interior(_plan(begin), LITTLE if kept else MUCH))
+            rungs.append(lambda: self._interior(copied(begin), LITTLE if kept else MUCH))
             retried = not kept and np.array_equal(begin.states, start.states)
         if not stay:
             rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
@@ -125,23 +102,14 @@ class Ladder:
             self._untried = None if retried else start
             rungs += [self._from_itself, lambda: self._from_start(start)]
         for rung in rungs:
-            found = rung()
-            if found is not None and found.success:
-                if not self._worse(found):
+            result = rung()
+            if result is not None and result.success:
+                if not self._worse(result):
                     break
                 self._best = None  # the given plan is better
             if self._budget.over:
                 break
         return self._answer(start)
-
-    def from_plan(self, plan: Motion | RunResult) -> RunResult | None:
-        """Try the interior point from a plan. None if it fails: smoothing can then go on."""
-        checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
-        found = self._interior(_plan(plan), MUCH)
-        if found is not None and found.success:
-            return found
-        self._run.go_on(checkpoint, self._budget.log[begin:])
-        return None
 
     def _from_valley(self) -> RunResult | None:
         """From the plan of smoothing without the constraints."""
@@ -152,7 +120,7 @@ class Ladder:
         plan = run.work.arrays.rollout if settled else run.work.plan  # the plan of least cost so far
         if ending is not run.ending or not np.isfinite(run.work.memory["plan_cost"]):
             return None
-        self._smoothed = _plan(plan)
+        self._smoothed = copied(plan)
         if self._budget.stop.due:
             return None
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
@@ -162,7 +130,7 @@ class Ladder:
         found = run.newton()
         if found.success and found.violation == 0:
             return self._remember(found)
-        bottom = _plan(found) if found.success else self._smoothed
+        bottom = copied(found) if found.success else self._smoothed
         run.go_on(checkpoint)
         if self._budget.stop.due or (self._guided and self._cuts(bottom)):
             return None  # far into an obstacle, the interior point stalls: the augmented Lagrangian leaves it
@@ -178,11 +146,11 @@ class Ladder:
     def _from_itself(self) -> RunResult | None:
         """From the start, once."""
         start, self._untried = self._untried, None
-        return None if start is None else self._interior(_plan(start), MUCH)
+        return None if start is None else self._interior(copied(start), MUCH)
 
     def _from_start(self, start: RunResult) -> RunResult | None:
         self._known.from_start = True
-        return self._at_a_price(_plan(start))
+        return self._at_a_price(copied(start))
 
     def _refined(self) -> RunResult | None:
         """From the plan of damped iterations on the augmented Lagrangian."""
@@ -204,8 +172,8 @@ class Ladder:
 
     def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
-        plan = _plan(found)
-        self._without_multipliers()
+        plan = copied(found)
+        self._point.without_multipliers()
         usable = np.isfinite(found.cost) and found.cost <= most and np.isfinite(plan.states).all()
         if self._budget.stop.due or not usable:
             return None
@@ -224,7 +192,7 @@ class Ladder:
             if priced is None:
                 return None
             plan = priced.plan
-            self._remember(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            self._remember(self._point.result(*plan))
             if priced.settled:
                 return None
             if priced.near or price == PRICES[-1]:
@@ -239,37 +207,31 @@ class Ladder:
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
         """Run the descent; its iterations go to the log."""
-        budget, left = self._budget, self._budget.left - 1
-        before, clock, slow = np.inf, time.perf_counter(), 0
+        budget, laps, slow, restored = self._budget, Laps(self._budget), 0, None
 
         def watch(cost: float, violation: float, promised: float) -> bool:
-            nonlocal before, clock, slow
-            now = time.perf_counter()
-            improvement = (before - cost) / max(abs(cost), 1e-300)
-            budget.record(Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION))
-            slow = slow + 1 if violation <= self._allowed and abs(improvement) < SLOW else 0
-            before, clock = cost, now
+            nonlocal slow
+            laps.record(RESTORATION, cost, optimality=promised, violation=violation)
+            settled = violation <= self._allowed and abs(budget.log[-1].improvement) < SLOW
+            slow = slow + 1 if settled else 0
             return budget.stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
         if self._known.rows is None:
             self._known.rows = sizes.rows
         sizes = sizes._replace(rows=self._known.rows)
-        if left < 1 or budget.stop.due:
+        if budget.left < 2 or budget.stop.due:
             return None
-        try:
-            with np.errstate(all="ignore"):
-                return restore(
-                    self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch,
-                    stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
-                )  # fmt: skip
-        except BaseException as error:  # Ctrl-C: raised again when there is a solution
-            budget.stop.error = error
-            return None
+        with budget.stop.heeding(), np.errstate(all="ignore"):
+            restored = restore(
+                self._stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), watch=watch,
+                stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
+            )  # fmt: skip
+        return restored
 
     def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
-        there = self._result(plan.states, plan.controls, self._without_gains(plan))
+        there = self._point.result(*plan)
         if not there.violation > FAR * self._allowed:
             return False
         rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
@@ -282,141 +244,12 @@ class Ladder:
         return found is not None
 
     def _interior(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
-        """Run the interior point from a plan, and finish its result."""
-        return self._finished(self._interior_point(plan, barrier, multipliers=multipliers))
+        """From a plan by the interior point."""
+        return self._remember(self._point.solve(plan, barrier, multipliers=multipliers))
 
-    def _finished(self, found: Found | None) -> RunResult | None:
-        """Finish a result of the interior point: with Newton's method if it converged, else as a rollout."""
-        if found is None or not np.isfinite(found.plan.states).all():
-            return None
-        if found.solved and (result := self._polished(found)) is not None and result.success:
-            return self._remember(result)
-        return self._remember(self._rolled_out(found.plan, found.gain))
-
-    def _interior_point(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> Found | None:
-        """Run the interior point; its iterations go to the log. None if it was interrupted."""
-        budget, left = self._budget, self._budget.left - 1
-        if left < 1 or budget.stop.due:
-            return None
-        before, clock = np.inf, time.perf_counter()
-
-        def watch(measures: Measures) -> bool:
-            nonlocal before, clock
-            now = time.perf_counter()
-            budget.record(iteration_of(measures, before, now - clock))
-            before, clock = measures.cost, now
-            return budget.stop.due
-
-        try:
-            with np.errstate(all="ignore"):
-                point = InteriorPoint(
-                    self._problem, plan, barrier=barrier.parameter, room=barrier.room, price=self._run.settings.price,
-                    multipliers=multipliers, stages=self._stages,
-                )  # fmt: skip
-                return point.run(
-                    tolerance=self._run.final, violation=self._allowed, most=min(MOST, left),
-                    near=barrier.near, watch=watch,
-                )  # fmt: skip
-        except BaseException as error:  # Ctrl-C: raised again when there is a solution
-            budget.stop.error = error
-            return None
-
-    def start(self) -> RunResult:
-        """The rollout of the initial policy."""
-        work = self._run.work
-        guess = self._run.initial_guess
-        states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
-        return self._result(states, controls, (guess.gain, guess.offset))
-
-    def _without_gains(self, plan: Motion) -> tuple[Array, Array]:
-        return np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls
-
-    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
-        """The rollout of a plan with gains about it; without gains if that violates the constraints less."""
-        candidates = []
-        for gains in (gain, np.zeros_like(gain)):
-            offset = plan.controls - np.einsum("tij,tj->ti", gains, plan.states[:-1])
-            states, controls = compiled.rollout(self._problem, gains, offset, plan.states[0].copy())
-            candidates.append(self._result(states, controls, (gains.copy(), offset)))
-        return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
-
-    def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> RunResult:
-        """The result for a plan that has not converged."""
-        cost, _ = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))
-        work = self._run.work
-        violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
-        return RunResult(
-            status=Status.MAX_ITERATIONS, detail="", states=states, controls=controls, law=law,
-            cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
-        )  # fmt: skip
-
-    def _polished(self, found: Found) -> RunResult | None:
-        """Finish a converged plan: put controls at their limits there, and compute the policy by Newton's method.
-
-        It minimises the augmented Lagrangian with these multipliers, whose minimum the plan is.
-        """
-        work, stages = self._run.work, self._stages
-        low, high = stages.low, stages.high
-        controls, gain = found.plan.controls.copy(), found.gain.copy()
-        for side, sign in ((low, -1.0), (high, 1.0)):
-            room = np.abs(side - controls) / found.control_size
-            force = sign * found.pressing * found.control_size / found.scale
-            there = (room < AT_LIMIT) & (force > room)
-            controls = np.where(there, side, controls)
-            gain[there] = 0.0
-        offset = controls - np.einsum("tij,tj->ti", gain, found.plan.states[:-1])
-        states, controls = compiled.rollout(self._problem, gain, offset, found.plan.states[0].copy())
-        if not np.isfinite(states).all():
-            return None
-        values = work.constraint_values(states, controls)
-        for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
-            array, size = work.multipliers[k], found.row_size[stages.owners == k]
-            array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
-            # Chosen so that the forces of the augmented Lagrangian at this plan are the multipliers found.
-            force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
-            presses = found.multipliers[k] > array[0] * (numbers - array[3])  # others are left over from the barrier
-            acts = np.isfinite(numbers) & (term.equality | presses)
-            array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
-        work.plan.states[...], work.plan.controls[...] = states, controls
-        work.memory["plan_cost"] = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))[0]
-        lagrangian = AugmentedLagrangian(self._run)
-        lagrangian.evaluate(*work.plan)
-        with self._budget.joined_with_last(INTERIOR):
-            result = self._newton(lagrangian)
-            for _ in range(UPDATES):
-                if lagrangian.kept or not result.success:
-                    break
-                lagrangian.update(growth=1.0)
-                result = self._newton(lagrangian)
-        detail = ""
-        if self._run.settings.elastic is not None and result.violation > 0:
-            detail = f"elastic: {lagrangian.worst()}"
-        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
-        if result.success and lagrangian.kept:
-            return result
-        self._without_multipliers()
-        return replace(result, status=Status.MAX_ITERATIONS)
-
-    def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
-        """The multipliers; zero for rows whose margin is larger than their force, which is only left by the barrier."""
-        values = self._run.work.constraint_values(result.states, result.controls)
-        multipliers = []
-        for k, one in enumerate(lagrangian.multipliers()):
-            size = found.row_size[self._stages.owners == k]
-            idle = one.values * size / found.scale < values[k] / size
-            idle &= not self._problem.constraint_terms[k].equality
-            multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
-        return tuple(multipliers)
-
-    def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:
-        """Run Newton's method from the plan in memory, with these multipliers."""
-        result = self._run.newton(added=lagrangian.added())
-        lagrangian.evaluate(result.states, result.controls)
-        return result
-
-    def _remember(self, found: RunResult) -> RunResult:
+    def _remember(self, found: RunResult | None) -> RunResult | None:
         """Copy a result if it is the best so far."""
-        if self._best is None or found.rank < self._best.rank:
+        if found is not None and (self._best is None or found.rank < self._best.rank):
             law = found.law[0].copy(), found.law[1].copy()
             self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
         return found
@@ -446,7 +279,3 @@ class Ladder:
                 detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
-
-
-def _plan(of: RunResult | Trajectory | Motion) -> Motion:
-    return Motion(of.states.copy(), of.controls.copy())

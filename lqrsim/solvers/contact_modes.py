@@ -13,7 +13,6 @@ The gradient is not zero there, and steps along it go across. Here a switch is a
 The plan is optimal if neither is possible; `optimality_in_mode` and `surroundings` measure both again.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,11 +23,11 @@ import scipy.optimize
 
 from lqrsim.errors import Array
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import ContactCertificate, Iteration, Status
+from lqrsim.results.solution_parts import ContactCertificate, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.scenes.contact_modes import ContactModes, Period, Switches
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.budget import Budget, Laps
 from lqrsim.solvers.certify import faults
 from lqrsim.solvers.engine import RunResult, SolveRun
 
@@ -193,7 +192,7 @@ class Descent:
         self, problem: Problem, modes: ContactModes, plan: CostedPlan, tolerance: float, budget: Budget
     ) -> None:
         self._problem, self._modes, self._tolerance, self._budget = problem, modes, tolerance, budget
-        self._damping, self._clock = 0.0, time.perf_counter()
+        self._damping, self._laps = 0.0, Laps(budget, plan.cost)
         self.plan, self.model = plan, ModeModel(problem, modes, plan)
 
     def run(self) -> Status:
@@ -284,13 +283,8 @@ class Descent:
 
     def _go_to(self, plan: CostedPlan) -> None:
         """Take a plan, and linearise about it."""
-        before, self.plan = self.plan, plan
-        self.model = ModeModel(self._problem, self._modes, plan)
-        now = time.perf_counter()
-        improvement = (before.cost - plan.cost) / abs(plan.cost)
-        nan = float("nan")
-        self._budget.record(Iteration(plan.cost, improvement, 0.0, nan, 0.0, 0.0, now - self._clock, "contact modes"))
-        self._clock = now
+        self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)
+        self._laps.record("contact modes", plan.cost, optimality=np.nan)
 
 
 def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
@@ -309,8 +303,7 @@ def changed(problem: Problem, plan: CostedPlan, model: ModeModel, change: Array)
 
 def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> CostedPlan:
     """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
-    offset = controls - np.einsum("tij,tj->ti", gain, states[:-1])
-    states, controls = compiled.rollout(problem, gain, offset, states[0])
+    states, controls = compiled.rollout(problem, *compiled.law_about(states, controls, gain), states[0])
     cost = compiled.costs_of(problem, states[None], controls[None])[0] if np.isfinite(states).all() else np.inf
     return CostedPlan(states, controls, float(cost))
 
@@ -345,7 +338,7 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     descent = Descent(problem, modes, plan, run.final, run.budget)
     status = descent.run()
     plan, gain = descent.plan, descent.model.gain
-    law = gain, plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
+    law = compiled.law_about(plan.states, plan.controls, gain)
     pulls, limits = descent.pulls()
     optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)
     result = RunResult(

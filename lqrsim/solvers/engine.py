@@ -61,6 +61,12 @@ _STATUS = {
     declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
     declarations.IN_VALLEY: Status.MAX_ITERATIONS,
 }
+_DETAILS = {
+    declarations.NO_START: "rollout of the initial controls",
+    declarations.CYCLING: "the iterations repeat themselves",
+    declarations.NO_PROGRESS: "the least cost so far no longer falls",
+    declarations.STALLED: "the line search found no lower cost",
+}
 ATTENTION = 0.1  # s, after which compiled code returns to heed Ctrl-C
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the next solve, and bytes of each
 # Newton's method takes over where the states of least total cost are so near to the rollout, relative to its range:
@@ -113,13 +119,7 @@ class Ending:
                 return ""
             which = "backward" if self.backward else "forward"
             return f"{which} pass of iteration {self.done + 1}, step {self.failed} of {steps}"
-        if self.outcome == declarations.NO_START:
-            return "rollout of the initial controls"
-        if self.outcome == declarations.CYCLING:
-            return "the iterations repeat themselves"
-        if self.outcome == declarations.NO_PROGRESS:
-            return "the least cost so far no longer falls"
-        return "the line search found no lower cost" if self.outcome == declarations.STALLED else ""
+        return _DETAILS.get(self.outcome, "")
 
 
 def iterate(
@@ -266,7 +266,6 @@ class SolveRun:
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
         self.work = Workspace(problem, settings, initial_guess, start)
-        self._rows = np.zeros(max(budget.left, 1), LOG)
         self._begin(initial_guess, budget)
         self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._rows))
 
@@ -279,22 +278,17 @@ class SolveRun:
         It overwrites the result of the earlier solve, which therefore has to be copied before.
         """
         core, steps = compiled.core(problem, settings.form), problem.steps
-        if settings.first_pass == "forward":
-            with _lending:
-                for run in reversed(_idle):
-                    if run.work.core is core and run.problem.steps == steps:
-                        _idle.remove(run)
-                        run.problem, run.settings = problem, settings
-                        break
-                else:
-                    run = None
+        with _lending:
+            fitting = (one for one in reversed(_idle) if one.work.core is core and one.problem.steps == steps)
+            run = next(fitting, None) if settings.first_pass == "forward" else None
             if run is not None:
-                run.work.begin(problem, settings, initial_guess, start)
-                if len(run._rows) != max(budget.left, 1):
-                    run._rows = np.zeros(max(budget.left, 1), LOG)
-                run._begin(initial_guess, budget)
-                return run
-        return cls(problem, settings, initial_guess, start, budget)
+                _idle.remove(run)
+        if run is None:
+            return cls(problem, settings, initial_guess, start, budget)
+        run.problem, run.settings = problem, settings
+        run.work.begin(problem, settings, initial_guess, start)
+        run._begin(initial_guess, budget)
+        return run
 
     def give_back(self) -> None:
         """Leave the memory to another solve."""
@@ -305,7 +299,7 @@ class SolveRun:
 
     def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
         self.initial_guess, self.budget = initial_guess, budget
-        self._row = 0  # of smoothing, which comes next
+        self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # of smoothing, and which comes next
         self._last: Iteration | None = None  # of smoothing
         self.work.memory["watched"] = float(self.settings.safeguard)
         self.ending = Ending(declarations.RUNNING)
@@ -313,49 +307,15 @@ class SolveRun:
         self.second_order = settings.second_order(problem)
         self.final, self.rough = settings.final(problem), settings.rough(problem)
         self._valley = VALLEY if self.second_order else 0.0
-        self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
+        # Fractions of the obstacle costs in the iterations, of which the last is for all that follow.
+        self._shares = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
 
     @property
     def cost(self) -> float:
         """True cost of the last rollout; infinite where there is none, or a pass failed."""
         return np.inf if self.ending.pass_failed else _cost_of(self._last)
 
-    def smooth(self, last: int) -> None:
-        """Continue until smoothing has done `last` iterations, or ends."""
-        if self.ending.outcome != declarations.RUNNING:
-            return
-        if not self._row and not self.run_opening_pass():
-            return
-        begin, first = len(self.budget.log), self._row
-        self.ending = iterate(
-            self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._rows)), self._rows,
-            first=first, last=min(last, len(self._rows)), budget=self.budget, violation=self._violation,
-        )  # fmt: skip
-        self._row += self._count(begin)
-        if self.ending.outcome == declarations.TIMED_OUT and not self._row:
-            self.roll_out()
-
-    def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
-        """More iterations, in rows of their own; a prior acts no longer."""
-        self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
-        begin = len(self.budget.log)
-        ending = iterate(
-            self.problem, lambda first, last: self._loop(*self._arguments(first, last, rows, again=True)), rows,
-            first=first, last=last, budget=self.budget, violation=self._violation,
-        )  # fmt: skip
-        self._count(begin)
-        return ending
-
-    def _count(self, begin: int) -> int:
-        """Number of smoothing iterations that were added to a log of `begin` entries."""
-        added = len(self.budget.log) - begin
-        if added:
-            self._last = self.budget.log[-1]
-        return added
-
-    def roll_out(self) -> None:
-        """Roll out the initial guess, before any iteration; the states and controls are in `work`."""
-        self._loop(*self._arguments(0, 0, self._rows))
+    # How it goes.
 
     def solve(self, *, look_back: bool = True) -> RunResult:
         """Smooth; from the valley on take Newton's steps; where the method fails, the safeguard's.
@@ -381,6 +341,39 @@ class SolveRun:
             return self.newton()
         return self.safeguard(found) if self.settings.safeguard else found
 
+    def smooth(self, last: int) -> None:
+        """Continue until smoothing has done `last` iterations, or ends."""
+        if self.ending.outcome != declarations.RUNNING:
+            return
+        if not self._row and not self.run_opening_pass():
+            return
+        begin, last = len(self.budget.log), min(last, len(self._rows))
+        self.ending = self._iterate(self._arguments, self.work.arrays.rollout, self._rows, self._row, last)
+        if len(self.budget.log) > begin:
+            self._row, self._last = self._row + len(self.budget.log) - begin, self.budget.log[-1]
+        if self.ending.outcome == declarations.TIMED_OUT and not self._row:
+            self.roll_out()
+
+    def run_opening_pass(self) -> bool:
+        """Do the backward pass that comes before the first iteration, if any; return whether it succeeded."""
+        if self.settings.first_pass == "forward":
+            return True
+        self.roll_out()  # before its arrays are overwritten
+        work = self.work
+        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._shares[0]))
+        failed, good = work.core.opening_pass(
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
+            arrays.policy, arrays.to_go,
+        )  # fmt: skip
+        if failed >= 0:
+            outcome = declarations.NOT_POSITIVE_DEFINITE if good else declarations.NOT_FINITE
+            self.ending = Ending(outcome, failed=failed, backward=True)
+        return failed < 0
+
+    def roll_out(self) -> None:
+        """Roll out the initial guess, before any iteration; the states and controls are in `work`."""
+        self._loop(*self._arguments(0, 0, self._rows))
+
     def checked_ending(self) -> Ending:
         """How smoothing ended; NOT_FINITE if a function is not finite at the start.
 
@@ -394,78 +387,12 @@ class SolveRun:
 
     def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
         """Newton's method from the best plan so far; `added` is the constraints' share of its cost."""
-        work, last = self.work, self.budget.left
-        rows, trial = np.zeros(max(last, 1), LOG), Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
-        work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
-        ending = iterate(
-            self.problem, lambda first, to: self._loop(*self._newton_arguments(first, to, rows, last, trial)), rows,
-            first=0, last=last, budget=self.budget, violation=lambda: self._violation_of(work.plan),
-        )  # fmt: skip
+        memory = self.work.memory
+        memory["merit"], memory["share"] = memory["plan_cost"] + added, -1.0
+        ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.plan)
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
         return self.damped_result(ending, ending.status, detail)
-
-    def checkpoint(self) -> list[Array]:
-        """A copy of the state of smoothing."""
-        return [array.copy() for array in self._going_on]
-
-    def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
-        """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
-
-        Iterations of other methods that failed count as smoothing's: it has to make progress from there.
-        """
-        for array, copy in zip(self._going_on, checkpoint, strict=True):
-            array[...] = copy
-        for row, one in zip(self._rows[self._row :], others, strict=False):
-            row["cost"], row["improvement"], row["gap"], row["optimality"] = one.cost, one.improvement, one.gap, np.nan
-        self._row = min(self._row + len(others), len(self._rows))
-        self._valley = 0.0
-        self.ending = replace(self.ending, outcome=declarations.RUNNING)
-
-    @property
-    def _going_on(self) -> tuple[Array, ...]:
-        arrays = self.work.arrays
-        return *arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat
-
-    def result(self, ending: Ending) -> RunResult:
-        """Result of smoothing, with its ending."""
-        work, last = self.work, self._last
-        return RunResult(
-            status=ending.status, detail=ending.detail(self.problem.steps), states=work.states, controls=work.controls,
-            law=work.arrays.kept, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
-            gap=np.nan if last is None else last.gap,
-            values={} if ending.pass_failed or last is None else work.value_functions(),
-        )  # fmt: skip
-
-    def best(self, found: RunResult) -> RunResult:
-        """The best plan so far in place of the last one, with a policy and value functions about it."""
-        cost = float(self.work.memory["plan_cost"])
-        if not np.isfinite(cost) or (not cost < found.cost and found.values):
-            return found
-        optimality = self.linearize_about_plan()
-        detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
-        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
-        return self._about_plan(optimality, status, detail)
-
-    def linearize_about_plan(self) -> float:
-        """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
-        work, rows = self.work, np.full(1, np.nan, LOG)
-        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
-        work.memory["merit"] = work.memory["plan_cost"]
-        self._loop(*self._damped_arguments(0, 0, rows, 1, trial))
-        return float(rows["optimality"][0])
-
-    def fails_at(self, risk: float) -> int:
-        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
-
-        Overwrites the arrays of the passes.
-        """
-        work, rows = self.work, np.full(1, np.nan, LOG)
-        trial, own = Motion(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
-        work.model.noise.risk[0] = risk
-        *_, failed = self._loop(*self._damped_arguments(0, 0, rows, 1, trial))
-        work.model.noise.risk[0] = own
-        return failed
 
     def safeguard(self, found: RunResult) -> RunResult:
         """Damped iterations from the best plan so far, after smoothing failed."""
@@ -491,25 +418,83 @@ class SolveRun:
             status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)
 
-    def law_about_plan(self) -> tuple[Array, Array]:
-        """Gain and offset of the policy about the plan in memory."""
-        gain, (states, controls) = self.work.arrays.policy.gain, self.work.plan
-        return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
-
     def damped(self, *, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
         """Damped iterations from the plan, whose cost and merit are in the memory; see `kernels/damped_iterations.py`.
 
         The tolerances of cost and gap are at least `least`.
         """
-        work, last = self.work, self.budget.left
-        rows, memory = np.zeros(max(last, 1), LOG), work.memory
+        memory = self.work.memory
         memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
-        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
-        return iterate(
-            self.problem, lambda first, to: self._loop(*self._damped_arguments(first, to, rows, last, trial, least)),
-            rows, first=0, last=last, budget=self.budget, violation=lambda: self._violation_of(work.plan),
+        return self._iterate(partial(self._plan_arguments, declarations.DAMP, least=least), self.work.plan)
+
+    def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
+        """More iterations, in rows of their own; a prior acts no longer."""
+        self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
+        begin, again = len(self.budget.log), partial(self._arguments, again=True)
+        ending = self._iterate(again, self.work.arrays.rollout, rows, first, last)
+        if len(self.budget.log) > begin:
+            self._last = self.budget.log[-1]
+        return ending
+
+    # Where it stands, and going back to that.
+
+    def checkpoint(self) -> list[tuple[Array, Array]]:
+        """The arrays with the state of smoothing, and copies."""
+        arrays = self.work.arrays
+        return [(one, one.copy()) for one in (*arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat)]
+
+    def go_on(self, checkpoint: list[tuple[Array, Array]], others: Sequence[Iteration] = ()) -> None:
+        """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
+
+        Iterations of other methods that failed count as smoothing's: it has to make progress from there.
+        """
+        for array, copy in checkpoint:
+            array[...] = copy
+        for row, one in zip(self._rows[self._row :], others, strict=False):
+            row["cost"], row["improvement"], row["gap"], row["optimality"] = one.cost, one.improvement, one.gap, np.nan
+        self._row = min(self._row + len(others), len(self._rows))
+        self._valley = 0.0
+        self.ending = replace(self.ending, outcome=declarations.RUNNING)
+
+    def linearize_about_plan(self) -> float:
+        """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
+        rows, memory = np.full(1, np.nan, LOG), self.work.memory
+        memory["merit"] = memory["plan_cost"]
+        self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, rows))
+        return float(rows["optimality"][0])
+
+    def fails_at(self, risk: float) -> int:
+        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
+
+        Overwrites the arrays of the passes.
+        """
+        self.work.model.noise.risk[0] = risk
+        *_, failed = self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, np.full(1, np.nan, LOG)))
+        self.work.model.noise.risk[0] = self.problem.risk
+        return failed
+
+    # What it leads to.
+
+    def result(self, ending: Ending) -> RunResult:
+        """Result of smoothing, with its ending."""
+        work, last = self.work, self._last
+        return RunResult(
+            status=ending.status, detail=ending.detail(self.problem.steps), states=work.states, controls=work.controls,
+            law=work.arrays.kept, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
+            gap=np.nan if last is None else last.gap,
+            values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
+
+    def best(self, found: RunResult) -> RunResult:
+        """The best plan so far in place of the last one, with a policy and value functions about it."""
+        cost = float(self.work.memory["plan_cost"])
+        if not np.isfinite(cost) or (not cost < found.cost and found.values):
+            return found
+        optimality = self.linearize_about_plan()
+        detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
+        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
+        return self._about_plan(optimality, status, detail)
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
@@ -568,90 +553,60 @@ class SolveRun:
         cost, status = (self.cost, None) if found is None else (found.cost, found.status)
         return Candidate(name, cost, len(self.budget.log), status, plan)
 
-    def run_opening_pass(self) -> bool:
-        """Do the backward pass that comes before the first iteration, if any; return whether it succeeded."""
-        if self.settings.first_pass == "forward":
-            return True
-        self.roll_out()  # before its arrays are overwritten
-        work = self.work
-        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._obstacle_share(0)))
-        failed, good = work.core.opening_pass(
-            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
-            arrays.policy, arrays.to_go,
+    # The compiled loop and its arguments.
+
+    def _iterate(
+        self, arguments: Callable[[int, int, StructuredArray], tuple[Any, ...]], plan: Motion,
+        rows: StructuredArray | None = None, first: int = 0, last: int | None = None,
+    ) -> Ending:  # fmt: skip
+        """Run the loop with these arguments, each of whose iterations writes a plan; by default to the budget's end."""
+        left = self.budget.left
+        rows, last = np.zeros(max(left, 1), LOG) if rows is None else rows, left if last is None else last
+        return iterate(
+            self.problem, lambda first, last: self._loop(*arguments(first, last, rows)), rows, first=first, last=last,
+            budget=self.budget, violation=lambda: self._violation_of(plan),
         )  # fmt: skip
-        if failed >= 0:
-            outcome = declarations.NOT_POSITIVE_DEFINITE if good else declarations.NOT_FINITE
-            self.ending = Ending(outcome, failed=failed, backward=True)
-        return failed < 0
 
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
-        settings, work = self.settings, self.work
-        share = 1.0 if again else self._obstacle_share(first)
-        tolerance, valley = self.rough, 0.0 if again else self._valley
+        work, tolerance, valley = self.work, self.rough, 0.0 if again else self._valley
+        share = 1.0 if again else self._shares[min(first, len(self._shares) - 1)]
         if share != 1:
             last = min(last, first + 1)
             tolerance = valley = 0.0  # a part of the cost must not converge
-        guided = self.initial_guess.trajectory is not None and settings.first_pass == "forward" and not again
+        guided = self.initial_guess.trajectory is not None and self.settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
-        options = self._settings(len(rows), tolerance, settings.gap_tolerance)._replace(
-            guided=guided, prior_iterations=count, valley=valley
-        )
+        options = self._options(rows, tolerance)._replace(guided=guided, prior_iterations=count, valley=valley)
         arrays = work.arrays._replace(homotopy_scaled=work.homotopy_scaled(share), prior=prior)
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, rows
 
-    def _damped_arguments(
-        self,
-        first: int,
-        last: int,
-        rows: StructuredArray,
-        most: int,
-        trial: Motion,
-        least: tuple[float, float] = (0.0, 0.0),
+    def _plan_arguments(
+        self, task: int, first: int, last: int, rows: StructuredArray, *, least: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Any, ...]:
-        """Arguments for at most `most` damped iterations; `trial` is scratch memory."""
-        settings, work = self.settings, self.work
-        options = self._settings(most, max(self.rough, least[0]), max(settings.gap_tolerance, least[1]))
-        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
-        return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, rows
-
-    def _newton_arguments(
-        self, first: int, last: int, rows: StructuredArray, most: int, trial: Motion
-    ) -> tuple[Any, ...]:
-        """Arguments for at most `most` Newton iterations; `trial` is scratch memory."""
-        settings, work = self.settings, self.work
-        options = self._settings(most, self.final, settings.gap_tolerance)
-        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
-        return declarations.FINISH, first, last, options, work.model, arrays, work.memory_rows, rows
+        """Arguments for damped or Newton iterations from the plan, with at least these tolerances of cost and gap."""
+        work, tolerance = self.work, self.final if task == declarations.FINISH else self.rough
+        options = self._options(rows, max(tolerance, least[0]), least[1])
+        arrays = work.arrays._replace(prior=work.no_prior, rollout=work.trial)
+        return task, first, last, options, work.model, arrays, work.memory_rows, rows
 
     def _check_arguments(
         self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
-        settings, work = self.settings, self.work
-        arrays = work.arrays._replace(
-            to_go=to_go, rollout=Motion(found.states, found.controls),
-            kept=Policy(*found.law), certificate=certificate,
-        )  # fmt: skip
-        options = self._settings(0, self.final, settings.gap_tolerance)
+        work, plan = self.work, Motion(found.states, found.controls)
+        arrays = work.arrays._replace(to_go=to_go, rollout=plan, kept=Policy(*found.law), certificate=certificate)
+        options = self._options(self._rows, self.final)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
-    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> IterationSettings:
-        """Settings of the kernels for at most `most` iterations."""
+    def _options(self, rows: StructuredArray, tolerance: float, least_gap: float = 0.0) -> IterationSettings:
+        """Settings of the kernels for at most as many iterations as there are rows."""
         return IterationSettings(
-            steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
-            gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
-            guided=False, prior_iterations=0,
+            steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
+            gap_tolerance=max(self.settings.gap_tolerance, least_gap), optimal=self.settings.stop == "optimal",
+            fixed=self.work.fixed, guided=False, prior_iterations=0,
         )  # fmt: skip
 
-    def _obstacle_share(self, iteration: int) -> float:
-        """Fraction of the obstacle costs in an iteration."""
-        return self._shares[iteration] if iteration < len(self._shares) else 1.0
-
-    def _violation(self) -> float:
-        return self._violation_of((self.work.states, self.work.controls))
-
-    def _violation_of(self, plan: tuple[Array, Array]) -> float:
+    def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
 
 
@@ -661,8 +616,10 @@ class Workspace:
     Attributes:
       arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
       memory: the safeguard's state between two iterations, a row of `MEMORY`; memory_rows: (1,) that row.
-      multipliers: multipliers of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
-      core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
+      multipliers: those of each constraint; changes act at once.
+      start: (n,) the start state. plan: the best so far. states, controls: of the last rollout, (T+1, n) and (T, m).
+      trial: the rollout that a line search tries. core: the compiled iterations.
+      fixed: whether the start is given exactly. dual: which form it is.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
@@ -681,7 +638,6 @@ class Workspace:
         def policy() -> Policy:
             return Policy(zeros((steps, m, n)), zeros((steps, m)))
 
-        self.multipliers: list[Array] = []
         self.arrays = records.SmootherArrays(
             start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
             to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
@@ -690,6 +646,8 @@ class Workspace:
             homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
+        self.start, self.plan, self.trial = self.arrays.start, self.arrays.plan, plan()
+        self.states, self.controls = self.arrays.rollout
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
@@ -703,11 +661,12 @@ class Workspace:
             self.prior = Prior(initial_guess.prior.weight.copy(), about)
             self.prior_iterations = initial_guess.prior.iterations
         spare = INSIDE * self._tolerance if self._exact else self._tolerance
-        multipliers = [compiled.no_multipliers(problem, one, spare, settings.price) for one in problem.constraint_terms]
-        for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
-            array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
-        self.multipliers = multipliers
-        self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.second_order(problem))
+        self.multipliers = [
+            compiled.ConstraintMultipliers(problem, term, spare, settings.price) for term in problem.constraint_terms
+        ]
+        for own, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
+            own.penalty, own.values[...] = known.penalty, known.values.ravel()
+        self.model = compiled.arguments(problem, multipliers=self.multipliers, second_order=self._exact)
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # Everything else is written before it is read.
         self.memory_rows[...] = 0.0
@@ -722,26 +681,6 @@ class Workspace:
         for array in (arrays.guess, arrays.plan):
             array.states[...] = start if plan is None else plan.states
             array.controls[...] = initial_guess.offset if plan is None else plan.controls
-
-    @property
-    def start(self) -> Array:
-        """The start state, (n,)."""
-        return self.arrays.start
-
-    @property
-    def plan(self) -> Motion:
-        """The best plan so far."""
-        return self.arrays.plan
-
-    @property
-    def states(self) -> Array:
-        """States of the last rollout, (T+1, n)."""
-        return self.arrays.rollout.states
-
-    @property
-    def controls(self) -> Array:
-        """Controls of the last rollout, (T, m)."""
-        return self.arrays.rollout.controls
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""
@@ -772,7 +711,7 @@ class Workspace:
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero where it does not act."""
-        values = [np.empty(len(multipliers) - declarations.HEADER) for multipliers in self.multipliers]
+        values = [np.empty_like(one.values) for one in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
             self._costs.evaluate_constraints(self._problem.steps, states, controls, constraints, tuple(values))
@@ -786,17 +725,17 @@ class Workspace:
 
     def violation(self, values: list[Array]) -> float:
         """The largest violation of a constraint, given their values; infinite if one is NaN."""
-        terms = self._problem.constraint_terms
-        return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
+        pairs = zip(self.multipliers, values, strict=True)
+        return max((violation_of(own.term, one) for own, one in pairs), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance.
 
         Elastic constraints, which have a price, count as kept.
         """
-        pairs = zip(self._problem.constraint_terms, values, strict=True)
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
-        return self.priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
+        pairs = zip(self.multipliers, values, strict=True)
+        return self.priced or all(violation_of(own.term, one) <= allowed(own.term) for own, one in pairs)
 
 
 def _cost_of(iteration: Iteration | None) -> float:

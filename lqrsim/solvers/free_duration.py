@@ -6,8 +6,8 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 """
 
 import copy
-import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,13 +20,82 @@ from lqrsim.problem.constraints import Constraint, GoalState, StateBounds, Symbo
 from lqrsim.problem.costs import ControlCost, Cost, CostSum, ObstacleCost, QuadraticCost, SymbolicCost, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Trajectory
-from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Status, Trajectory
+from lqrsim.solvers.budget import Budget, Callback, Laps
+from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
+from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.stages import Stages
 
 STATE, STATED = "duration", "stated_duration"  # the added state, and the parameter that it is relative to
 MOST = 300  # iterations
+# How often a shorter duration is tried, by which factor, and with how many iterations.
+SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
+
+
+def solve_for_duration(
+    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
+    attentive: bool, callback: Callback | None,
+) -> Solution:  # fmt: skip
+    """Solve for the stated duration, then find the best one near it, and finish the plan with that.
+
+    With a weight on time, and no start from the caller, shorter durations are tried, too, since they may lead another
+    way round. `solve` is for problems with a fixed duration; for `attentive` see `Budget`.
+    """
+    budget = Budget(settings.max_iterations, callback=callback)
+    stop, log, laps = budget.stop, budget.log, Laps(budget)
+    stop.begin(settings.time_limit)
+
+    def watch(measures: Measures) -> bool:
+        measures.record(laps)
+        return stop.due
+
+    assert problem.duration is not None
+    stated, first, best, near = problem.steps * problem.dt, None, None, None
+    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 and settings.start is None else 1):
+        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+        begin = solve(settled(problem, stated), tries)
+        first = begin if first is None else first
+        if attempt and not begin.success:
+            break
+        with stop.reporting("smooth", attentive):
+            near = find_duration(
+                problem, begin.trajectory, tolerance=settings.final(problem),
+                violation=settings.violation_tolerance(problem), most=settings.max_iterations, watch=watch,
+            )  # fmt: skip
+        cheaper = best is None or near[1].measures.cost < best[1].measures.cost
+        if stop.due or not near[1].solved or not cheaper:
+            break
+        best = near
+        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
+    assert first is not None
+    if best is not None:
+        ordinary, found = best
+        m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
+        guess = InitialGuess(
+            np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
+            f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
+        )  # fmt: skip
+        return stop.finish(solve(ordinary, replace(settings, start=guess, starts=None)))
+    candidates = [first]
+    if near is not None and np.isfinite(near[1].plan.states).all() and not stop.due:
+        ordinary, found = near
+        start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+        candidates.append(solve(ordinary, replace(settings, start=start, starts=None)))
+    chosen = min(candidates, key=lambda one: _rank_with_time(one, problem.time_weight))
+    status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
+    detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
+    iterations = (*first.iterations, *log, *(chosen.iterations if chosen is not first else ()))
+    return stop.finish(replace(chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations))
+
+
+def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
+    """The smaller, the better: the violation of a plan that failed, then the cost with that of its time."""
+    missed = 0.0 if solution.success else solution.violation
+    return missed, solution.cost + time_weight * solution.trajectory.horizon
 
 
 def find_duration(
@@ -48,10 +117,11 @@ def find_duration(
         point = InteriorPoint(freed, plan, room=0.02, stages=stages)
         found = point.run(tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch)
     # Remove everything that belongs to the duration.
-    rows = found.row_size[stages.owners != len(problem.constraint_terms)]
-    found = dataclasses.replace(
+    rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
+    found = replace(
         found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
-        gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1], row_size=rows,
+        gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1],
+        sizes=found.sizes._replace(rows=rows),
     )  # fmt: skip
     duration = float(np.clip(point.point.plan.states[0, n], *problem.duration))
     return settled(problem, duration), found
@@ -59,7 +129,7 @@ def find_duration(
 
 def settled(problem: Problem, duration: float) -> Problem:
     """The problem with a fixed duration, in seconds."""
-    return dataclasses.replace(problem, dt=duration / problem.steps, duration=None, time_weight=0.0)
+    return replace(problem, dt=duration / problem.steps, duration=None, time_weight=0.0)
 
 
 def with_duration(problem: Problem) -> Problem:

@@ -176,7 +176,7 @@ def _solve(
         whole = failed < 0 and np.isfinite(states).all()
     if not whole:  # without a pass about the trajectory the policy has no feedback
         policy.gain[:] = 0
-    offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
+    offset = compiled.law_about(states, controls, policy.gain)[1] if whole else controls.copy()
     status, detail = ending.status, ending.detail(steps)
 
     def check(task: int, to_go: CostToGo, out: StructuredArray) -> None:

@@ -60,9 +60,30 @@ def evidence(
       sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
       control_size, state_size: typical sizes of controls and states.
     """
+    missed, slopes, alone, holding = _pulls(problem, work, plan, shares, sizes, allowed)
+    if not missed > 0:
+        return None
+    left, size, pressed = _balance(problem, plan, slopes, alone, control_size, state_size)
+    if not left <= STATIONARY * size:
+        return None
+    if size > 0:
+        each = zip(problem.dynamics.control_coordinates.names, pressed.tolist(), strict=True)
+        holding += [(force / size, f"the limits of {name}") for name, force in each if force > 1e-2 * size]
+    return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
+
+
+def _pulls(
+    problem: Problem, work: Workspace, plan: RunResult, shares: list[Array], sizes: list[Array], allowed: float
+) -> tuple[float, Array, Array, list[tuple[float, str]]]:
+    """The total violation, relative to the rows' sizes, and what pulls on it.
+
+    Returns:
+      The violation; slopes (T+1, n+m) of all rows with their multipliers, and of the violated ones alone; and the rows
+      in words, each with its share.
+    """
     states, controls = plan.states, plan.controls
-    steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
-    slopes, alone, missed = np.zeros((steps + 1, n + m)), np.zeros((steps + 1, n + m)), 0.0
+    steps, joint = len(controls), states.shape[1] + controls.shape[1]
+    slopes, alone, missed = np.zeros((steps + 1, joint)), np.zeros((steps + 1, joint)), 0.0
     holding: list[tuple[float, str]] = []
     for k, (term, numbers) in enumerate(
         zip(problem.constraint_terms, work.constraint_values(states, controls), strict=True)
@@ -84,8 +105,15 @@ def evidence(
                 t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
                 told = f", missed by {beyond:.2g}" if beyond > allowed else ""
                 holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{told}"))
-    if not missed > 0:
-        return None
+    return missed, slopes, alone, holding
+
+
+def _balance(
+    problem: Problem, plan: RunResult, slopes: Array, alone: Array, control_size: Array, state_size: Array
+) -> tuple[float, float, Array]:
+    """The largest gradient in a control that is left, that of what cancels, and (m,) what limits balance."""
+    states, controls = plan.states, plan.controls
+    steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     space = problem.control_coordinates
     low = controls <= space.low + AT_LIMIT * control_size
     high = controls >= space.high - AT_LIMIT * control_size
@@ -98,18 +126,7 @@ def evidence(
         total = max(total, float((np.abs(slope) * control_size * free).max()))
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
-        size = max(size, float((np.linalg.norm(ahead * state_size) * reach).max()))
-        size = max(
-            size,
-            float((np.linalg.norm(own * state_size) * reach).max()),
-            float((np.abs(of_missed) * control_size).max()),
-        )
+        of_all, of_own = np.linalg.norm(ahead * state_size) * reach, np.linalg.norm(own * state_size) * reach
+        size = max(size, *(float(one.max()) for one in (of_all, of_own, np.abs(of_missed) * control_size)))
         ahead, own = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ own
-    if not total <= STATIONARY * size:
-        return None
-    names = problem.dynamics.control_coordinates.names
-    if size > 0:
-        holding += [
-            (float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size
-        ]
-    return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
+    return total, size, pressed

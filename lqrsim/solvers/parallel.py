@@ -78,14 +78,9 @@ def check_threads(threads: int | None) -> int:
     return processors() if threads is None else check_count("threads", threads, at_most=MOST_THREADS)
 
 
-def list_of(problems: Iterable[Problem]) -> list[Problem]:
-    """The problems as a list. Raises InputError unless they are a collection."""
-    return list(check_items("problems", problems, object, "a list of Problem"))
-
-
 def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
-    """The problems as a list, with noise and risk replaced where they are given."""
-    listed = list_of(problems)
+    """The problems as a list, with noise and risk replaced where they are given. Raises InputError unless it is one."""
+    listed = list(check_items("problems", problems, object, "a list of Problem"))
     if noise is None and risk is None:
         return listed
     return [check_kind("problems", one, Problem, "Problems").driven_by(noise, risk) for one in listed]

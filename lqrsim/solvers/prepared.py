@@ -20,12 +20,13 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import satisfy
-from lqrsim.solvers.budget import Budget, Stop
-from lqrsim.solvers.constrained import LITTLE
+from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.engine import RunResult, SolveRun, raised_by
 from lqrsim.solvers.initial_guess import InitialGuess
-from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
+from lqrsim.solvers.interior_point import InteriorPoint, Measures
+from lqrsim.solvers.interior_run import LITTLE
 from lqrsim.solvers.settings import SmootherSettings, check_problem
+from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
 BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
@@ -168,7 +169,7 @@ class PreparedSolver:
             if problem.constraints and run.second_order:
                 stages = self._stages_of(problem)
                 neighbour = _Neighbour(run, stages, _plan_of(start, best), best, self._closing)
-                found, ended = neighbour.find(), neighbour.ended
+                found, ended = neighbour.find(), neighbour.laps.ended
                 self._idle.append(stages)
             else:
                 found = _solve(run, best)
@@ -263,15 +264,14 @@ class _Neighbour:
       best: the plan that the law leads to. closing: how long what follows the last iteration takes, in s.
 
     Attributes:
-      ended: when the last iteration did.
+      laps: of its iterations; the last may be a step that was abandoned.
     """
 
     def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._run, self._stages, self._plan, self._best = run, stages, plan, best
         self._closing, self._budget = closing, run.budget
         self._allowed = run.settings.violation_tolerance(run.problem)
-        self.ended, self._cost = time.perf_counter(), np.inf
-        self._out_of_time = False
+        self.laps, self._out_of_time = Laps(run.budget), False
 
     def find(self) -> RunResult:
         """Run until it converges or has to stop."""
@@ -286,7 +286,7 @@ class _Neighbour:
             function.forget()
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
-            self.ended = time.perf_counter()
+            self.laps.ended = time.perf_counter()
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
@@ -295,21 +295,21 @@ class _Neighbour:
                 )  # fmt: skip
 
                 def watch(measures: Measures) -> bool:
-                    self._log(measures, INTERIOR)
+                    measures.record(self.laps)
                     return self._late(budget.log[-1].seconds) or not budget.left
 
                 found = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
                 if found.solved or not np.isfinite(active.measures.cost):
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
                     solved = self._solve(active)
-            self.ended = time.perf_counter()  # also of an abandoned step
+            self.laps.ended = time.perf_counter()
             return self._result(active, solved)
 
     def _solve(self, active: ActiveSet) -> bool:
         """Take the steps of an active set; return whether they converge. A step that would be too late is abandoned."""
 
         def watch(measures: Measures) -> bool:
-            self._log(measures, "active set")
+            measures.record(self.laps, "active set")
             return self._late(active.looking) or not self._budget.left
 
         return active.run(self._run.final, watch, self._late)
@@ -318,11 +318,6 @@ class _Neighbour:
         """Whether something that takes so long would end too late; if so, the solve ends."""
         self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
         return self._out_of_time
-
-    def _log(self, measures: Measures, method: str) -> None:
-        now = time.perf_counter()
-        self._budget.record(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
-        self.ended, self._cost = now, measures.cost
 
     def _result(self, active: ActiveSet, solved: bool) -> RunResult:
         """The rollout of the plan with a policy about it."""
@@ -337,10 +332,9 @@ class _Neighbour:
         )
         status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
-        offset = plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
         return RunResult(
             status=Status.CONVERGED if solved else status, detail=detail, states=plan.states, controls=plan.controls,
-            law=(gain, offset), cost=cost, violation=self._run.work.violation(values), gap=np.nan,
+            law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values), gap=np.nan,
             multipliers=tuple(Multipliers(*one) for one in active.multipliers()),
         )  # fmt: skip
 
@@ -376,7 +370,7 @@ class _Best:
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
-                there = *arrays.plan, *self._run.law_about_plan()
+                there = *arrays.plan, *compiled.law_about(*arrays.plan, arrays.policy.gain)
             else:
                 there = *arrays.rollout, *arrays.kept, *arrays.to_go
             # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.

@@ -17,8 +17,9 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Limits, Motion
-from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
+from lqrsim.kernels.records import Limits, Motion, Policy
+from lqrsim.solvers.interior_point import MIXES
+from lqrsim.solvers.stages import Sizes, Stages, joined
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; its factor
 SETTLED = 0.1  # promised decrease per row, relative to the parameter, below which that falls
@@ -45,6 +46,60 @@ class Restored:
     near: bool
 
 
+class Penalty:
+    """What violated rows (K,) cost, smoothed by a barrier. Limits of controls have no price, but their own barrier.
+
+    Attributes:
+      size, equality, limit: of each row. highest: the price of a unit; lowest: the least multiplier.
+    """
+
+    def __init__(self, stages: Stages, sizes: Sizes, price: float) -> None:
+        self.size, self.equality = stages.of_each(sizes.rows), stages.of_each(stages.equality)
+        self.limit = stages.of_each(stages.owners == -1)
+        self.highest = price * sizes.cost / self.size
+        self.lowest = np.where(self.equality, -self.highest, 0.0)
+
+    def merit(self, numbers: Array, cost: float, parameter: float) -> float:
+        """Cost plus penalties of rows with these values, at a barrier parameter."""
+        slack, excess = self._slacks(numbers, parameter)
+        paid = self.highest * (excess + np.where(self.equality, slack, 0.0))
+        paid = paid - parameter * (np.log(slack) + np.log(excess))
+        with np.errstate(all="ignore"):
+            inside = np.where(self.limit, -parameter * np.log(np.where(self.limit, numbers, 1.0)), 0.0)
+        total = cost + float(np.where(self.limit, inside, paid).sum())
+        return total if np.isfinite(total) else np.inf
+
+    def model(self, numbers: Array, dual: Array | None, parameter: float, damping: float) -> tuple[Array, Array, Array]:
+        """Forces (K,) and curvatures of the penalties, and the multipliers, which are the forces if not known yet."""
+        slack, excess = self._slacks(numbers, parameter)
+        room = np.where(self.limit, numbers, slack)
+        force = self.lowest + parameter / room
+        dual = force if dual is None else dual
+        low = np.clip(dual - self.lowest, parameter / room / WIDE, parameter / room * WIDE)
+        high = np.clip(self.highest - dual, parameter / excess / WIDE, parameter / excess * WIDE)
+        own = np.where(self.limit, low / room, 1 / (room / low + excess / high))
+        chord = parameter / (slack * np.where(self.equality, 2 * excess, slack + excess))
+        curvature = np.where(self.limit, own, own + min(damping, 1.0) * np.maximum(chord - own, 0.0))
+        return force, curvature, dual
+
+    def missed(self, numbers: Array) -> Array:
+        """Violations of all rows but limits; negative for inequalities that are kept."""
+        return np.where(self.limit, 0.0, np.where(self.equality, np.abs(numbers), -numbers))
+
+    def shares(self, multipliers: Array) -> Array:
+        """Multipliers relative to the price, from -1 to 1; 0 for limits."""
+        return np.where(self.limit, 0.0, np.clip(multipliers, self.lowest, self.highest) / self.highest)
+
+    def _slacks(self, numbers: Array, parameter: float) -> tuple[Array, Array]:
+        """The two slacks of each row, whose difference is its value, that minimise price and barrier."""
+        steep = np.where(self.equality, 2 * self.highest, self.highest)
+        root = np.hypot(steep * numbers, 2 * parameter)
+        rest = 4 * parameter**2 / (root + steep * np.abs(numbers))  # root - steep |numbers|, without cancelling
+        small = (2 * parameter + rest) / (2 * steep)
+        large = (2 * parameter + root + steep * np.abs(numbers)) / (2 * steep)
+        return np.where(numbers > 0, large, small), np.where(numbers > 0, small, large)
+
+
 def restore(
     stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
     watch: Callable[[float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
@@ -57,88 +112,59 @@ def restore(
       stationary: asked, once the promised decrease is negligible, whether the violation of a motion is stationary. It
         gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.
     """
-    live = stages.live
-    size, equality = stages.of_each(sizes.rows), stages.of_each(stages.equality)
-    limit = stages.of_each(stages.owners == -1)
-    highest = price * sizes.cost / size
+    live, penalty = stages.live, Penalty(stages, sizes, price)
+    count = max(len(penalty.size), 1)
     edge = EDGE * np.where(np.isfinite(stages.high - stages.low), stages.high - stages.low, 0.0)
-    controls = np.clip(plan.controls, stages.low + edge, stages.high - edge)
-    begun = Motion(plan.states, in_c_order(controls))
-    still = np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m))
+    begun = Motion(plan.states, in_c_order(np.clip(plan.controls, stages.low + edge, stages.high - edge)))
+    still = Policy(np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m)))
     plan = stages.follow(begun, 0.0, still, _limits(stages, begun.controls))
-    parameter = FIRST * price * sizes.cost / max(len(size), 1)
-    least = LEAST * price * sizes.cost / max(len(size), 1)
-
-    def merit(numbers: Array, cost: float) -> float:
-        slack, excess = _slacks(numbers, highest, equality, parameter)
-        paid = highest * (excess + np.where(equality, slack, 0.0)) - parameter * (np.log(slack) + np.log(excess))
-        with np.errstate(all="ignore"):
-            inside = np.where(limit, -parameter * np.log(np.where(limit, numbers, 1.0)), 0.0)
-        total = cost + float(np.where(limit, inside, paid).sum())
-        return total if np.isfinite(total) else np.inf
-
+    parameter, least = FIRST * price * sizes.cost / count, LEAST * price * sizes.cost / count
     diagonal = np.arange(stages.n, stages.n + stages.m)
-    lowest = np.where(equality, -highest, 0.0)
     settled, near, damping, close, level, dual, before = False, False, 1.0, 0, LEVEL, None, np.inf
-    count = len(stages.problem.constraint_terms)
-    force = np.zeros(len(size))
-    costates = np.zeros((stages.steps + 1, stages.n))
+    force, costates = np.zeros(len(penalty.size)), np.zeros((stages.steps + 1, stages.n))
     for _ in range(most):
-        cost, _arrived = stages.trial(plan)
-        numbers = stages.values(plan)[live]
+        cost, numbers = stages.trial(plan)[0], stages.values(plan)[live]
         if not np.isfinite(cost) or not np.isfinite(numbers).all():
             return None
         stages.linearize(plan, costates, stages.spread(force), 0.0)
         while True:
-            slack, excess = _slacks(numbers, highest, equality, parameter)
-            room = np.where(limit, numbers, slack)
-            force = lowest + parameter / room
-            dual = force if dual is None else dual
-            low = np.clip(dual - lowest, parameter / room / WIDE, parameter / room * WIDE)
-            high = np.clip(highest - dual, parameter / excess / WIDE, parameter / excess * WIDE)
-            own = np.where(limit, low / room, 1 / (room / low + excess / high))
-            chord = parameter / (slack * np.where(equality, 2 * excess, slack + excess))
-            curvature = np.where(limit, own, own + min(damping, 1.0) * np.maximum(chord - own, 0.0))
-            gradient = stages.models.gradient - stages.pull(force)
-            barrier = stages.curvature(curvature)
+            force, curvature, dual = penalty.model(numbers, dual, parameter, damping)
+            gradient, barrier = stages.models.gradient - stages.pull(force), stages.curvature(curvature)
             barrier[:, diagonal, diagonal] += damping * DAMPING * price * sizes.cost / sizes.controls**2 / stages.steps
             if not _direction(stages, barrier, gradient, sizes, price):
                 return None
-            joined = stages.joined()
-            slope = float((gradient * joined).sum())
-            if -slope > SETTLED * parameter * len(size) or parameter <= least:
+            slope = float((gradient * joined(stages.changes)).sum())
+            if -slope > SETTLED * parameter * len(penalty.size) or parameter <= least:
                 break
             parameter = max(FALL * parameter, least)
         costates = stages.to_go.gradient.copy()
-        now = merit(numbers, cost)
-        part, taken = 1.0, None
-        policy = stages.gain, stages.offset
-        limits = _limits(stages, plan.controls)
+        now = penalty.merit(numbers, cost, parameter)
+        part, taken, limits = 1.0, None, _limits(stages, plan.controls)
         while part > SHORTEST:
-            tried = stages.follow(plan, part, policy, limits)
+            tried = stages.follow(plan, part, stages.policy, limits)
             if np.isfinite(tried.states).all():
-                value = merit(stages.values(tried)[live], stages.trial(tried)[0])
+                value = penalty.merit(stages.values(tried)[live], stages.trial(tried)[0], parameter)
                 if value <= now + ARMIJO * part * slope + 1e-13 * abs(now):
                     taken = tried
                     break
             part /= 2
-        moved = stages.moved()
-        aim = force - curvature * moved  # the multipliers after the whole step
+        aim = force - curvature * stages.moved()  # the multipliers after the whole step
         dual = dual + part * (aim - dual)
         if part > LONG:
             damping /= TIMES
         elif part < SHORT:
             damping = min(max(TIMES * damping, LIGHT), HEAVY)
-        short = np.where(limit, 0.0, np.where(equality, np.abs(numbers), -numbers))
-        missed, near = float(short.max(initial=0.0)), float((short / size).max(initial=0.0)) < CLOSE
+        missed = penalty.missed(numbers)
+        near = float((missed / penalty.size).max(initial=0.0)) < CLOSE
         close = close + 1 if near and abs(before - cost) < SLOW * abs(cost) else 0
         before = cost
         promised = -0.5 * slope / max(abs(now), 1e-300)
-        if watch(cost, missed, promised) or close == PATIENCE:
+        if watch(cost, float(missed.max(initial=0.0)), promised) or close == PATIENCE:
             break
         if not near and 2 * promised < level and damping < 1:
-            shares = stages.spread(np.where(limit, 0.0, np.clip(aim, lowest, highest) / highest))
-            settled = stationary(plan, [shares[:, stages.owners == k] for k in range(count)])
+            shares = stages.spread(penalty.shares(aim))
+            terms = range(len(stages.problem.constraint_terms))
+            settled = stationary(plan, [shares[:, stages.owners == k] for k in terms])
             if settled:
                 break
             level *= FINER
@@ -146,15 +172,6 @@ def restore(
             break
         plan = taken
     return Restored(plan, settled, near)
-
-
-def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -> tuple[Array, Array]:
-    """The two slacks of each row, whose difference is its value, that minimise price and barrier."""
-    steep = np.where(equality, 2 * highest, highest)
-    root = np.hypot(steep * numbers, 2 * parameter)
-    rest = 4 * parameter**2 / (root + steep * np.abs(numbers))  # root - steep |numbers|, without cancelling
-    small, large = (2 * parameter + rest) / (2 * steep), (2 * parameter + root + steep * np.abs(numbers)) / (2 * steep)
-    return np.where(numbers > 0, large, small), np.where(numbers > 0, small, large)
 
 
 def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, price: float) -> bool:

@@ -43,13 +43,16 @@ class Settings:
         if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # Plain Python numbers: NumPy's are other types for the compiler, and JSON cannot have them.
-        if self.tolerance is not None:
-            object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
+        self._check_positive("tolerance")
         # A log of that length takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
         object.__setattr__(self, "max_iterations", most)
-        if self.time_limit is not None:
-            object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
+        self._check_positive("time_limit")
+
+    def _check_positive(self, name: str) -> None:
+        """Check an option that is a positive number, or None for its default."""
+        if (value := getattr(self, name)) is not None:
+            object.__setattr__(self, name, check_number(name, value, above=0.0))
 
     @property
     def core_form(self) -> str:
@@ -77,8 +80,7 @@ class SmootherSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.elastic is not None:
-            object.__setattr__(self, "elastic", check_number("elastic", self.elastic, above=0.0))
+        self._check_positive("elastic")
         if self.finish is not None:
             check_name("finish", self.finish, ("newton",))
         if self.starts is not None:
@@ -86,13 +88,10 @@ class SmootherSettings(Settings):
             if self.starts > 1 and self.start is not None:
                 raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
-        if self.constraint_tolerance is not None:
-            number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
-            object.__setattr__(self, "constraint_tolerance", number)
-        if self.penalty is not None:
-            object.__setattr__(self, "penalty", check_number("penalty", self.penalty, above=0.0))
-            if self.start is None:
-                raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
+        self._check_positive("constraint_tolerance")
+        self._check_positive("penalty")
+        if self.penalty is not None and self.start is None:
+            raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
         check_name("form", self.form, tuple(compiled.FORMS))
         check_name("first_pass", self.first_pass, ("forward", "backward"))
         object.__setattr__(self, "safeguard", check_flag("safeguard", self.safeguard))

@@ -1,0 +1,196 @@
+"""The interior point as part of a run: from a plan to a result with a policy, within the run's budget.
+
+A plan that converges is finished by Newton's method on the augmented Lagrangian with the multipliers found, whose
+minimum it is: that puts controls exactly at their limits, and gives a policy and value functions. Any other plan is
+rolled out.
+"""
+
+import time
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.kernels.records import Motion
+from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
+from lqrsim.solvers import compiled
+from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.solvers.budget import Laps
+from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures
+from lqrsim.solvers.stages import Stages
+
+OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
+MOST = 300  # iterations from one plan
+PENALTY = 8.0  # of the augmented Lagrangian that makes the policy keep the constraints, in cost per squared row size
+UPDATES = 5  # of multipliers, if Newton's steps at the end violate constraints
+AT_LIMIT = 1e-9  # distance from its limit, relative to its range, at which a pressing control is put there
+
+
+class Barrier(NamedTuple):
+    """How the interior point begins: barrier parameter, least slacks, and whether the plan may be near the optimum."""
+
+    parameter: float
+    room: float
+    near: bool
+
+
+MUCH, LITTLE = Barrier(1.0, 0.06, near=False), Barrier(0.01, 0.01, near=True)
+
+
+class InteriorRun:
+    """The interior point for the problem of a run.
+
+    Attributes:
+      stages: of the problem. allowed: tolerance of its constraints.
+    """
+
+    def __init__(self, run: SolveRun) -> None:
+        self._run, self._problem, self._budget = run, run.problem, run.budget
+        self.allowed = run.settings.violation_tolerance(run.problem)
+        clock = time.perf_counter()
+        self.stages = Stages(run.problem)
+        run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
+
+    def instead(self, plan: Motion | RunResult) -> RunResult | None:
+        """The result from a plan if it converges; None if not: smoothing can then go on."""
+        checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
+        found = self.solve(copied(plan), MUCH)
+        if found is not None and found.success:
+            return found
+        self._run.go_on(checkpoint, self._budget.log[begin:])
+        return None
+
+    def solve(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
+        """The result from a plan; None if the budget is over, or it leads nowhere. The iterations go to the log."""
+        budget, run, found = self._budget, self._run, None
+        if budget.left < 2 or budget.stop.due:
+            return None
+        laps = Laps(budget)
+
+        def watch(measures: Measures) -> bool:
+            measures.record(laps)
+            return budget.stop.due
+
+        with budget.stop.heeding(), np.errstate(all="ignore"):
+            point = InteriorPoint(
+                self._problem, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
+                multipliers=multipliers, stages=self.stages,
+            )  # fmt: skip
+            found = point.run(
+                tolerance=run.final, violation=self.allowed, most=min(MOST, budget.left - 1), near=barrier.near,
+                watch=watch,
+            )  # fmt: skip
+        return None if found is None else self.finish(found)
+
+    def finish(self, found: Found) -> RunResult | None:
+        """Make a result of a plan: by Newton's method if it converged, else by a rollout. None if it is not finite."""
+        if not np.isfinite(found.plan.states).all():
+            return None
+        if found.solved and (result := self._polished(found)) is not None and result.success:
+            return result
+        return self._rolled_out(found.plan, found.gain)
+
+    def start(self) -> RunResult:
+        """The rollout of the initial policy."""
+        guess, start = self._run.initial_guess, self._run.work.start
+        plan = compiled.rollout(self._problem, guess.gain, guess.offset, start.copy())
+        return self.result(*plan, (guess.gain, guess.offset))
+
+    def result(self, states: Array, controls: Array, law: tuple[Array, Array] | None = None) -> RunResult:
+        """The result for a plan that has not converged; without a law, its controls are applied without feedback."""
+        if law is None:
+            law = np.zeros((*controls.shape, states.shape[1])), controls
+        cost, _ = self.stages.trial(Motion(states, controls))
+        work = self._run.work
+        violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
+        return RunResult(
+            status=Status.MAX_ITERATIONS, detail="", states=states, controls=controls, law=law,
+            cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
+        )  # fmt: skip
+
+    def without_multipliers(self) -> None:
+        """Set multipliers and penalties of the augmented Lagrangian to zero."""
+        for one in self._run.work.multipliers:
+            one.penalty, one.values[...] = 0.0, 0.0
+
+    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
+        """The rollout of a plan with gains about it; without gains if that violates the constraints less."""
+        candidates = []
+        for gains in (gain.copy(), np.zeros_like(gain)):
+            law = compiled.law_about(*plan, gains)
+            candidates.append(self.result(*compiled.rollout(self._problem, *law, plan.states[0].copy()), law))
+        return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
+
+    def _polished(self, found: Found) -> RunResult | None:
+        """Finish a converged plan by Newton's method; None if its rollout is not finite."""
+        work = self._run.work
+        law = compiled.law_about(found.plan.states, *self._at_limits(found))
+        states, controls = compiled.rollout(self._problem, *law, found.plan.states[0].copy())
+        if not np.isfinite(states).all():
+            return None
+        self._take_multipliers(found, work.constraint_values(states, controls))
+        work.plan.states[...], work.plan.controls[...] = states, controls
+        work.memory["plan_cost"] = self.stages.trial(Motion(states, controls))[0]
+        lagrangian = AugmentedLagrangian(self._run)
+        lagrangian.evaluate(*work.plan)
+        with self._budget.joined_with_last(INTERIOR):
+            result = self._newton(lagrangian)
+            for _ in range(UPDATES):
+                if lagrangian.kept or not result.success:
+                    break
+                lagrangian.update(growth=1.0)
+                result = self._newton(lagrangian)
+        detail = ""
+        if self._run.settings.elastic is not None and result.violation > 0:
+            detail = f"elastic: {lagrangian.worst()}"
+        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
+        if result.success and lagrangian.kept:
+            return result
+        self.without_multipliers()
+        return replace(result, status=Status.MAX_ITERATIONS)
+
+    def _at_limits(self, found: Found) -> tuple[Array, Array]:
+        """Controls and gains of a converged plan, where controls that press against a limit are at it."""
+        controls, gain = found.plan.controls.copy(), found.gain.copy()
+        for side, sign in ((self.stages.low, -1.0), (self.stages.high, 1.0)):
+            room = np.abs(side - controls) / found.sizes.controls
+            force = sign * found.pressing * found.sizes.controls / found.scale
+            there = (room < AT_LIMIT) & (force > room)
+            controls = np.where(there, side, controls)
+            gain[there] = 0.0
+        return controls, gain
+
+    def _take_multipliers(self, found: Found, values: list[Array]) -> None:
+        """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
+        each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
+        for k, (own, known, numbers) in enumerate(each):
+            size = found.sizes.rows[self.stages.owners == k]
+            own.penalty = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
+            presses = known > own.penalty * (numbers - own.margin)  # others are left over from the barrier
+            acts = np.isfinite(numbers) & (own.term.equality | presses)
+            own.values[...] = np.where(acts, force, 0.0).ravel()
+
+    def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:
+        """Run Newton's method from the plan in memory, with these multipliers."""
+        result = self._run.newton(added=lagrangian.added())
+        lagrangian.evaluate(result.states, result.controls)
+        return result
+
+    def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
+        """The multipliers; zero for rows whose margin is larger than their force, which is only left by the barrier."""
+        values = self._run.work.constraint_values(result.states, result.controls)
+        multipliers = []
+        for k, one in enumerate(lagrangian.multipliers()):
+            size = found.sizes.rows[self.stages.owners == k]
+            idle = one.values * size / found.scale < values[k] / size
+            idle &= not self._problem.constraint_terms[k].equality
+            multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
+        return tuple(multipliers)
+
+
+def copied(plan: RunResult | Trajectory | Motion) -> Motion:
+    """A copy of the states and controls of a plan."""
+    return Motion(plan.states.copy(), plan.controls.copy())
