@@ -328,7 +328,7 @@ def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 @needs_browser
 def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Path) -> None:
     """What a page gets is the run to the last bit, and what it draws moves."""
-    with browsing.browser(f"http://127.0.0.1:{served}/", tmp_path / "profile", size=(500, 400)) as page:
+    with browsing.browser(f"http://127.0.0.1:{served}/", tmp_path / "profile", size=(250, 200)) as page:
         # A page whose scene has just come may still be laying it out; from some picture on, only what moves changes.
         changes = (changed(*pair) for pair in itertools.pairwise(page.pictures()))
         assert any(20 < of.sum() < 0.2 * of.size for of in changes)  # the robot, its trace and the words, and no more
