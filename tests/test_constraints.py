@@ -1,7 +1,9 @@
 """Constraints: against SciPy's SLSQP, and the conditions of first order, worked out from a motion of its own."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from point_mass import DT, ONE, RADIUS, Effort, Oracle, balls, check, problem
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Iteration, Status
+from lqrsim.solvers import budget
 
 # As much is left to spare as the constraints are solved for to, and what that costs is no more than 1e-3 of all.
 TIGHT: dict[str, Any] = {"tolerance": 1e-7, "gap_tolerance": 1e-4, "constraint_tolerance": 1e-5}
@@ -153,6 +156,29 @@ class TestInfeasibleByTheMultipliersAlone:
         alone = ls.smooth(case, finish=None, start=(0.1, 0.1))
         assert alone.status is Status.STALLED
         assert alone.violation == pytest.approx(solution.violation, rel=0.05)
+
+
+@pytest.mark.parametrize("share", [1.2, 4.0])
+@pytest.mark.parametrize("until", ["the first start", "another"])
+def test_out_of_time_nothing_is_called_infeasible(share: float, until: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """INFEASIBLE needs the other starts, too: a clock that jumps while one of them is tried leaves none."""
+    case = car((share * 2.0 * 0.6, 0.1), 1.0, seconds=0.6, steps=10)
+    whole = ls.smooth(case)
+    assert whole.status is Status.INFEASIBLE
+    assert len(whole.candidates) > 2
+    heard, late, clock = 0, 0.0, time.perf_counter
+    last = whole.candidates[0].iterations + (until == "another")
+
+    def hear(_: Iteration) -> None:
+        nonlocal heard, late
+        heard += 1
+        late = 1e6 if heard >= last else 0.0
+
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: clock() + late))
+    solution = ls.smooth(case, time_limit=1e5, callback=hear)
+    assert solution.status is Status.TIME_LIMIT, solution.summary()
+    assert "is missed by" in solution.detail
+    assert solution.violation >= (share - 1) * 2.0 * 0.6
 
 
 class TestTolerance:

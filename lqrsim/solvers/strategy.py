@@ -114,6 +114,9 @@ def solve(
             if not search.best[1].success and not stop.due:
                 search.keep_modes()
     chosen, found = search.best
+    if found.status is Status.INFEASIBLE and stop.due and settings.safeguard:
+        untried = "no time was left for other starts, which may keep the constraints"
+        found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
     solution = assemble(
