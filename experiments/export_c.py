@@ -97,8 +97,9 @@ class CompiledLaw(ls.Controller):
     def __call__(self, measured: Array | None, t: float) -> Array:
         """The commands (m,). Raises ValueError where C refuses."""
         shown = None if measured is None else np.ascontiguousarray(measured, dtype=self._real)
-        command = np.empty(len(self.policy.control_coordinates), dtype=self._real)
+        command = np.full(len(self.policy.control_coordinates), np.nan, dtype=self._real)
         if self._library.policy_step(None if shown is None else shown.ctypes.data, t, command.ctypes.data):
+            assert np.isnan(command).all(), "refused, but changed the command"
             raise ValueError("refused")
         return command.astype(np.float64)
 

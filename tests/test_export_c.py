@@ -1,5 +1,6 @@
 """Policies as C: commands as in Python, within bounds that follow from the rounding of each operation."""
 
+import ctypes
 import itertools
 import json
 import re
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_c import VARIANTS, WARNINGS, CompiledLaw, difference
+from export_c import QEMU, VARIANTS, WARNINGS, CompiledLaw, difference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -281,6 +282,63 @@ def test_what_python_refuses_is_refused_and_changes_nothing(
     if kind == "feedback":
         with pytest.raises(ValueError, match="refused"):
             law(None, 0.0)
+        return
+    shutil.copy(tmp_path / "policy.so", tmp_path / "not_begun.so")  # with variables of its own
+    other, commands = ctypes.CDLL(str(tmp_path / "not_begun.so")), np.full(2, np.nan)
+    other.policy_step.argtypes = [ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p]
+    assert other.policy_step(None, 0.0, commands.ctypes.data) == 1
+    assert np.isnan(commands).all()
+    other.policy_init()
+    assert other.policy_step(None, 0.0, commands.ctypes.data) == 0
+
+
+@needs_compiler
+@settings(max_examples=10)
+@given(drawn=affine_policies() | filters(), size=st.floats(20.0, 38.5))
+def test_numbers_that_overflow_are_refused_and_change_nothing(
+    drawn: tuple[Case, ls.AffinePolicy | ls.types.OutputFeedbackPolicy],
+    size: float,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Finite floats of up to 10**38.5, as of a broken packet: a command within its limits, or none."""
+    case, policy = drawn
+    law = CompiledLaw(policy, tmp_path_factory.mktemp("c"), number="float", gains=case.gains)
+    filters = isinstance(policy, ls.types.OutputFeedbackPolicy)
+    space = policy.measured_coordinates if filters else policy.state_coordinates
+    controls = policy.control_coordinates
+
+    def estimate() -> Array:
+        z = np.zeros(policy.nominal.shape[1] if filters else 0, dtype=np.float32)
+        law.swap(z)
+        found = z.copy()
+        law.swap(z)
+        return found
+
+    for step in range(20):
+        before = estimate()
+        largest = np.minimum(10.0 ** (size - case.rng.uniform(0, 3, len(space))), 3.4e38)
+        try:
+            command = law(largest * case.rng.choice([-1.0, 1.0], len(space)), step * policy.dt)
+        except ValueError:
+            assert (estimate() == before).all()
+        else:
+            assert np.isfinite([*command, *estimate()]).all()
+            assert ((command >= controls.low) & (command <= controls.high)).all()
+
+
+@needs_compiler
+def test_a_difference_of_infinities_is_no_command(tmp_path: Path) -> None:
+    """10 * 3e38 - 10 * 3e38 in float, which comparisons with the limits let through."""
+    names = ls.types.Coordinates(names=("a", "b"), units=("m", "m"))
+    controls = ls.types.Coordinates(names=("u",), units=("N",), low=(-1.0,), high=(1.0,))
+    policy = ls.AffinePolicy(
+        gain=np.full((2, 1, 2), 10.0), offset=np.zeros((2, 1)), nominal=np.arange(4.0).reshape(2, 2), dt=0.1,
+        state_coordinates=names, control_coordinates=controls,
+    )  # fmt: skip
+    law = CompiledLaw(policy, tmp_path, number="float")
+    with pytest.raises(ValueError, match="refused"):
+        law(np.array([3e38, -3e38]), 0.0)
+    assert law(np.array([3e30, -3e30]), 0.0) == 0
 
 
 def built(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -305,7 +363,10 @@ def test_the_command_writes_what_its_example_finds_to_be_as_in_python(
     for controls in ("left (m/s)", "right (m/s)"):
         bound = next(line for line in said.splitlines() if controls in line)
         assert bound.strip() in header
-    assert "2: heading (rad), an angle" in header
+    nominal = drive_solution.policy.nominal[0]
+    assert f" *   0: x (m), {nominal[0]:.6g}\n" in header
+    assert f" *   2: heading (rad), an angle, {nominal[2]:.6g}\n" in header
+    assert "The plan lasts 25 s." in header
 
     example = built(tmp_path / "c")
     assert example.returncode == 0
@@ -390,6 +451,12 @@ def test_the_example_on_an_emulated_stm32f405(drive_solution: ls.Solution, tmp_p
     assert "100% tests passed" in said.stdout
     assert said.stdout.endswith(here.stdout)  # of the last command
     assert here.stdout.endswith(": as in Python\n")
+
+    faulty = 'int main(void)\n{\n    __asm volatile("udf #0");\n    return 0;\n}\n'
+    (folder / "main.c").write_text(faulty, encoding="utf-8")
+    subprocess.run(["cmake", "--build", "build-arm"], cwd=tmp_path, capture_output=True, check=True)
+    board = [*QEMU, "-kernel", "build-arm/policy_example"]
+    assert subprocess.run(board, cwd=tmp_path, timeout=60, check=False).returncode == 1  # and does not hang
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,8 @@ def export_c(
     sha, parts = hash_of(policy), kind | (BLENDED if interpolate else HELD)
     parts |= {
         "version": version("lqrsim"), "rounding": _rounding_text(law, tables, number, gains), "sha256": sha,
-        "entries": _entries(measured, law.control_coordinates), "period": repr(law.dt), "T": str(law.steps),
+        "entries": _entries(measured, values.get("expected", law.nominal)[0], law.control_coordinates),
+        "period": repr(law.dt), "horizon": f"{law.steps * law.dt:.6g}", "T": str(law.steps),
         "n": str(len(law.state_coordinates)), "Y": str(len(measured)), "m": str(len(law.control_coordinates)),
         "Z": str(law.nominal.shape[1]), "bytes": str(tables.bytes), "real": number, "tables": tables.text(),
         "nearest": _nearest(law, number), "share": f"{share:g}", "tolerance": _list(map(repr, tolerance.tolist())),
@@ -140,7 +141,8 @@ def export_c(
 # The template of the source, and what the header says.
 FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
 FILTER = {
-    "source": "filter.c", "what": "A filter and the law of its estimates", "or": "",
+    "source": "filter.c", "what": "A filter and the law of its estimates",
+    "or": ", or my_policy_init()\n * has not been called",
     "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period.",
 }  # fmt: skip
 # What feedback.c does between two knots.
@@ -299,13 +301,14 @@ def _comment(text: str) -> str:
     return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)", " ", re.sub(r"[^ -~]|[?\\]", "_", text))
 
 
-def _entries(measured: Coordinates, controls: Coordinates) -> str:
-    """The lines of a comment that name measured numbers and commands, with units and limits."""
-    lines = ["measured:"]
+def _entries(measured: Coordinates, start: Array, controls: Coordinates) -> str:
+    """The lines of a comment that name measured numbers, with their values (Y,) at the start, and commands."""
+    lines = ["measured, with what the plan expects at its start:"]
     turning = dict.fromkeys(measured.angles, ", an angle")
     turning |= {i + j: ", of a rotation vector" for i in measured.rotation_vectors for j in range(3)}
-    lines += [f"  {i}: {label}{turning.get(i, '')}" for i, label in enumerate(measured.labels)]
-    lines.append("command:")
+    for i, (label, value) in enumerate(zip(measured.labels, start.tolist(), strict=True)):
+        lines.append(f"  {i}: {label}{turning.get(i, '')}, {value:.6g}")
+    lines.append("command, with its limits:")
     limits = zip(controls.low, controls.high, strict=True)
     pairs = zip(controls.labels, limits, strict=True)
     lines += [f"  {i}: {label}, {low:g} to {high:g}" for i, (label, (low, high)) in enumerate(pairs)]
@@ -322,8 +325,8 @@ def _rounding_text(law: AffinePolicy | OutputFeedbackPolicy, tables: _Tables, nu
 
 
 # What `rounding` bounds.
-OFF = """Where all states, with those of a filter, are off their nominal ones by one of their unit, rounding the gains
-changes the commands by at most"""
+OFF = """Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
+value by 1 in its unit"""
 
 
 def _bounds(labels: Iterable[str], rounding: Iterable[float]) -> list[str]:

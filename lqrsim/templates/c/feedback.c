@@ -23,7 +23,7 @@ static real law(int k, int i, const real *state)
 
 int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command)
 {
-    real state[MY_POLICY_STATES], near[MY_POLICY_STATES];
+    real state[MY_POLICY_STATES], near[MY_POLICY_STATES], wanted[MY_POLICY_CONTROLS];
 
     if (!measured || !(t >= 0.0) || !isfinite(t))
         return 1;
@@ -40,8 +40,11 @@ int my_policy_step(const my_policy_real *measured, double t, my_policy_real *com
         near[j] = @near@;
     nearest_state(state, near);
     for (int i = 0; i < MY_POLICY_CONTROLS; i++) {
-        const real wanted = @wanted@;
-        command[i] = wanted < lowest[i] ? lowest[i] : wanted > highest[i] ? highest[i] : wanted;
+        wanted[i] = @wanted@;
+        if (!isfinite(wanted[i])) /* the state is so large that a product overflows */
+            return 1;
     }
+    for (int i = 0; i < MY_POLICY_CONTROLS; i++)
+        command[i] = wanted[i] < lowest[i] ? lowest[i] : wanted[i] > highest[i] ? highest[i] : wanted[i];
     return 0;
 }

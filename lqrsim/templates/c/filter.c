@@ -19,22 +19,21 @@ typedef my_policy_real real;
 @tables@
 @nearest@
 static real z[SIZE];
+static int begun;
 
 void my_policy_init(void)
 {
     for (int i = 0; i < SIZE; i++)
         z[i] = NOMINAL(0, i);
+    begun = 1;
 }
 
 int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command)
 {
-    real d[SIZE], near[SIZE], beside[MY_POLICY_CONTROLS];
+    real d[SIZE], near[SIZE], after[SIZE], limited[MY_POLICY_CONTROLS];
 
-    if (!(t >= 0.0) || !isfinite(t))
+    if (!begun || !(t >= 0.0) || !isfinite(t))
         return 1;
-    for (int i = 0; i < SIZE; i++)
-        if (!isfinite(z[i]))
-            return 1;
     for (int i = 0; measured && i < MY_POLICY_MEASURED; i++)
         if (!isfinite(measured[i]))
             return 1;
@@ -69,15 +68,23 @@ int my_policy_step(const my_policy_real *measured, double t, my_policy_real *com
         real wanted = PLANNED(k, i);
         for (int j = 0; j < SIZE; j++)
             wanted += GAIN(k, i, j) * d[j];
-        command[i] = wanted < lowest[i] ? lowest[i] : wanted > highest[i] ? highest[i] : wanted;
-        beside[i] = command[i] - PLANNED(k, i);
+        if (!isfinite(wanted)) /* the measurement is so large that a product overflows */
+            return 1;
+        limited[i] = wanted < lowest[i] ? lowest[i] : wanted > highest[i] ? highest[i] : wanted;
     }
     for (int i = 0; i < SIZE; i++) {
-        z[i] = NEXT(k, i);
+        after[i] = NEXT(k, i);
         for (int j = 0; j < SIZE; j++)
-            z[i] += TRANSITION(k, i, j) * d[j];
+            after[i] += TRANSITION(k, i, j) * d[j];
         for (int j = 0; j < MY_POLICY_CONTROLS; j++)
-            z[i] += INPUT(k, i, j) * beside[j];
+            after[i] += INPUT(k, i, j) * (limited[j] - PLANNED(k, j));
+        if (!isfinite(after[i]))
+            return 1;
     }
+    /* Nothing has changed so far. */
+    for (int i = 0; i < SIZE; i++)
+        z[i] = after[i];
+    for (int i = 0; i < MY_POLICY_CONTROLS; i++)
+        command[i] = limited[i];
     return 0;
 }

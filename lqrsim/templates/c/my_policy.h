@@ -3,9 +3,9 @@
  * Written by lqrsim @version@ from a file whose content has the SHA-256 that is below as MY_POLICY_SHA256.
  * @rounding@
  *
- * Call my_policy_init() once, then my_policy_step() in each control period, @period@ s.
- * Nothing is allocated. The state of the law is static: one robot runs it. Do not compile it with -ffast-math, for it
- * looks for NaN.
+ * Call my_policy_init() at the start, then my_policy_step() in each control period, @period@ s.
+ * The plan lasts @horizon@ s. Nothing is allocated. The state of the law is static: one robot runs it. Do not compile it
+ * with -ffast-math, for it looks for NaN.
  *
 @entries@
  */
@@ -26,7 +26,7 @@ extern "C" {
 
 typedef @real@ my_policy_real;
 
-/* Begin a run. */
+/* Begin a run, the first one or another. */
 void my_policy_init(void);
 
 /* The commands at one time.
@@ -35,8 +35,8 @@ void my_policy_init(void);
  * t: seconds since the start, 0 or more; a double, so that rounding never puts it into another control period.
  * command: MY_POLICY_CONTROLS numbers, within their limits.
  *
- * After the horizon the last law stays in force. Returns 0; or 1, and does nothing, if t is negative or a number is not
- * finite@or@.
+ * After the plan its last law stays in force, about its last state. Returns 0; or 1, and changes nothing, command
+ * included, if t is negative, a number is not finite or so large that the law overflows@or@.
  */
 int my_policy_step(const my_policy_real *measured, double t, my_policy_real *command);
 
