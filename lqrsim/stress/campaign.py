@@ -126,7 +126,11 @@ def run_resolved(
         results.resolved = scenario
         unfinished = _unfinished(results)
         if unfinished:
-            _check_versions(results)
+            if others := changed(results.manifest["versions"]):
+                raise InputError(
+                    f"versions: got {others}, which may change the last bits, want those that {folder} was begun with,"
+                    " or another folder"
+                )
             results.trials.warm_up()  # here first: the workers then find everything compiled
         job = Job.of(results.trials, results.manifest["digest"], batch)
         total = campaign.trials * len(results.cells)
@@ -148,14 +152,6 @@ def run_resolved(
             if (counted := results.tally(cell).total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
-
-
-def _check_versions(results: Results) -> None:
-    if others := changed(results.manifest["versions"]):
-        raise InputError(
-            f"versions: got {others}, which may change the last bits, want those that {results.folder} was begun with,"
-            " or another folder"
-        )
 
 
 def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:

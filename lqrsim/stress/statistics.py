@@ -8,16 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_function,
-    check_number,
-    check_seed,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_number, check_seed, excerpt
 from lqrsim.results.fields import check_fields
 
 CONFIDENCE = 0.95
