@@ -126,8 +126,7 @@ class Problem:
     _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        keep(self, dt=check_number("dt", self.dt, above=0.0))
-        keep(self, steps=check_count("steps", self.steps))
+        keep(self, dt=check_number("dt", self.dt, above=0.0), steps=check_count("steps", self.steps))
         keep(self, begin=check_number("begin", self.begin))
         if not isinstance(self.dynamics, Dynamics):
             raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
@@ -161,8 +160,7 @@ class Problem:
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
             _check_within_reach(limited, controls)
-            keep(self, control_limits=(limited.low, limited.high))
-            keep(self, _controls=(limited, limited.within(controls)))
+            keep(self, control_limits=(limited.low, limited.high), _controls=(limited, limited.within(controls)))
         else:
             keep(self, _controls=(controls, controls))
         self._check_start_clear()

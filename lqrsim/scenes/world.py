@@ -55,8 +55,7 @@ class Obstacle:
         used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2}.get(self.kind, 3)
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
-        keep(self, size=size)
-        keep(self, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
+        keep(self, size=size, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
 
     @classmethod
     def _of_mujoco(
