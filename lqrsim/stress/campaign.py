@@ -142,7 +142,7 @@ def run_resolved(
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = executors.run_here(job, unfinished, results.trials)
+            work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count

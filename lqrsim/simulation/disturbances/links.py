@@ -26,12 +26,17 @@ class Late(Disturbance):
     periods: int
 
     what: ClassVar[str]
+    known_as: ClassVar[str]  # to an Uncertainty
 
     def __post_init__(self) -> None:
         keep(self, periods=check_count(f"{type(self).__name__}: periods", self.periods, at_least=0))
 
     def describe(self, plant: Plant) -> str:
         return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        told: dict[str, Any] = {self.known_as: self.periods}
+        return Uncertainty(**told)
 
     def scaled(self, strength: float) -> Self:
         """The same with `strength` times the periods, rounded to whole ones.
@@ -49,7 +54,7 @@ class ControlDelay(Late):
       periods: the delay in control periods.
     """
 
-    what = "commands"
+    what, known_as = "commands", "delay"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         under_way: list[Array] = []
@@ -62,9 +67,6 @@ class ControlDelay(Late):
 
         return Effect(actuate=actuate)
 
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(delay=self.periods)
-
 
 class MeasurementLatency(Late):
     """Measurements arrive late; until then the first one is repeated.
@@ -73,7 +75,7 @@ class MeasurementLatency(Late):
       periods: the delay in control periods.
     """
 
-    what = "measurements"
+    what, known_as = "measurements", "latency"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         seen: list[Array] = []
@@ -83,9 +85,6 @@ class MeasurementLatency(Late):
             return seen.pop(0) if len(seen) > self.periods else seen[0].copy()
 
         return Effect(measure=measure)
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(latency=self.periods)
 
 
 @dataclass(frozen=True)
