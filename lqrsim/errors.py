@@ -39,6 +39,12 @@ class InputError(ValueError):
         super().__init__(line if len(line) <= LONGEST else f"{line[:700]} ... {line[-300:]}")
 
 
+def keep(record: object, **values: object) -> None:
+    """Set fields of a frozen record to what its `__post_init__` has checked."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
 

@@ -14,7 +14,6 @@ from planar_arm import LENGTH, LINK, PlanarArm, places
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.collision_spheres import clearances
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.solvers import compiled
 
@@ -273,8 +272,8 @@ class TestCapsule:
             state = np.concatenate([rng.uniform(-np.pi, np.pi, 3), np.zeros(3)])
             data.qpos[:] = state[:3]
             mujoco.mj_forward(model, data)
-            at = state[None], np.zeros(1)
-            ours = clearances(ARM.balls, ARM.dynamics, scene.world, *at).reshape(3, LINK.count).min(axis=1)
+            at = ARM.balls.centres(ARM.dynamics, state)
+            ours = (scene.world.distance(at) - ARM.balls.radii).reshape(3, LINK.count).min(axis=1)
             for link, clearance in zip(links, ours, strict=True):
                 theirs = min(
                     mujoco.mj_geomDistance(model, data, link, model.geom(name).id, 5.0, None)
@@ -318,7 +317,7 @@ def with_u(x, u, p):
     [
         (
             lambda: ls.CollisionSpheres(nobody, [0.1, 0.1]).bind(ARM.dynamics),
-            "got 1 points, want 2: one for each of radii",
+            "got 1 points, want 2 points of 3 coordinates, one for each of radii",
         ),
         (lambda: ls.CollisionSpheres(nobody, [-0.1]), "radii: got -0.1 for ball 0, want at least 0"),
         (lambda: ls.CollisionSpheres(nobody, []), "radii: got none"),

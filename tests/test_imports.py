@@ -57,8 +57,8 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics", "linear_quadratic"),
-        ("collision_geoms",),
         ("collision_spheres", "noise"),
+        ("collision_shape",),
         ("costs",),
         ("constraints",),
         ("clearance",),

@@ -29,13 +29,6 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
     return out.reshape(trials, count)
 
 
-def signed_distance_at(world_seen: World, points: Array, times: Array) -> Array:
-    """Distances (K, k) of points (K, k, 2 or 3) to the obstacles at times (K,) in s."""
-    if not world_seen.moving:
-        return signed_distance(world_seen, points)
-    return signed_distance_displaced(world_seen, points, world_seen.displacements(times))
-
-
 def distances_with_normals(world_seen: World, points: npt.ArrayLike) -> tuple[Array, Array]:
     """Distances (K, O) of points (K, 2 or 3) to each obstacle, and their gradients (K, O, 2 or 3)."""
     points = np.asarray(points, dtype=np.float64)

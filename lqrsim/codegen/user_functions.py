@@ -27,7 +27,7 @@ from lqrsim.codegen.compiled_module import compilations, compiling
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
-from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
 from lqrsim.machine import instruction_set
 from lqrsim.results.archive import sha256
 
@@ -400,13 +400,24 @@ class Term:
         return len(self.functions) + len(self.data)
 
     def __post_init__(self) -> None:
-        self._keep("data", check_array(f"{type(self).__name__}: data", self.data, (None,), infinite=True))
+        keep(self, data=check_array(f"{type(self).__name__}: data", self.data, (None,), infinite=True))
         _ = self.code
         wanted = "a tuple of UserFunction, as FunctionCost makes them"
-        self._keep("functions", check_items(f"{type(self).__name__}: functions", self.functions, UserFunction, wanted))
+        keep(self, functions=check_items(f"{type(self).__name__}: functions", self.functions, UserFunction, wanted))
 
-    def _keep(self, field: str, value: object) -> None:
-        object.__setattr__(self, field, value)
+
+def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[list[Any]]:
+    """This number of rows that a user's function returned, in lists or arrays. Raises InputError for anything else."""
+    if returned is None:
+        raise InputError(f"got None, want {wanted}: is a return missing?")
+    listed = returned.tolist() if hasattr(returned, "tolist") else returned
+    try:
+        rows = [row.tolist() if hasattr(row, "tolist") else list(row) for row in listed]
+    except TypeError:
+        raise InputError(f"got {excerpt(returned)}, want {wanted}") from None
+    if len(rows) != count:
+        raise InputError(f"got {len(rows)} {what}, want {wanted}")
+    return rows
 
 
 def numbers_of(term: Term) -> Array:

@@ -26,6 +26,7 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_number,
+    keep,
 )
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
@@ -73,11 +74,10 @@ class SafePlan:
             check_kind(f"SafePlan: {name}", getattr(self, name), kind, f"a {kind.__name__}")
         kinds = (OffsetFree, AffinePolicy)
         check_kind("SafePlan: controller", self.controller, kinds, "an OffsetFree or an AffinePolicy")
-        object.__setattr__(self, "asked", check_number("SafePlan: asked", self.asked, above=0.0, below=1.0))
+        keep(self, asked=check_number("SafePlan: asked", self.asked, above=0.0, below=1.0))
         rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
-        each = tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds)
-        object.__setattr__(self, "rounds", each)
-        object.__setattr__(self, "weight", check_number("SafePlan: weight", self.weight, above=0.0))
+        keep(self, rounds=tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds))
+        keep(self, weight=check_number("SafePlan: weight", self.weight, above=0.0))
         check_kind("SafePlan: instead", self.instead, Mapping, "a dictionary of chances")
 
     @property
@@ -138,7 +138,7 @@ def smooth_chance_constrained(
     check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    if not surroundings.worlds:
+    if not surroundings.kept:
         raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
     search = _Search(problem, uncertainty, chance, controller, surroundings)
     most = rounds + (len(HEAVIER) if problem.obstacle_costs else 0)

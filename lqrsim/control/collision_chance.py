@@ -12,14 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, owens_t
 
-from lqrsim.codegen.distances import distances_with_normals, signed_distance_displaced
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate, evaluate_slopes
-from lqrsim.problem.costs import ObstacleCost
-from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.collision_shape import KeepsClear, ShapeInWorld, each_once
 from lqrsim.problem.problem import Problem
-from lqrsim.scenes.world import World
 
 FAR = 12.0  # standard deviations of clearance, with which the chance of a collision is below 1e-32
 
@@ -41,17 +37,14 @@ class Surroundings:
     """Obstacles of a problem, as its robot sees them.
 
     Attributes:
-      dynamics: dynamics of the problem.
-      worlds: each world with the costs and constraints that keep the robot away from it, each kind once.
-      seen: the worlds as the robot sees them. places: for those that are kept from balls, the places of the balls.
-      place: the states that are its position. position: the same, or, with balls, all states that move it.
+      kept: the costs and constraints that keep the robot away from obstacles, each kind once.
+      shapes: for each of these the robot among its obstacles.
+      place: the states that are its position. position: the same, or, with balls or geoms, all states that move it.
       std: standard deviation of an obstacle's position, in m.
     """
 
-    dynamics: Dynamics
-    worlds: tuple[ObstacleCost | Clearance, ...]
-    seen: tuple[World, ...]
-    places: tuple[SphereCenters | None, ...]
+    kept: tuple[KeepsClear, ...]
+    shapes: tuple[ShapeInWorld, ...]
     place: tuple[int, ...]
     position: tuple[int, ...]
     std: float
@@ -59,105 +52,54 @@ class Surroundings:
     @classmethod
     def of(cls, problem: Problem, std: float) -> "Surroundings":
         """The obstacles of the problem's costs and constraints, each world once."""
-        space, worlds = problem.dynamics.state_coordinates, []
-        clearances = [one for one in problem.constraints if isinstance(one, Clearance)]
-        for one in (*problem.obstacle_costs, *clearances):
-            kind = id(one.world), one.radius, id(one.balls), id(one.geoms)
-            if not any(kind == (id(other.world), other.radius, id(other.balls), id(other.geoms)) for other in worlds):
-                worlds.append(one)
-        if any(one.moving for one in worlds):
+        kept, place = each_once(problem.kept_clear), problem.dynamics.state_coordinates.position
+        if any(one.moving for one in kept):
             raise InputError(
                 "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
             )
-        bound = [
-            (None, one.world)
-            if one.geoms is not None
-            else bind_outline("problem", one.balls, problem.dynamics, one.world)
-            for one in worlds
-        ]
-        found = [(one, places, seen) for one, (places, seen) in zip(worlds, bound, strict=True) if len(seen)]
-        moving = space.position
-        if any(places is not None or one.geoms is not None for one, places, _ in found):
-            own = [
-                tuple(range(one.geoms.bind(problem.dynamics, one.world, 0.0).moved))
-                if one.geoms is not None
-                else places.depends_on
-                if places is not None
-                else space.position
-                for one, places, _ in found
-            ]
-            moving = tuple(sorted({i for indices in own for i in indices}))
-        kept, of_balls, seen = (tuple(part) for part in zip(*found, strict=True)) if found else ((), (), ())
-        return cls(problem.dynamics, kept, seen, of_balls, space.position, moving, std)
+        found = [(one, shape) for one in kept if len((shape := one.in_world(problem.dynamics)).world)]
+        shapes = tuple(shape for _, shape in found)
+        moved_by = [shape.moved_by for shape in shapes]
+        position = place if set(moved_by) <= {place} else tuple(sorted({i for own in moved_by for i in own}))
+        return cls(tuple(one for one, _ in found), shapes, place, position, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""
-        kept, first = [], 0
-        for one, seen in zip(self.worlds, self.seen, strict=True):
-            own = margin[:, first : first + len(seen)]
-            radius = one.radius if one.balls is None and one.geoms is None else None
-            kept.append(Clearance(one.world, radius=radius, balls=one.balls, geoms=one.geoms, margin=own))
-            first += len(seen)
-        return kept
+        ends = np.cumsum([len(shape.world) for shape in self.shapes])[:-1]
+        pairs = zip(self.kept, np.split(margin, ends, axis=1), strict=True)
+        return [Clearance(one.world, **one.shape, margin=own) for one, own in pairs]
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
         """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p), and its variance (O,).
 
         With balls it is the clearance of the ball nearest to the obstacle.
         """
-        if not self.worlds:
+        if not self.shapes:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
-        pairs = zip(self.worlds, self.seen, self.places, strict=True)
-        parts = [self._of_one(one, seen, places, states) for one, seen, places in pairs]
-        fixed = [[one.kind == "plane" for one in seen.obstacles] for seen in self.seen]
+        parts = [shape.with_slopes(states, self.position) for shape in self.shapes]
+        fixed = [one.kind == "plane" for shape in self.shapes for one in shape.world.obstacles]
         return (
             np.concatenate([clearance for clearance, _ in parts], axis=1),
             np.concatenate([normals for _, normals in parts], axis=1),
-            np.where(np.concatenate(fixed), 0.0, self.std**2),
+            np.where(fixed, 0.0, self.std**2),
         )
-
-    def _of_one(
-        self, one: ObstacleCost | Clearance, seen: World, places: SphereCenters | None, states: Array
-    ) -> tuple[Array, Array]:
-        if one.geoms is not None:
-            distances, slopes = one.geoms.slopes(self.dynamics, one.world, states)
-            return distances, slopes[..., list(self.position)]
-        if one.balls is None or places is None:
-            distances, across = distances_with_normals(seen, states[:, list(self.place)])
-            normals = np.zeros((*distances.shape, len(self.position)))
-            normals[..., [self.position.index(i) for i in self.place]] = across
-            return distances - one.radius, normals
-        count, knots = len(one.balls), np.arange(len(states))[:, None]
-        middles, slopes = evaluate_slopes(places, count, states)
-        distances, normals = distances_with_normals(seen, middles.reshape(-1, 3))
-        clearance = distances.reshape(len(states), count, -1) - one.balls.radii[:, None]
-        nearest, obstacle = clearance.argmin(axis=1), np.arange(len(seen))
-        normals = normals.reshape(len(states), count, -1, 3)[knots, nearest, obstacle]
-        moves = slopes[knots, nearest][..., list(self.position)]
-        return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
 
     @property
     def by_mujoco(self) -> bool:
         """Whether distances are those of MuJoCo's geoms."""
-        return any(one.geoms is not None for one in self.worlds)
+        return any("geoms" in one.shape for one in self.kept)
 
     def displacements(self, rng: np.random.Generator, trials: int) -> list[Array]:
         """By how much the obstacles of each world are off in K trials, (K, O, 3), in their plane; planes stay."""
-        axes = np.arange(3) < (len(self.place) or 3)
-        std = [np.array([self.std * axes * (one.kind != "plane") for one in seen.obstacles]) for seen in self.seen]
+        axes, worlds = np.arange(3) < (len(self.place) or 3), [shape.world.obstacles for shape in self.shapes]
+        std = [np.array([self.std * axes * (one.kind != "plane") for one in world]) for world in worlds]
         return [own * rng.standard_normal((trials, *own.shape)) for own in std]
 
     def nearest(self, states: Array, displaced: list[Array]) -> Array:
         """Clearance of states (K, n) to the nearest obstacle, (K,), the obstacles of each world displaced (K, O, 3)."""
-        nearest = np.full(len(states), np.inf)
-        for one, seen, places, away in zip(self.worlds, self.seen, self.places, displaced, strict=True):
-            if one.balls is None or places is None:
-                points, radii = states[:, None, list(self.place)], one.radius
-            else:
-                points, radii = evaluate(places, len(one.balls), states), one.balls.radii
-            clearance = signed_distance_displaced(seen, points, away) - radii
-            nearest = np.minimum(nearest, clearance.min(axis=1))
-        return nearest
+        pairs = zip(self.shapes, displaced, strict=True)
+        found = [shape.clearance(shape.places(states), away) for shape, away in pairs]
+        return np.min(found, axis=0, initial=np.inf) if found else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
         """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""
@@ -177,7 +119,7 @@ def collision_chance(
     Args:
       states: means, (T+1, n). covariance: (T+1, n, n). across: of each state with the one before it, (T, n, n).
     """
-    if not surroundings.worlds:
+    if not surroundings.kept:
         return np.zeros(len(states)), 0.0
     clearance, std, correlation = surroundings.spread(states, covariance, across)
     return chance_of_clearances(clearance / std, correlation)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller
 from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
@@ -15,7 +14,7 @@ from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
-from lqrsim.control.tracking import Prediction, choose_tolerances, reach_of, unit_means, with_filter
+from lqrsim.control.tracking import StateMoments, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import Uncertainty, check_seconds, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind
@@ -135,15 +134,12 @@ class OffsetFree(Controller):
         """The weights of the given tolerances, or of chosen ones."""
         if tolerate is not None:
             return Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
-        controls = self.solution.policy.control_coordinates
-        low, high = np.array(controls.low), np.array(controls.high)
-        surroundings = Surroundings.of(self.problem, self.uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> list[Prediction]:
-            radius = self.solution.goal_radius
-            return with_filter(self.model, self.filter, tried, (low, high), surroundings, radius)
+        def moments(tried: Weights, limits: tuple[Array, Array]) -> StateMoments:
+            return with_filter(self.model, self.filter, tried, limits)
 
-        return choose_tolerances(self.model, predicted, effort, at_end).weights
+        told = self.problem, self.solution, self.uncertainty
+        return choose_tolerances(*told, self.model, effort, at_end, moments)
 
     def start(self, trials: int) -> "FilterRun | ReplannedRun":
         records = empty_records(self._law, trials) if self.record else None

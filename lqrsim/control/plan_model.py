@@ -327,44 +327,48 @@ class PlanModel:
         """Effect of the unknowns' states on the next state, (T, n, D)."""
         return self.effects @ self.output
 
-    @cached_property
+    @property
     def F(self) -> Array:
         """State matrices F_t, (T, Z, Z)."""
-        return self._F(self.lag)
+        return self._mean_step.F
 
-    @cached_property
+    @property
     def G(self) -> Array:
         """Input matrices G_t, (T, Z, m)."""
-        return self._G(self.lag)
+        return self._mean_step.G
 
-    @cached_property
+    @property
     def c(self) -> Array:
         """Drift c_t, (T, Z)."""
-        return self._c(self.lag)
+        return self._mean_step.c
+
+    @cached_property
+    def _mean_step(self) -> Step:
+        return self._step(1.0, self.lag)
 
     @cached_property
     def steps_of_commands(self) -> list[Step]:
         """The model for a command that arrives; and for one that is lost, if any are."""
         lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
         kinds = [(1 - lost, arrived), (lost, Lag(1.0, 1.0))] if lost else [(1.0, arrived)]
-        return [Step(share, self._F(lag), self._G(lag), self._c(lag)) for share, lag in kinds]
+        return [self._step(share, lag) for share, lag in kinds]
 
-    def _F(self, lag: Lag) -> Array:
-        n, a = self.n, self.lagging
-        F = np.zeros((self.plan.steps, self.size, self.size))
+    def _step(self, share: float, lag: Lag) -> Step:
+        n, a, steps = self.n, self.lagging, self.plan.steps
+        F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
         F[:, :n, :n] = self.jacobian[:, :, :n]
         F[:, :n, n : n + a] = lag.mean * self.jacobian[:, :, n : n + a]
         F[:, :n, n + a :] = self.E
         F[:, n : n + a, n : n + a] = lag.left * np.eye(a)
         F[:, n + a :, n + a :] = self.transition
-        return F
-
-    def _G(self, lag: Lag) -> Array:
-        n, a = self.n, self.lagging
-        G = np.zeros((self.plan.steps, self.size, self.m))
         G[:, :n] = (1 - lag.mean) * self.jacobian[:, :, n:]
         G[:, n : n + a] = (1 - lag.left) * np.eye(self.m)[:a]
-        return G
+        c = np.zeros((steps, self.size))
+        if a:
+            behind = self.reached[:-1] - self.plan.controls
+            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
+            c[:, n : n + a] = (lag.left - self.lag.left) * behind
+        return Step(share, F, G, c)
 
     @cached_property
     def reached(self) -> Array:
@@ -375,15 +379,6 @@ class PlanModel:
         for t in range(plan.steps if a else 0):
             reached[t + 1] = plan.controls[t] + self.lag.left * (reached[t] - plan.controls[t])
         return reached
-
-    def _c(self, lag: Lag) -> Array:
-        n, a = self.n, self.lagging
-        c = np.zeros((self.plan.steps, self.size))
-        if a:
-            behind = self.reached[:-1] - self.plan.controls
-            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
-            c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return c
 
     @cached_property
     def H(self) -> Array:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
@@ -88,7 +89,7 @@ class ReplannedRun(ControllerRun):
         """Replace the law of a trial by one about a new plan, if needed and found."""
         law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
-        granted = np.where(np.logical_and(in_parameters(model), constants(model)), z[n + model.lagging :], 0.0)
+        granted = np.where(_constant_parameters(model), z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
         values = {
             name: float(model.dynamics.parameters[name] + change)
@@ -120,16 +121,10 @@ class ReplannedRun(ControllerRun):
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 
-def constants(model: PlanModel) -> Array:
-    """Whether each of the unknowns' states is constant, (D,): they keep their value to the end of the horizon."""
-    found = np.zeros(len(model.transition), dtype=bool)
-    for one, own in zip(model.remembered, model.own_states, strict=True):
-        found[list(own)] = one.constant
-    return found
-
-
-def in_parameters(model: PlanModel) -> Array:
-    """Whether each of the unknowns' states changes only parameters of the dynamics, (D,)."""
-    moved = (model.output != 0).any(axis=0)
+def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:
+    """Which of the unknowns' states are constant, to the end of the horizon, and change only parameters, (D,)."""
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
-    return moved & ~beyond
+    found = (model.output != 0).any(axis=0) & ~beyond
+    for one, own in zip(model.remembered, model.own_states, strict=True):
+        found[list(own)] &= one.constant
+    return found

@@ -11,6 +11,7 @@ The linear model is wrong where controls are often at their limits, so saturatio
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -36,6 +37,20 @@ NARROW = 0.02
 FRAGILE = 3.0
 
 
+class StateMoments(NamedTuple):
+    """Moments of the states' deviations from the plan under C laws, as in `collision_chance`.
+
+    Attributes:
+      mean: (C, T+1, n). covariance: (C, T+1, n, n). across: (C, T, n, n).
+      saturation: share of the commands beyond the limits, (C,).
+    """
+
+    mean: Array
+    covariance: Array
+    across: Array
+    saturation: Array
+
+
 @dataclass(frozen=True)
 class Prediction:
     """Prediction for a law: chance of failure, mean width of the tube, share of commands beyond the limits."""
@@ -45,39 +60,30 @@ class Prediction:
     saturation: float
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Tolerances, as the weights of a law, and the prediction for it."""
-
-    weights: Weights
-    predicted: Prediction
-
-
 def choose_tolerances(
-    model: PlanModel, predicted: Callable[[Weights], list[Prediction]], effort: Array, at_end: float
-) -> Choice:
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
+    moments: Callable[[Weights, tuple[Array, Array]], StateMoments],
+) -> Weights:  # fmt: skip
     """Choose the tolerances whose law is predicted to fail least often.
 
     Args:
-      predicted: predicts the results of the laws of C weights.
       effort: the most that may be added to each control, (m,).
       at_end: as in `track`.
+      moments: predicts the moments under the laws of C weights and the limits of the controls.
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
     reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
     tried = [unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest]
     each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
     all_weights = Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
-    found = [Choice(*one) for one in zip(each, predicted(all_weights), strict=True)]
+    surroundings, space = Surroundings.of(problem, uncertainty.obstacles), solution.policy.control_coordinates
+    found = zip(*moments(all_weights, (np.array(space.low), np.array(space.high))), strict=True)
+    told = [prediction_of(model, *one, surroundings, solution.goal_radius) for one in found]
     # A thousandth of the plan's extent is narrow enough.
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
-    narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
-
-    def worth(one: Choice) -> float:
-        told = one.predicted
-        return told.chance + FRAGILE * told.saturation**2 + NARROW * max(told.width / narrowest, 1.0)
-
-    return min(reversed(found), key=worth)  # of equals the gentlest
+    narrowest = max(min(one.width for one in told), 1e-3 * extent)
+    worth = [one.chance + FRAGILE * one.saturation**2 + NARROW * max(one.width / narrowest, 1.0) for one in told]
+    return each[min(reversed(range(len(each))), key=worth.__getitem__)]  # of equals the gentlest
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
@@ -103,7 +109,7 @@ def prediction_of(
     model: PlanModel, mean: Array, covariance: Array, across: Array, saturation: float, surroundings: Surroundings,
     radius: float | None,
 ) -> Prediction:  # fmt: skip
-    """The prediction for moments of the states' deviations, as in `collision_chance`.
+    """The prediction for a law's moments.
 
     Args:
       radius: radius of the goal, in metres; None without one.
@@ -118,14 +124,11 @@ def prediction_of(
             widest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[-1][place][:, place])[-1], 0.0)))
             miss = 2 * float(ndtr(-radius / max(widest, 1e-12)))
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, place or list(range(plan.shape[1]))] / scale**2
-    return Prediction(collide + miss, float(np.sqrt(variances.sum(axis=1).mean())), saturation)
+    return Prediction(collide + miss, float(np.sqrt(variances.sum(axis=1).mean())), float(saturation))
 
 
-def with_filter(
-    model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array], surroundings: Surroundings,
-    radius: float | None,
-) -> list[Prediction]:  # fmt: skip
-    """Predictions for the laws of C weights that follow a filter's estimates.
+def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array]) -> StateMoments:
+    """Moments under the laws of C weights that follow a filter's estimates.
 
     The filter is assumed to be right about the noise. Then its error is independent of its estimate, and there is less
     to compute than in `linear_loop.py`.
@@ -160,18 +163,11 @@ def with_filter(
         estimate[:, :own, :own] += (G * left[:, None, :]) @ G.T
         mean = mean @ F.T + model.c[t]
         mean[:, :own] += (level - planned) @ G.T
-    saturation = beyond.mean(axis=1).tolist()
-    return [
-        prediction_of(model, means[i], covariance[i], across[i], saturation[i], surroundings, radius)
-        for i in range(count)
-    ]
+    return StateMoments(means, covariance, across, beyond.mean(axis=1))
 
 
-def of_states(
-    model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array], surroundings: Surroundings,
-    radius: float | None,
-) -> list[Prediction]:  # fmt: skip
-    """Predictions for C laws of the states that are shown, (C, T, m, n) and (C, T, m), in deviations from the plan.
+def of_states(model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array]) -> StateMoments:
+    """Moments under C laws of the states that are shown, (C, T, m, n) and (C, T, m), in deviations from the plan.
 
     The moments are those of `linear_loop.py`. No law moves the unknowns: their rows are the same for all, and of the
     covariance's next one only the rows for the state and the actuators are computed.
@@ -215,10 +211,7 @@ def of_states(
         unknowns = transition @ unknowns @ transition.T + noise[own:, own:]
         covariance[:, :own, :own], covariance[:, :own, own:] = own_next + noise[:own, :own], meet
         covariance[:, own:, :own], covariance[:, own:, own:] = meet.swapaxes(1, 2), unknowns
-    saturation = beyond.mean(axis=1).tolist()
-    return [
-        prediction_of(model, means[i], states[i], across[i], saturation[i], surroundings, radius) for i in range(count)
-    ]
+    return StateMoments(means, states, across, beyond.mean(axis=1))
 
 
 def track(
@@ -277,15 +270,12 @@ def track(
         )
     else:
         truth = PlanModel.of(dynamics, plan, uncertainty)
-        space = solution.policy.control_coordinates
-        limits = np.array(space.low), np.array(space.high)
-        surroundings = Surroundings.of(problem, uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> list[Prediction]:
+        def moments(tried: Weights, limits: tuple[Array, Array]) -> StateMoments:
             gain, offset = tracking_laws(model, tried)
-            return of_states(truth, gain[..., : model.n], offset, limits, surroundings, solution.goal_radius)
+            return of_states(truth, gain[..., : model.n], offset, limits)
 
-        weights = choose_tolerances(model, predicted, efforts, at_end).weights
+        weights = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments)
     gain, offset = _laws(problem, solution, model, weights, risk)
     gain = gain[..., : model.n]  # what a lost command leaves in force is nothing to a command that arrives
     return AffinePolicy(

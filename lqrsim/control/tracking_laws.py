@@ -157,5 +157,5 @@ def check_plan(who: str, problem: Problem, solution: Solution) -> None:
         raise InputError(
             f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"
         )
-    if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
+    if not plan.finite:
         raise InputError(f"{who}: solution: got a plan that is not finite ({solution.status.name}), want one that is")

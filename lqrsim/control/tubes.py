@@ -7,6 +7,7 @@ these moments as far as trials of the nonlinear model do not refute it; `sampled
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
@@ -18,9 +19,10 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, shaped
+from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import SHARE, check_fields
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -59,34 +61,21 @@ class Tube:
     """
 
     plan: Trajectory
-    state_coordinates: Coordinates
-    mean: Array
-    covariance: Array
-    across: Array
-    estimate_covariance: Array | None
-    command: Array
-    saturation: Array
-    step_chance: Array
-    linear_chance: float
-    collision_chance: float
+    state_coordinates: Annotated[Coordinates, "n"]
+    mean: Annotated[Array, "T+1 n"]
+    covariance: Annotated[Array, "T+1 n n"]
+    across: Annotated[Array, "T n n"]
+    estimate_covariance: Annotated[Array, "T+1 n n"] | None
+    command: Annotated[Array, "T m"]
+    saturation: Annotated[Array, "T m"]
+    step_chance: Annotated[Array, "T+1"]
+    linear_chance: Annotated[float, SHARE]
+    collision_chance: Annotated[float, SHARE]
     samples: int = 0
-    strays: float = 0.0
+    strays: Annotated[float, SHARE] = 0.0
 
     def __post_init__(self) -> None:
-        plan = check_kind("Tube: plan", self.plan, Trajectory, "a Trajectory")
-        check_kind("Tube: state_coordinates", self.state_coordinates, Coordinates, "Coordinates")
-        n, m, knots = len(self.state_coordinates), plan.controls.shape[-1], len(plan.states)
-        shapes: dict[str, tuple[int, ...]] = {
-            "mean": (knots, n), "covariance": (knots, n, n), "estimate_covariance": (knots, n, n),
-            "command": (knots - 1, m), "saturation": (knots - 1, m), "step_chance": (knots,),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            if name != "estimate_covariance" or self.estimate_covariance is not None:
-                object.__setattr__(self, name, shaped(f"Tube: {name}", getattr(self, name), shape))
-        for name in ("linear_chance", "collision_chance", "strays"):
-            share = check_number(f"Tube: {name}", getattr(self, name), at_least=0.0, at_most=1.0)
-            object.__setattr__(self, name, share)
-        object.__setattr__(self, "samples", check_count("Tube: samples", self.samples, at_least=0))
+        check_fields(self)
 
     @cached_property
     def position_covariance(self) -> Array:
@@ -157,15 +146,14 @@ def predict_tube(
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         space = policy.control_coordinates
-        loop, law = (
-            LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high)),
-            Feedback(policy),
-        )
+        loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
+        law = Feedback(policy)
     surroundings, told = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
     late = [f"{field} of {getattr(told, field)}" for field in ("latency", "delay") if getattr(told, field)]
     if samples is None:
         slow = problem.dynamics.discrete or problem.dynamics.level == "plain" or surroundings.by_mujoco
-        samples = 0 if slow or not (surroundings.worlds or late) else _affordable(loop.model)
+        affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
+        samples = 0 if slow or not (surroundings.kept or late) else affordable
     if samples and surroundings.by_mujoco:
         raise InputError(f"predict_tube: samples: got {samples} and distances by MuJoCo, want 0")
     if late and not samples:
@@ -175,10 +163,6 @@ def predict_tube(
         )
     trials = sample_loop(loop.model, law, (loop.low, loop.high), surroundings, samples, seed) if samples else None
     return _tube(loop, None if late else loop.moments(), trials, surroundings)
-
-
-def _affordable(model: PlanModel) -> int:
-    return min(max(NUMBERS // (model.plan.steps * model.size), FEWEST), MOST)
 
 
 def _tube(

@@ -21,6 +21,7 @@ from lqrsim.errors import (
     check_number,
     check_text,
     excerpt,
+    keep,
     real,
 )
 from lqrsim.problem.dynamics import Dynamics
@@ -64,10 +65,9 @@ class Unknown:
         for name, share in shares.items():
             check_text("Unknown: of", name, "the name of a parameter")
             check_number(f"Unknown: of: {name}", share)
-        object.__setattr__(self, "std", check_number("Unknown: std", self.std, at_least=0.0))
-        object.__setattr__(self, "drift", check_number("Unknown: drift", self.drift, at_least=0.0))
-        constant = check_seconds("Unknown: time_constant", self.time_constant, at_least=0.0)
-        object.__setattr__(self, "time_constant", constant)
+        keep(self, std=check_number("Unknown: std", self.std, at_least=0.0))
+        keep(self, drift=check_number("Unknown: drift", self.drift, at_least=0.0))
+        keep(self, time_constant=check_seconds("Unknown: time_constant", self.time_constant, at_least=0.0))
         check_count("Unknown: order", self.order, at_most=2)
         if self.order == 2 and not 0 < self.time_constant < np.inf:
             raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
@@ -135,24 +135,21 @@ class Uncertainty:
     left_out: Sequence[str] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        unknowns = check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown")
-        object.__setattr__(self, "unknowns", unknowns)
+        keep(self, unknowns=check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown"))
         for name in SUMMED:
             numbers = getattr(self, name)
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
                 check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
             if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
                 raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want a number, or one for each")
-        object.__setattr__(self, "lag", check_number("Uncertainty: lag", self.lag, at_least=0.0))
+        keep(self, lag=check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
-            count = check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)
-            object.__setattr__(self, name, count)
+            keep(self, **{name: check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)})
         for name in ("loss", "command_loss"):
             share = check_number(f"Uncertainty: {name}", getattr(self, name), at_least=0.0, at_most=1.0)
-            object.__setattr__(self, name, share)
-        object.__setattr__(self, "obstacles", check_number("Uncertainty: obstacles", self.obstacles, at_least=0.0))
-        left_out = check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts")
-        object.__setattr__(self, "left_out", left_out)
+            keep(self, **{name: share})
+        keep(self, obstacles=check_number("Uncertainty: obstacles", self.obstacles, at_least=0.0))
+        keep(self, left_out=check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts"))
 
     def check(self, dynamics: Dynamics) -> None:
         """Check that it fits a system.
@@ -164,10 +161,8 @@ class Uncertainty:
           InputError: something does not fit.
         """
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
-        per_entry("Uncertainty: start", self.start, states)
-        per_entry("Uncertainty: measurement", self.measurement, states)
-        per_entry("Uncertainty: model_error", self.model_error, states)
-        per_entry("Uncertainty: control", self.control, controls)
+        for name in SUMMED:
+            per_entry(f"Uncertainty: {name}", getattr(self, name), controls if name == "control" else states)
         for unknown in self.unknowns:
             for name in unknown.shares:
                 check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))

@@ -6,16 +6,16 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number, real
 from lqrsim.kernels import clearance, distance_constraint
-from lqrsim.problem.collision_geoms import CollisionGeoms
-from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
+from lqrsim.problem.collision_shape import CollisionGeoms, GeomsInWorld, KeepsClear
+from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
 
-class Clearance(Constraint):
+class Clearance(KeepsClear, Constraint):
     """`distance(x_t, obstacle) - radius >= margin` for each obstacle, walls included, at the steps.
 
         ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
@@ -42,10 +42,7 @@ class Clearance(Constraint):
         geoms: CollisionGeoms | None = None,
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
-        if not isinstance(world, World):
-            raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world, self.balls, self.geoms = world, balls, geoms
-        self.radius = check_outline("Clearance", radius, balls, geoms)
+        self._set_shape(world, radius, balls, geoms)
         self.margin = _checked_margin(margin)
 
     def ahead(self, steps: int) -> "Clearance":
@@ -60,49 +57,54 @@ class Clearance(Constraint):
         other.margin = _checked_margin(margin)
         return other
 
-    @property
-    def moving(self) -> bool:
-        return self.world.moving
-
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))))
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
         margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
-        world = self.world if self.geoms is not None else bind_outline("Clearance", self.balls, dynamics, self.world)[1]
+        shape = self.in_world(dynamics)
+        world = shape.world
         if len(margins) not in (1, len(times)):
             want = f"one, or one for each of {len(times)} knots"
             raise InputError(f"Clearance: margin: got {len(margins)} numbers, want {want}")
         if margins.shape[1] not in (1, len(world)):
             want = f"{len(world)}, one per obstacle: {', '.join(world.names)}"
             raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
-        if self.geoms is not None:
-            return _bind_geoms(self.geoms, dynamics, world, margins)
-        balls, tables = self.balls, world.tables(times)
-        places, _ = bind_outline("Clearance", balls, dynamics, self.world)
+        if isinstance(shape, GeomsInWorld):
+            found = shape.geoms.bind(dynamics, world, float(margins.max()) + 2 * shape.geoms.size)
+            if -1 in found.obstacles and margins.shape[1] > 1:
+                want = f"one number for a knot, as there are {len(world)} obstacles"
+                raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+            rows, shared = list(zip(found.parts, found.obstacles, strict=True)), max(1, len(found.parts))
+            kernel = source_of(distance_constraint, AT=found.numbers, ROWS=shared)
+            own = [*margins.shape, *np.maximum(found.obstacles, 0), *margins.ravel()]
+        else:
+            found, tables, count = shape.centers, world.tables(times), len(shape.radii)
+            rows, shared = [(name, number) for name in shape.names for number in range(len(world))], 3 * count
+            sizes = [*margins.shape, len(world), len(tables)]
+            if found is None:
+                kernel, least = source_of(clearance, AXES=shape.moved_by), (shape.radii + margins).ravel()
+            else:
+                kernel, least = source_of(clearance, AT=found.numbers, BALLS=count), [*shape.radii, *margins.ravel()]
+            own = [*sizes, *least, *tables.ravel()]
 
         def describe(row: int) -> str:
-            ball, place = divmod(row, len(world))
-            own, who = margins[:, place % margins.shape[1]], "" if balls is None else f" of {balls.names[ball]!r}"
+            part, number = rows[row]
+            own, who = margins[:, number % margins.shape[1]], f" of {part!r}" if part else ""
             low, high = f"{own.min():g}", f"{own.max():g}"
             said = low if low == high else f"{low} to {high}"
-            return f"a clearance of {said} m{who} to obstacle {world.names[place]!r}"
+            where = f"obstacle {world.names[number]!r}" if number >= 0 else "all obstacles"
+            return f"a clearance of {said} m{who} to {where}"
 
-        if balls is None or places is None:
-            first = [*margins.shape, len(world), len(tables)]
-            data = np.concatenate([first, (self.radius + margins).ravel(), tables.ravel()])
-            source = source_of(clearance, AXES=dynamics.state_coordinates.position)
-            return ConstraintTerm(source, data, len(world), describe)
-        own = [*margins.shape, len(world), len(tables), *balls.radii, *margins.ravel(), *tables.ravel()]
+        if found is None:
+            return ConstraintTerm(kernel, np.array(own), len(rows), describe)
         return ConstraintTerm(
-            source=source_of(clearance, AT=places.numbers, BALLS=len(balls)).filled(
-                places=places.code, places_jacobian=places.code
-            ),
-            data=np.concatenate([places.data, own]),
-            rows=len(balls) * len(world),
+            source=found.filling(kernel),
+            data=np.concatenate([found.data, own]),
+            rows=len(rows),
             describe=describe,
-            shared=3 * len(balls),
-            functions=places.functions,
+            shared=shared,
+            functions=found.functions,
         )
 
 
@@ -115,28 +117,3 @@ def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
     if not margins.size:
         raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
     return margins
-
-
-def _bind_geoms(geoms: CollisionGeoms, dynamics: Dynamics, world: World, margins: Array) -> ConstraintTerm:
-    """The constraint on a simulator's distances, with margins (1 or T + 1, 1 or O)."""
-    found = geoms.bind(dynamics, world, float(margins.max()) + 2 * geoms.size)
-    if -1 in found.obstacles and margins.shape[1] > 1:
-        want = f"one number for a knot, as there are {len(world)} obstacles"
-        raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
-
-    def describe(row: int) -> str:
-        number = found.obstacles[row]
-        own = margins[:, number % margins.shape[1]]
-        low, high = f"{own.min():g}", f"{own.max():g}"
-        said, what = low if low == high else f"{low} to {high}", f"obstacle {world.names[number]!r}"
-        return f"a clearance of {said} m of {found.parts[row]!r} to {what if number >= 0 else 'all obstacles'}"
-
-    rows, numbers = len(found.parts), np.maximum(found.obstacles, 0)
-    return ConstraintTerm(
-        source=found.filling(source_of(distance_constraint, AT=found.numbers, ROWS=max(1, rows))),
-        data=np.concatenate([found.data, margins.shape, numbers, margins.ravel()]),
-        rows=rows,
-        describe=describe,
-        shared=max(1, rows),
-        functions=found.functions,
-    )

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen import distances, symbolic
+from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import in_c_order, module_of
-from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import (
     Term,
     UserFunction,
@@ -22,6 +22,7 @@ from lqrsim.codegen.user_functions import (
     name_of,
     numbers_of,
     raise_again,
+    rows_of,
 )
 from lqrsim.errors import (
     Array,
@@ -31,12 +32,11 @@ from lqrsim.errors import (
     check_flag,
     check_items,
     check_kind,
-    check_number,
     excerpt,
+    keep,
     vectors_of,
 )
 from lqrsim.kernels import differences, sphere_centers, user_functions
-from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
@@ -67,8 +67,8 @@ class SphereCenters(Term):
         super().__post_init__()
         wanted = "a tuple of indices of states"
         given = check_items("SphereCenters: depends_on", self.depends_on, (int, np.integer), wanted)
-        self._keep("depends_on", tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given))
-        self._keep("in_plane", check_flag("SphereCenters: in_plane", self.in_plane))
+        keep(self, depends_on=tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given))
+        keep(self, in_plane=check_flag("SphereCenters: in_plane", self.in_plane))
 
     def world_seen(self, world: World, space: Coordinates) -> World:
         """The obstacles in the coordinates of the places.
@@ -78,6 +78,14 @@ class SphereCenters(Term):
           space: the coordinates of the states.
         """
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
+
+    def filling(self, kernel: Source) -> Source:
+        """The kernel of a cost or a constraint, with these places.
+
+        Args:
+          kernel: its source.
+        """
+        return kernel.filled(places=self.code, places_jacobian=self.code)
 
 
 class CollisionSpheres:
@@ -279,44 +287,6 @@ class CollisionSpheres:
         return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
 
 
-def check_outline(
-    field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
-) -> float:
-    """Check the outline, and return the radius to keep clear of obstacles: of balls the largest, for geoms 0.
-
-    Raises:
-      InputError: it is negative, these are no balls or geoms, or it is not one of the three.
-    """
-    check_kind(f"{field}: balls", balls, (CollisionSpheres, type(None)), "CollisionSpheres(places, radii)")
-    check_kind(f"{field}: geoms", geoms, (CollisionGeoms, type(None)), "those of a robot from an MJCF, robot.geoms")
-    given = [name for name, one in (("radius", radius), ("balls", balls), ("geoms", geoms)) if one is not None]
-    if len(given) != 1:
-        got = " and ".join(given) or "none of radius, balls and geoms"
-        wanted = "one of them: radius=robot.radius, balls=robot.balls or geoms=robot.geoms"
-        raise InputError(f"{field}: got {got}, want {wanted}")
-    if radius is not None:
-        return check_number(f"{field}: radius", radius, at_least=0.0)
-    return float(balls.radii.max()) if balls is not None else 0.0
-
-
-def bind_outline(
-    field: str, balls: CollisionSpheres | None, dynamics: Dynamics, world: World
-) -> tuple[SphereCenters | None, World]:
-    """The balls' places (None for a robot that is a single ball at its position), and the world in their coordinates.
-
-    Raises:
-      InputError: there are neither balls nor a position, or the balls do not fit the dynamics.
-    """
-    space = dynamics.state_coordinates
-    if balls is not None:
-        places = balls.bind(dynamics)
-        return places, places.world_seen(world, space)
-    if not space.position:
-        wanted = "Dynamics(..., position=(names)), or balls="
-        raise InputError(f"{field}: got dynamics without a position, want {wanted}")
-    return None, world.seen_by(space.plane, space.offset)
-
-
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
     """Places of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
     given = np.asarray(states, dtype=np.float64)
@@ -344,29 +314,11 @@ def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> N
     raise_again(places.functions)
 
 
-def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:
-    """Signed distance of each ball to the nearest obstacle minus its radius, (T, K).
-
-    At states (T, n), and for obstacles that move at the times (T,) in s.
-    """
-    places = balls.bind(dynamics)
-    seen = places.world_seen(world, dynamics.state_coordinates)
-    return distances.signed_distance_at(seen, evaluate(places, len(balls), states), times) - balls.radii
-
-
 def _points(returned: Any, count: int) -> list[list[Any]]:
     """The points that a function returned. Raises InputError unless their number is right and all have 2, or all 3,
     coordinates.
     """
-    if returned is None:
-        raise InputError("got None, want the centre of each ball: is a return missing?")
-    listed = returned.tolist() if hasattr(returned, "tolist") else returned
-    try:
-        points = [point.tolist() if hasattr(point, "tolist") else list(point) for point in listed]
-    except TypeError:
-        raise InputError(f"got {excerpt(returned)}, want a list of points of 3 coordinates") from None
-    if len(points) != count:
-        raise InputError(f"got {len(points)} points, want {count}: one for each of radii")
+    points = rows_of(returned, count, f"{count} points of 3 coordinates, one for each of radii", "points")
     sizes = {len(point) for point in points}
     if sizes not in ({2}, {3}):
         raise InputError(f"got points of {' and '.join(map(str, sorted(sizes)))} coordinates, want 3 of each, or 2")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
-from lqrsim.codegen.user_functions import Term, check_signature, level_of, name_of
+from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import (
     Array,
     InputError,
@@ -25,9 +25,10 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
+    keep,
 )
 from lqrsim.kernels import state_bound
-from lqrsim.problem.costs import ProblemPart
+from lqrsim.problem.costs import OfFunction, ProblemPart
 from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
@@ -66,13 +67,13 @@ class ConstraintTerm(Term):
         return {"value": 5, "slope": 6, **of_all}
 
     def __post_init__(self) -> None:
-        self._keep("rows", check_count("ConstraintTerm: rows", self.rows, at_least=0))
+        keep(self, rows=check_count("ConstraintTerm: rows", self.rows, at_least=0))
         check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
         for name in ("uses_control", "equality", "final_only"):
-            self._keep(name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
+            keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
-        self._keep("shared", check_count("ConstraintTerm: shared", self.shared, at_least=0))
+        keep(self, shared=check_count("ConstraintTerm: shared", self.shared, at_least=0))
         super().__post_init__()
 
 
@@ -89,7 +90,7 @@ class Constraint(ProblemPart[ConstraintTerm]):
         return self
 
 
-class SymbolicConstraint(Constraint):
+class SymbolicConstraint(OfFunction, Constraint):
     """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
 
         def slower_than_2(x, u, p):  # a planar speed, in m/s
@@ -117,20 +118,9 @@ class SymbolicConstraint(Constraint):
         equality: bool = False,
         at: str = "all",
     ) -> None:
-        if level_of(function, None) == "compiled":
-            raise InputError(
-                f"SymbolicConstraint: got the numba function {name_of(function)}, want one of SymPy symbols"
-            )
-        self.function = function
-        check_signature(function, ("x", "u", "p"))
-        self.parameters = symbolic.check_parameters(parameters)
+        self._set_formula(function, parameters, "one of SymPy symbols")
         self.equality = check_flag("SymbolicConstraint: equality", equality)
         self.at = check_name("SymbolicConstraint: at", at, STEPS)
-
-    @property
-    def name(self) -> str:
-        """The name of its function."""
-        return f"{name_of(self.function)}(x, u, p)"
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
@@ -151,7 +141,7 @@ class SymbolicConstraint(Constraint):
         kind = "zero" if self.equality else "not negative"
         return ConstraintTerm(
             source=made["source"],
-            data=np.array(list(self.parameters.values()), dtype=np.float64),
+            data=self._data,
             rows=rows,
             describe=lambda row: f"that {self.name}{f'[{row}]' if rows > 1 else ''} is {kind}",
             uses_control=bool(with_control),

@@ -35,10 +35,11 @@ from lqrsim.errors import (
     check_number,
     check_weight,
     excerpt,
+    keep,
 )
 from lqrsim.kernels import differences, distance_cost, limit_cost, obstacle_cost, quadratic_cost, user_functions
-from lqrsim.problem.collision_geoms import CollisionGeoms
-from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
+from lqrsim.problem.collision_shape import CollisionGeoms, GeomsInWorld, KeepsClear
+from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.scenes.world import World
@@ -77,12 +78,12 @@ class CostTerm(Term):
         if self.nonconvex_in is not None:
             wanted = "a tuple of indices, or None"
             given = check_items("CostTerm: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
-            self._keep("nonconvex_in", tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given))
+            keep(self, nonconvex_in=tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given))
         for name in ("uses_control", "exact_hessian"):
-            self._keep(name, check_flag(f"CostTerm: {name}", getattr(self, name)))
+            keep(self, **{name: check_flag(f"CostTerm: {name}", getattr(self, name))})
         if self.factor is not None:
             last = len(self.data) - 1
-            self._keep("factor", check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
+            keep(self, factor=check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
 
 
 _BoundTerm = TypeVar("_BoundTerm", bound=Term)
@@ -110,6 +111,29 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
         """Bind it to a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
+
+
+class OfFunction:
+    """A cost or a constraint that is stated as a function, with parameters."""
+
+    function: Callable[..., Any]
+    parameters: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    @property
+    def _data(self) -> Array:
+        return np.array(list(self.parameters.values()), dtype=np.float64)
+
+    def _set_formula(self, function: Callable[..., Any], parameters: Mapping[str, float] | None, instead: str) -> None:
+        """Check and keep a function of symbols."""
+        if level_of(function, None) == "compiled":
+            raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
+        check_signature(function, ("x", "u", "p"))
+        self.function, self.parameters = function, symbolic.check_parameters(parameters)
 
 
 class Cost(ProblemPart[CostTerm]):
@@ -288,7 +312,7 @@ class LimitCost(Cost):
         return CostTerm(source_of(limit_cost), numbers, exact_hessian=False)
 
 
-class ObstacleCost(Cost):
+class ObstacleCost(KeepsClear, Cost):
     """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
 
     Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
@@ -318,10 +342,7 @@ class ObstacleCost(Cost):
         sharpness: float = 10.0,
         weight: float = 1.0,
     ) -> None:
-        if not isinstance(world, World):
-            raise InputError(f"ObstacleCost: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world, self.balls, self.geoms = world, balls, geoms
-        self.radius = check_outline("ObstacleCost", radius, balls, geoms)
+        self._set_shape(world, radius, balls, geoms)
         self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
@@ -335,49 +356,33 @@ class ObstacleCost(Cost):
         other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
         return other
 
-    @property
-    def moving(self) -> bool:
-        return self.world.moving
-
     def bind(self, dynamics: Dynamics) -> CostTerm:
         return self._bind_at(dynamics, np.zeros(1))
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
-        if self.geoms is not None:
-            return self._bind_geoms(self.geoms, dynamics)
-        places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
-        tables = world.tables(times)
-        radii = [self.radius] if self.balls is None else self.balls.radii
-        own = np.concatenate([[self.sharpness, self.weight, len(world), len(tables)], radii, tables.ravel()])
-        if self.balls is None or places is None:
-            position = dynamics.state_coordinates.position
-            return CostTerm(source_of(obstacle_cost, AXES=position), own, nonconvex_in=position, factor=1)
-        axes = places.depends_on
-        kernel = source_of(obstacle_cost, AT=places.numbers, BALLS=len(self.balls), AXES=axes)
-        return CostTerm(
-            kernel.filled(places=places.code, places_jacobian=places.code),
-            np.concatenate([places.data, own]),
-            nonconvex_in=axes or None,
-            factor=len(places.data) + 1,
-            functions=places.functions,
-            exact_hessian=False,
-        )
-
-    def _bind_geoms(self, geoms: CollisionGeoms, dynamics: Dynamics) -> CostTerm:
-        reach = FAR / self.sharpness
-        found = geoms.bind(dynamics, self.world, reach)
-        kernel = source_of(distance_cost, AT=found.numbers, ROWS=max(1, len(found.parts)), MOVED=found.moved)
+        shape, reach = self.in_world(dynamics), FAR / self.sharpness
+        if isinstance(shape, GeomsInWorld):
+            found = shape.geoms.bind(dynamics, self.world, reach)
+            kernel = source_of(distance_cost, AT=found.numbers, ROWS=max(1, len(found.parts)), MOVED=found.moved)
+            own, axes = np.array([self.sharpness, self.weight, reach]), tuple(range(found.moved))
+        else:
+            found, axes, tables = shape.centers, shape.moved_by, shape.world.tables(times)
+            sizes = self.sharpness, self.weight, len(shape.world), len(tables)
+            own = np.concatenate([sizes, shape.radii, tables.ravel()])
+            if found is None:
+                return CostTerm(source_of(obstacle_cost, AXES=axes), own, nonconvex_in=axes, factor=1)
+            kernel = source_of(obstacle_cost, AT=found.numbers, BALLS=len(shape.radii), AXES=axes)
         return CostTerm(
             found.filling(kernel),
-            np.concatenate([found.data, [self.sharpness, self.weight, reach]]),
-            nonconvex_in=tuple(range(found.moved)),
+            np.concatenate([found.data, own]),
+            nonconvex_in=axes or None,
             factor=len(found.data) + 1,
             functions=found.functions,
             exact_hessian=False,
         )
 
 
-class SymbolicCost(Cost):
+class SymbolicCost(OfFunction, Cost):
     """A cost stated as a formula.
 
     Args:
@@ -394,17 +399,8 @@ class SymbolicCost(Cost):
         parameters: Mapping[str, float] | None = None,
         convex: bool = False,
     ) -> None:
-        if level_of(function, None) == "compiled":
-            raise InputError(f"SymbolicCost: got the numba function {name_of(function)}, want FunctionCost for it")
-        self.function = function
-        check_signature(function, ("x", "u", "p"))
-        self.parameters = symbolic.check_parameters(parameters)
+        self._set_formula(function, parameters, "FunctionCost for it")
         self.convex = check_flag("SymbolicCost: convex", convex)
-
-    @property
-    def name(self) -> str:
-        """The name of its function."""
-        return f"{name_of(self.function)}(x, u, p)"
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
@@ -414,7 +410,7 @@ class SymbolicCost(Cost):
         )
         return CostTerm(
             made["source"],
-            np.array(list(self.parameters.values()), dtype=np.float64),
+            self._data,
             nonconvex_in=None if self.convex or not made["nonconvex_in"] else tuple(made["nonconvex_in"]),
             uses_control=made["uses_control"],
         )
@@ -440,7 +436,7 @@ class SymbolicCost(Cost):
         }
 
 
-class FunctionCost(Cost):
+class FunctionCost(OfFunction, Cost):
     """A cost given as a numba or a plain Python function, where `SymbolicCost` cannot express it.
 
     Args:
@@ -482,11 +478,6 @@ class FunctionCost(Cost):
                 "FunctionCost: derivatives", derivatives, function, self.level, "x, u, p, gradient, hessian"
             )
 
-    @property
-    def name(self) -> str:
-        """The name of its function."""
-        return f"{name_of(self.function)}(x, u, p)"
-
     def bind(self, dynamics: Dynamics) -> CostTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
@@ -501,7 +492,7 @@ class FunctionCost(Cost):
             source = source_of(differences, AXES=axes).filled(value=source)
         return CostTerm(
             source,
-            np.array(list(self.parameters.values()), dtype=np.float64),
+            self._data,
             nonconvex_in=None if self.convex else axes,
             uses_control=any(axis >= n for axis in axes),
             functions=functions,

@@ -10,12 +10,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.user_functions import UserFunction, address_of, brief, plain_calls
+from lqrsim.codegen.user_functions import Term, UserFunction, address_of, brief, plain_calls
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.fields import Line, check_fields
 
@@ -24,15 +23,12 @@ STEP = 6e-6  # of difference quotients, relative to numbers above 1
 
 def functions_of(problem: Problem) -> list[UserFunction]:
     """The numba and plain Python functions of a problem."""
-    terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
-    parts = (problem.dynamics, *terms, *problem.constraint_terms, *_noise(problem))
-    return [function for part in parts for function in part.functions]
+    return [function for part in _parts(problem) for function in part.functions]
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
     """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
-    parts = (problem.dynamics, *(term for _, term in _terms(problem)), *problem.constraint_terms, *_noise(problem))
-    for part in parts:
+    for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
             values = function.call(x, u, parameters)
@@ -43,8 +39,11 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
                     raise InputError(f"{function.name}: got a value that depends on {name}, want it in depends_on")
 
 
-def _noise(problem: Problem) -> tuple[NoiseTerm, ...]:
-    return () if problem.noise_term is None else (problem.noise_term,)
+def _parts(problem: Problem) -> list[Dynamics | Term]:
+    """The dynamics, and all that is bound to them."""
+    terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
+    noise = () if problem.noise_term is None else (problem.noise_term,)
+    return [problem.dynamics, *terms, *problem.constraint_terms, *noise]
 
 
 def check_start(problem: Problem, x: Array, u: Array) -> None:

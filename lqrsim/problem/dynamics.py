@@ -21,16 +21,7 @@ from lqrsim.codegen.user_functions import (
     name_of,
     plain_calls,
 )
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_items,
-    check_name,
-    check_number,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
 from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_memory, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_memory, excerpt, keep
 from lqrsim.results.value_functions import Quadratic
 
 
@@ -72,7 +72,7 @@ class Stage:
             array = check_array(f"Stage: {field.name}", value, (*time, *want))
             if field.name in ("Q", "R") and not np.allclose(array, np.swapaxes(array, -1, -2), rtol=1e-9, atol=0):
                 raise InputError(f"Stage: {field.name}: got a matrix that is not symmetric, want a symmetric one")
-            object.__setattr__(self, field.name, array)
+            keep(self, **{field.name: array})
 
     @property
     def states(self) -> int:

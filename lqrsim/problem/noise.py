@@ -25,17 +25,9 @@ from lqrsim.codegen.user_functions import (
     name_of,
     numbers_of,
     raise_again,
+    rows_of,
 )
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_kind,
-    check_name,
-    check_number,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
 from lqrsim.kernels import differences, user_functions
 from lqrsim.kernels import noise as noise_kernel
 from lqrsim.problem.dynamics import Dynamics
@@ -226,15 +218,7 @@ class Noise:
     def _rows(self, returned: Any, n: int) -> list[list[Any]]:
         """The result of the function, as n rows. Raises InputError for another shape."""
         wanted = f"{n} rows, one per state, of {self.size} entries"
-        if returned is None:
-            raise InputError(f"got None, want {wanted}: is a return missing?")
-        listed = returned.tolist() if hasattr(returned, "tolist") else returned
-        try:
-            rows = [row.tolist() if hasattr(row, "tolist") else list(row) for row in listed]
-        except TypeError:
-            raise InputError(f"got {excerpt(returned)}, want {wanted}") from None
-        if len(rows) != n:
-            raise InputError(f"got {len(rows)} rows, want {wanted}")
+        rows = rows_of(returned, n, wanted)
         for row in rows:
             if len(row) != self.size:
                 raise InputError(f"got a row of {len(row)} entries, want {wanted}")

@@ -19,17 +19,16 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
+    keep,
 )
 from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_spheres import evaluate
+from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, by_name, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
-
-TOUCHING = 1e-9  # m; how deep in an obstacle a robot may be where it only touches it
 
 
 @dataclass(frozen=True, init=False)
@@ -58,7 +57,7 @@ class FixedState:
             found = check_array("FixedState: state", state, (None,))
             if not len(found):
                 raise InputError("FixedState: state: got no numbers, want one per state")
-        object.__setattr__(self, "state", found)
+        keep(self, state=found)
 
     @property
     def numbers(self) -> Array:
@@ -127,16 +126,15 @@ class Problem:
     _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
-        object.__setattr__(self, "steps", check_count("steps", self.steps))
-        object.__setattr__(self, "begin", check_number("begin", self.begin))
+        keep(self, dt=check_number("dt", self.dt, above=0.0), steps=check_count("steps", self.steps))
+        keep(self, begin=check_number("begin", self.begin))
         if not isinstance(self.dynamics, Dynamics):
             raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
         self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
         for name in ("stage_cost", "final_cost", "initial"):
             given, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
-            object.__setattr__(self, name, given._in(self.dynamics) if fixed else in_system(given, self.dynamics, name))
+            keep(self, **{name: given._in(self.dynamics) if fixed else in_system(given, self.dynamics, name)})
         costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
             # A zero cost, with which fixed and soft starts share compiled code.
@@ -148,14 +146,13 @@ class Problem:
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
-        object.__setattr__(self, "_terms", bound)
+        keep(self, _terms=bound)
         wanted = "a list of constraints, such as [Clearance(...)] or, for a function, [SymbolicConstraint(function)]"
-        object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
-        terms = bind_all(self.constraints, self.dynamics, self.times)
-        object.__setattr__(self, "_constraint_terms", terms)
+        keep(self, constraints=check_items("constraints", self.constraints, Constraint, wanted))
+        keep(self, _constraint_terms=bind_all(self.constraints, self.dynamics, self.times))
         check_kind("noise", self.noise, (Noise, type(None)), "a Noise, or None")
-        object.__setattr__(self, "_noise_term", None if self.noise is None else self.noise.bind(self.dynamics))
-        object.__setattr__(self, "risk", check_number("risk", self.risk))
+        keep(self, _noise_term=None if self.noise is None else self.noise.bind(self.dynamics))
+        keep(self, risk=check_number("risk", self.risk))
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         self._check_duration()
@@ -163,10 +160,9 @@ class Problem:
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
             _check_within_reach(limited, controls)
-            object.__setattr__(self, "control_limits", (limited.low, limited.high))
-            object.__setattr__(self, "_controls", (limited, limited.within(controls)))
+            keep(self, control_limits=(limited.low, limited.high), _controls=(limited, limited.within(controls)))
         else:
-            object.__setattr__(self, "_controls", (controls, controls))
+            keep(self, _controls=(controls, controls))
         self._check_start_clear()
 
     @property
@@ -203,7 +199,7 @@ class Problem:
         start = FixedState(here)
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
             term = copy.copy(self._terms["initial"][0])
-            object.__setattr__(term, "data", np.concatenate([here, term.data[len(here) :]]))
+            keep(term, data=np.concatenate([here, term.data[len(here) :]]))
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
         other = self._with(initial=start, _terms=self._terms | {"initial": (term,)})
@@ -249,8 +245,7 @@ class Problem:
         Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
         """
         other = copy.copy(self)
-        for name, value in changed.items():
-            object.__setattr__(other, name, value)
+        keep(other, **changed)
         return other
 
     @property
@@ -314,6 +309,11 @@ class Problem:
         """The terms that keep the robot clear of obstacles."""
         return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
 
+    @property
+    def kept_clear(self) -> tuple[KeepsClear, ...]:
+        """The costs and constraints that keep the robot clear of obstacles."""
+        return (*self.obstacle_costs, *(one for one in self.constraints if isinstance(one, Clearance)))
+
     def terms(self, which: str) -> tuple[CostTerm, ...]:
         """The bound terms of `initial`, `stage_cost` or `final_cost`.
 
@@ -374,7 +374,7 @@ class Problem:
 
     def _check_duration(self) -> None:
         """Raises InputError if the duration is not as described, or a problem of its kind cannot have one."""
-        object.__setattr__(self, "time_weight", check_number("time_weight", self.time_weight, at_least=0.0))
+        keep(self, time_weight=check_number("time_weight", self.time_weight, at_least=0.0))
         if self.duration is None:
             if self.time_weight:
                 raise InputError(f"time_weight: got {self.time_weight:g} without a duration, want duration=(low, high)")
@@ -385,7 +385,7 @@ class Problem:
             raise InputError(
                 f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
             )
-        object.__setattr__(self, "duration", (low, high))
+        keep(self, duration=(low, high))
         why = ""
         if self.dynamics.discrete or self.dynamics.level != "symbolic":
             why = "dynamics that are not a formula"
@@ -408,45 +408,14 @@ class Problem:
         """The place of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if it is clear, or
         is no place.
         """
-        goal, clearances = self.weighed_goal, [one for one in self.constraints if isinstance(one, Clearance)]
-        end = self.begin + self.steps * self.dt
-        found = None if goal is None else self._inside([*self.obstacle_costs, *clearances], goal, end)
+        goal, end = self.weighed_goal, self.begin + self.steps * self.dt
+        found = None if goal is None else self._inside(self.kept_clear, goal, end)
         return "" if found is None else found[0]
 
-    def _inside(
-        self, outlines: Sequence[ObstacleCost | Clearance], state: Array, time: float
-    ) -> tuple[str, str] | None:
+    def _inside(self, kept: Sequence[KeepsClear], state: Array, time: float) -> tuple[str, str] | None:
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
-        space = self.dynamics.state_coordinates
-        for outline in outlines:
-            if outline.geoms is not None:
-                if not len(outline.world) or np.isnan(state).any():
-                    continue
-                distances = outline.geoms.clearances(self.dynamics, outline.world, state)
-                if distances.min() < -TOUCHING:
-                    where = f"{-distances.min():.3g} m inside obstacle {outline.world.names[int(distances.argmin())]!r}"
-                    return where, "; or, if that geom is no obstacle, obstacles= of the robot without it"
-                continue
-            if outline.balls is None:
-                world = outline.world.moved(time).seen_by(space.plane, space.offset)
-                places = state[None, list(space.position)]
-                parts = [("", "the robot's radius", outline.radius)]
-            else:
-                bound = outline.balls.bind(self.dynamics)
-                world = bound.world_seen(outline.world.moved(time), space)
-                places = evaluate(bound, len(outline.balls), state)
-                balls = zip(outline.balls.names, outline.balls.radii, strict=True)
-                parts = [(f"with {name!r} ", "its radius", radius) for name, radius in balls]
-            for place, (what, whose, radius) in zip(places, parts if len(world) else (), strict=False):
-                if np.isnan(place).any():
-                    continue
-                distances = world.distances(place) - radius
-                if distances.min() < 0:
-                    at = ", ".join(f"{value:g}" for value in place)
-                    name = world.names[int(distances.argmin())]
-                    where = f"{what}at ({at}) m, {-distances.min():.3g} m inside obstacle {name!r}"
-                    return where, f" of obstacles by {whose} of {radius:g} m"
-        return None
+        found = (one.in_world(self.dynamics, time).inside(state) for one in kept)
+        return next((one for one in found if one is not None), None)
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

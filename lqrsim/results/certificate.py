@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results.fields import LINE, Bounds, Line, check_fields
+from lqrsim.results.fields import LINE, SHARE, Bounds, Line, check_fields
 from lqrsim.results.solution import Solution
-
-_SHARE = Bounds(at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +51,11 @@ class FailureCertificate:
     disturbances: tuple[Line, ...]
     model: Line
     policy_digest: Line
-    probability: Annotated[float, _SHARE]
-    low: Annotated[float, _SHARE]
-    high: Annotated[float, _SHARE]
+    probability: Annotated[float, SHARE]
+    low: Annotated[float, SHARE]
+    high: Annotated[float, SHARE]
     confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
-    repetitions: Annotated[Array, "R", _SHARE]
+    repetitions: Annotated[Array, "R", SHARE]
     particles: int
     seed: int
     versions: Mapping[str, Line]
@@ -82,5 +80,4 @@ class FailureCertificate:
             f"probability of failure: {self.probability:.2g} [{self.low:.2g}, {self.high:.2g}] ({interval})"
         )
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary

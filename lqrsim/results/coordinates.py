@@ -19,6 +19,7 @@ from lqrsim.errors import (
     check_number,
     check_text,
     excerpt,
+    keep,
     numbers_of,
     vectors_of,
 )
@@ -74,8 +75,7 @@ class Coordinates:
             given = check_items(
                 field, getattr(self, field), str, "a tuple of texts, one for each entry", at_most=10_000
             )
-            one_by_one = tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)
-            object.__setattr__(self, field, one_by_one)
+            keep(self, **{field: tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)})
         size = len(self.names)
         if not size:
             raise InputError("names: got none, want at least one")
@@ -84,7 +84,7 @@ class Coordinates:
             counted = tuple(check_count(field, index, at_least=0) for index in given)
             if len(set(counted)) < len(counted):
                 raise InputError(f"{field}: got {excerpt(counted)}, want different indices")
-            object.__setattr__(self, field, counted)
+            keep(self, **{field: counted})
         if len(self.units) != size:
             raise InputError(
                 f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
@@ -109,11 +109,10 @@ class Coordinates:
                 f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
             )
         offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
-        object.__setattr__(self, "plane", plane)
-        object.__setattr__(self, "offset", None if offset is None else check_number("offset", offset))
+        keep(self, plane=plane, offset=None if offset is None else check_number("offset", offset))
         for field, endless in (("low", -np.inf), ("high", np.inf)):
             if isinstance(getattr(self, field), tuple) and not getattr(self, field):
-                object.__setattr__(self, field, (endless,) * size)
+                keep(self, **{field: (endless,) * size})
         low = check_array("low", self.low, (size,), infinite=True)
         high = check_array("high", self.high, (size,), infinite=True)
         if (low >= high).any():
@@ -121,8 +120,7 @@ class Coordinates:
             raise InputError(
                 f"limits of {self.names[i]}: got {low[i]:g} to {high[i]:g}, want the first below the second"
             )
-        object.__setattr__(self, "low", tuple(low.tolist()))
-        object.__setattr__(self, "high", tuple(high.tolist()))
+        keep(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def __len__(self) -> int:
         return len(self.names)

@@ -23,7 +23,17 @@ from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_number, excerpt, numbers_of, real
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_number,
+    excerpt,
+    keep,
+    numbers_of,
+    real,
+)
 
 Sizes = dict[str, int]
 
@@ -39,6 +49,9 @@ class Bounds(NamedTuple):
     at_least: float | None = None
     at_most: float | None = None
     below: float | None = None
+
+
+SHARE = Bounds(at_least=0.0, at_most=1.0)
 
 
 class Declared(NamedTuple):
@@ -75,7 +88,7 @@ def check_fields(record: Any) -> Sizes:
         value = getattr(record, name)
         kept = _checked(f"{who}: {name}", value, said, sizes)
         if kept is not value:
-            object.__setattr__(record, name, kept)
+            keep(record, **{name: kept})
     return sizes
 
 

@@ -251,8 +251,7 @@ class Funnel:
             lines.append(f"{line}  {self.reasons[i]}".rstrip())
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def _extent(self, knot: int) -> str:
         """The largest half width among the states of each unit."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_number, excerpt, shaped
+from lqrsim.errors import Array, InputError, check_number, excerpt, keep, shaped
 from lqrsim.results.coordinates import Coordinates
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
@@ -65,7 +65,7 @@ class Target:
             raise InputError(f"goal: got {excerpt(goal.tolist())}, want finite numbers, or NaN for any state")
         if np.isnan(goal).all():
             raise InputError("goal: got NaN for every state, want a number for at least one, or None without a goal")
-        object.__setattr__(self, "goal", goal)
+        keep(self, goal=goal)
 
     @property
     def state(self) -> Array:

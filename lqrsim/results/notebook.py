@@ -36,7 +36,7 @@ def of_solution(solution: "Solution") -> str:
     remarks = [text for text in (solution.status.meaning, solution.detail, solution.remedy) if text]
     none = np.empty((0, *plan.states.shape))
     picture = _drawing(solution.policy.state_coordinates, plan.times, plan.states, none)
-    return _page(f"{solution.status.name}, {solution.solver}", remarks, rows, picture, head=False)
+    return of_table(f"{solution.status.name}, {solution.solver}", remarks, rows, picture, head=False)
 
 
 def of_rollout(rollout: "Rollout") -> str:
@@ -54,12 +54,7 @@ def of_rollout(rollout: "Rollout") -> str:
     if rollout.trials > MOST:
         remarks.append(f"the first {MOST} of {rollout.trials} trials are shown")
     picture = _drawing(rollout.state_coordinates, rollout.times, rollout.plan.states, rollout.states)
-    return _page(f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}", remarks, rows, picture, head=True)
-
-
-def of_table(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]]) -> str:
-    """A heading, remarks, and a table whose first row names the columns."""
-    return _page(heading, remarks, rows, "", head=True)
+    return of_table(f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}", remarks, rows, picture)
 
 
 def _number(value: float) -> str:
@@ -67,8 +62,10 @@ def _number(value: float) -> str:
     return f"{value:.4g}" if np.isfinite(value) else "-"
 
 
-def _page(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], picture: str, *, head: bool) -> str:
-    """A heading, remarks, a table and a picture side by side.
+def of_table(
+    heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], picture: str = "", *, head: bool = True
+) -> str:
+    """A heading, remarks, and a table with a picture beside it.
 
     Args:
       rows: rows of the table.

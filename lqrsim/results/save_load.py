@@ -99,7 +99,8 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
       InputError: the file is missing, damaged, of another version or of another kind.
     """
     if kind is not None and kind not in FORMATS:
-        raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(map(_public, FORMATS))}")
+        names = (f"ls.{'stress.' if one is FailureCertificate else ''}{one.__name__}" for one in FORMATS)
+        raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(names)}")
     wanted = None if kind is None else FORMATS[kind][0]
     path = check_path(wanted or "path", path)
     if path.is_dir():
@@ -115,10 +116,6 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
         return record
-
-
-def _public(kind: type) -> str:
-    return f"ls.stress.{kind.__name__}" if kind is FailureCertificate else f"ls.{kind.__name__}"
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:

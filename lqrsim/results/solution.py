@@ -197,8 +197,7 @@ class Solution(Plan):
         others = [one for one in ended if one.start != best]
         return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def _repr_html_(self) -> str:
         return notebook.of_solution(self)

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_number, vectors_of
+from lqrsim.errors import Array, InputError, check_number, keep, vectors_of
 
 if TYPE_CHECKING:
-    from lqrsim.problem.collision_geoms import CollisionGeoms
+    from lqrsim.problem.collision_shape import CollisionGeoms
     from lqrsim.problem.collision_spheres import CollisionSpheres
     from lqrsim.problem.dynamics import Dynamics
 
@@ -101,8 +101,7 @@ class Robot(abc.ABC):
         """
         for field in (*above_zero, *at_least_zero):
             least = {"above": 0.0} if field in above_zero else {"at_least": 0.0}
-            number = check_number(f"{type(self).__name__}: {field}", getattr(self, field), **least)
-            object.__setattr__(self, field, number)  # robots are frozen
+            keep(self, **{field: check_number(f"{type(self).__name__}: {field}", getattr(self, field), **least)})
 
 
 def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_number, vectors_of
 from lqrsim.kernels import mjcf_distances
-from lqrsim.problem.collision_geoms import CollisionGeoms, GeomDistances
+from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_memory import MjcfMemory

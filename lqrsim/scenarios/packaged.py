@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import check_count, check_items, check_kind, check_name, check_number, check_seed, check_text
+from lqrsim.errors import check_count, check_items, check_kind, check_name, check_number, check_seed, check_text, keep
 from lqrsim.problem.costs import ControlCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target
@@ -94,10 +94,9 @@ class Scenario:
         check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
         for name in ("goal_radius", "goal_tolerance"):
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, check_number(f"Scenario: {name}", value, above=0.0))
+                keep(self, **{name: check_number(f"Scenario: {name}", value, above=0.0)})
         wanted = "disturbances, such as ControlNoise(0.05)"
-        found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
-        object.__setattr__(self, "disturbances", found)
+        keep(self, disturbances=check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted))
         if not is_function(self.start):  # a function is called when the scenario is solved
             resolve(self.start, self.problem)
         check_kind("Scenario: simulator", self.simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")

@@ -25,7 +25,7 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     mujoco.mj_kinematics(model, data)  # at rest
     base, touched = _base(model), set(touching_pairs(model, candidates)[:, 1].tolist())
     ground = _ground(model, data) if floors else set[int]()
-    if not _sinks(model, data, body):
+    if not sinks(model, data, body):
         ground = {geom for geom in ground if _touches(model, data, geom)}
     bodies = model.geom_bodyid.tolist()
     return [geom for geom in candidates if geom in touched and geom not in ground and bodies[geom] not in base]
@@ -133,7 +133,7 @@ def _touches(model: mujoco.MjModel, data: mujoco.MjData, ground: int) -> bool:
     return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
 
 
-def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
+def sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     while body:
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])

@@ -28,7 +28,17 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, check_path, check_text, excerpt
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_path,
+    check_text,
+    excerpt,
+    keep,
+)
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 
 try:
@@ -88,7 +98,7 @@ class Scene:
         check_kind("Scene: xml", self.xml, str, "the MJCF as text")
         check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
         check_kind("Scene: world", self.world, World, "a World")
-        object.__setattr__(self, "geoms", check_items("Scene: geoms", self.geoms, (int, np.integer), "ids of geoms"))
+        keep(self, geoms=check_items("Scene: geoms", self.geoms, (int, np.integer), "ids of geoms"))
         for geom in self.geoms:
             check_count("Scene: geoms", geom, at_least=0, at_most=self.model.ngeom - 1)
         if len(set(self.geoms)) < len(self.geoms):

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, real
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, keep, real
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance
 
@@ -46,17 +46,16 @@ class Obstacle:
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
         check_name(f"obstacle {self.name!r}: kind", self.kind, (*KINDS, *OTHER_KINDS))
-        object.__setattr__(self, "position", check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
+        keep(self, position=check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
         rotation = check_array(f"obstacle {self.name!r}: rotation", self.rotation, (3, 3))
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
             raise InputError(f"obstacle {self.name!r}: rotation: got {rotation.tolist()}, want orthonormal axes")
-        object.__setattr__(self, "rotation", rotation)
+        keep(self, rotation=rotation)
         size = check_array(f"obstacle {self.name!r}: size", self.size, (3,), infinite=True)
         used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2}.get(self.kind, 3)
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "velocity", check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
+        keep(self, size=size, velocity=check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
 
     @classmethod
     def _of_mujoco(
@@ -93,7 +92,7 @@ class World:
     obstacles: Sequence[Obstacle] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "obstacles", check_items("obstacles", self.obstacles, Obstacle, "a list of Obstacle"))
+        keep(self, obstacles=check_items("obstacles", self.obstacles, Obstacle, "a list of Obstacle"))
 
     def __len__(self) -> int:
         return len(self.obstacles)

@@ -29,11 +29,11 @@ class Collisions:
     """
 
     def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float) -> None:
-        self.plant, self.displaced, self.dt = plant, displaced, dt
-        self._moved = bool(displaced.any())
+        self.plant, self.shape, self.dt = plant, plant.shape, dt
+        self._displaced, self._moved = plant.shape.across(displaced), bool(displaced.any())
         self.at = np.full(len(states), np.inf)
         self.obstacles = [""] * len(states)
-        self._last = plant.middles(states)
+        self._last = self.shape.places(states)
         self.clearance = self._clear(self._last)
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._last[row])
@@ -51,7 +51,7 @@ class Collisions:
             for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
                 self.touch(int(row), start, touching[row])
             if len(self.plant.world):
-                self._search_line(step, part, parts, self.plant.middles(states), open_)
+                self._search_line(step, part, parts, self.shape.places(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # A time in the period may be rounded to beyond its end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
@@ -64,20 +64,20 @@ class Collisions:
 
     def relocate(self, states: Array) -> None:
         """Replace the current states: obstacles have stopped some of the trials."""
-        self._last = self.plant.middles(states)
+        self._last = self.shape.places(states)
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
         """Check the lines from the robot's last places to these, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
-        length = self.plant.travel(last, there)
+        length = self.shape.travel(last, there)
         # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
         if not len(rows):
             return
-        finest = np.maximum(FINEST * float(self.plant.radii.min()), length[rows] / MOST)
+        finest = np.maximum(FINEST * float(self.shape.radii.min()), length[rows] / MOST)
         gone, clear = np.zeros(len(rows)), before[rows]
         looking = np.ones(len(rows), dtype=bool)
         while looking.any():
@@ -92,11 +92,10 @@ class Collisions:
 
     def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
         """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3)."""
-        if not self._moved:
-            return self.plant.clearance_at(places)
-        return self.plant.clearance_at(places, self.displaced if rows is None else self.displaced[rows])
+        displaced = self._displaced if rows is None else self._displaced[rows]
+        return self.shape.clearance(places, displaced if self._moved else None)
 
     def _hit(self, row: int, time: float, places: Array) -> None:
         """Record a collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        self.obstacles[row] = self.plant.nearest(places, self.displaced[row])
+        self.obstacles[row] = self.plant.world.names[self.shape.nearest(places, self._displaced[row])]

@@ -6,6 +6,7 @@ With a `Simulator` the robot moves as that says; the MuJoCo model then has the o
 import copy
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 
 import mujoco
@@ -13,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, check_text, shaped, vectors_of
-from lqrsim.problem.collision_geoms import CollisionGeoms
-from lqrsim.problem.collision_spheres import evaluate
+from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
+from lqrsim.scenes.mjcf_obstacles import sinks
 from lqrsim.scenes.scene import Scene, free_name
-from lqrsim.scenes.world import ROW, World, signed_distance
+from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
 
@@ -37,9 +37,8 @@ class Plant:
       robot: the robot, with its dynamics and limits.
       scene: the scene, with its MJCF and obstacles.
       simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
-      geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
-      balls, places: the robot's balls and their centres; None if it is one ball at its position.
-      world: the obstacles for the robot's geoms, its balls or its position; none without any.
+      shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
+      world: the obstacles for it; none for a robot that has neither geoms nor balls nor a position.
       obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
         balls in space, all that the MJCF lets it touch, except level planes on which a free joint, or a slide that is
         not level, lets it stand.
@@ -62,20 +61,18 @@ class Plant:
             check_text("simulator: name", getattr(simulator, "name", None))
             check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)
         plant_validation.check_names(robot, scene)
-        space = robot.dynamics.state_coordinates
         self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, instead of the MJCF's
-        self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
-        self.geoms = geoms_in(robot, scene)
-        self.world = World()
-        if self.geoms is not None:
-            self.world = scene.world
-        elif self.places is not None and not self.places.in_plane:
+        if robot.geoms is not None and not robot.geoms.of_scene(scene):
+            raise InputError(
+                f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles"
+            )
+        self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
+        if self.shape.centers is not None and not self.shape.in_plane:
             near = _in_the_way(robot, scene)
-            self.world = World([one for one in scene.world.obstacles if one.name in near])
-        elif space.position:
-            self.world = scene.world.seen_by(space.plane, space.offset)
-        bounded = space.position or self.places is not None or self.geoms is not None
+            self.shape = replace(self.shape, world=World([one for one in scene.world.obstacles if one.name in near]))
+        self.world = self.shape.world
+        bounded = "radius" not in robot.shape or robot.dynamics.state_coordinates.position
         self.obstacles = self.world.names if bounded else _in_the_way(robot, scene)
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
@@ -180,9 +177,9 @@ class Plant:
 
         For balls and geoms this is not known.
         """
-        if self.balls is not None or self.geoms is not None:
+        if not self.obstacles or "radius" not in self.robot.shape:
             return not self.obstacles
-        return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
+        return len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9)
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
         """The analytic state for the robot's `qpos` and `qvel` and the actuators' `act`; see `Robot.state`.
@@ -223,92 +220,8 @@ class Plant:
             displaced = shaped("displaced", displaced, wanted)
             if displaced.any() and states.ndim != 3:
                 raise InputError(f"states: got shape {states.shape} beside displaced obstacles, want (K, k, n)")
-        return self.clearance_at(self.middles(states), displaced)
-
-    @property
-    def radii(self) -> Array:
-        """Radii of the robot's balls in metres, (B,); the robot's radius without any; that of the largest geom."""
-        if self.geoms is not None:
-            return np.array([self.geoms.size])
-        return np.array([self.robot.radius]) if self.balls is None else self.balls.radii
-
-    def middles(self, states: Array) -> Array:
-        """The centres of the robot's balls, in the coordinates of `world`; for geoms the states.
-
-        Args:
-          states: (..., n).
-
-        Returns:
-          (..., B, 2 or 3), in metres; or (..., 1, n).
-        """
-        if self.geoms is not None:
-            return states[..., None, :]
-        if self.balls is None or self.places is None:
-            return states[..., None, list(self.robot.dynamics.state_coordinates.position)]
-        return evaluate(self.places, len(self.balls), states)
-
-    def clearance_at(self, middles: Array, displaced: Array | None = None) -> Array:
-        """The clearance for given centres of the balls.
-
-        Args:
-          middles: (..., B, 2 or 3), as `middles` returns them.
-          displaced: as in `clearance`.
-
-        Returns:
-          (...), in metres.
-        """
-        if not len(self.world):
-            return np.full(middles.shape[:-2], np.inf)
-        if self.geoms is not None:
-            return self._distances(middles[..., 0, :], displaced).min(axis=-1)
-        if displaced is None or not displaced.any():
-            return (distances.signed_distance(self.world, middles) - self.radii).min(axis=-1)
-        trials, size = len(middles), middles.shape[-1]
-        found = distances.signed_distance_displaced(
-            self.world, middles.reshape(trials, -1, size), self.across(displaced)
-        )
-        return (found.reshape(middles.shape[:-1]) - self.radii).min(axis=-1)
-
-    def travel(self, before: Array, after: Array) -> Array:
-        """How far any point of the robot goes at most between places, (...), in metres.
-
-        Args:
-          before: (..., B, 2 or 3), as of `middles`.
-          after: likewise.
-        """
-        if self.geoms is not None:
-            return self.geoms.travel(before[..., 0, :], after[..., 0, :])
-        return np.linalg.norm(after - before, axis=-1).max(axis=-1)
-
-    def nearest(self, middles: Array, displaced: Array) -> str:
-        """The name of the obstacle that is nearest at a place.
-
-        Args:
-          middles: (B, 2 or 3), as of `middles`.
-          displaced: (obstacles, 3), by how much they are elsewhere.
-        """
-        if self.geoms is not None:
-            return self.world.names[int(self._distances(middles[None], displaced[None])[0, 0].argmin())]
-        points = np.zeros((len(middles), 3))
-        points[:, : middles.shape[1]] = middles
-        table, away = self.world.table.ravel(), self.across(displaced)
-        found = np.full(len(self.world), np.inf)
-        larger = self.radii - self.radii.min()  # what all have changes no order, except by rounding
-        for point, radius in zip(points, larger, strict=True):
-            there = (point - away).tolist()  # seen from where each obstacle is
-            own = [signed_distance(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
-            found = np.minimum(found, own)
-        return self.world.names[int(np.argmin(found))]
-
-    def _distances(self, states: Array, displaced: Array | None) -> Array:
-        """MuJoCo's distances of the geoms to each obstacle, (..., O); NaN where the states are."""
-        assert self.geoms is not None
-        if np.isfinite(states).all():
-            return self.geoms.clearances(self.robot.dynamics, self.world, states, displaced)
-        known = np.asarray(np.isfinite(states).all(axis=-1))
-        found = self._distances(np.where(known[..., None], states, 0.0), displaced)
-        found[~known] = np.nan
-        return found
+            displaced = self.shape.across(displaced) if displaced.any() else None
+        return self.shape.clearance(self.shape.places(states), displaced)
 
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
@@ -320,34 +233,17 @@ class Plant:
         Returns:
           The record; None if the robot has no balls.
         """
-        if self.balls is None:
+        balls, dynamics = self.robot.balls, self.robot.dynamics
+        if balls is None:
             return None
-        dynamics, anchors = self.robot.dynamics, np.full((len(self.balls), 4), np.nan)
-        places = np.full((*driven.shape[:2], len(self.balls), 3), np.nan)
+        anchors, places = np.full((len(balls), 4), np.nan), np.full((*driven.shape[:2], len(balls), 3), np.nan)
         known = np.isfinite(driven).all(axis=2)
-        places[known] = self.balls.centres(dynamics, driven[known])
-        for k, site in enumerate(self.balls.sites):
+        places[known] = balls.centres(dynamics, driven[known])
+        for k, site in enumerate(balls.sites):
             if site is not None:
                 anchors[k] = plant_validation.anchor_of(self.model, site)
-        return BallRecord(
-            driven=places, planned=self.balls.centres(dynamics, planned), radii=self.balls.radii, anchors=anchors
-        )
-
-    def across(self, vectors: Array) -> Array:
-        """Convert vectors from the axes of the scene to those of `world`.
-
-        Args:
-          vectors: (..., 3).
-
-        Returns:
-          (..., 2 or 3).
-        """
-        space = self.robot.dynamics.state_coordinates
-        if len(space.position) != 2 or (self.places is not None and not self.places.in_plane):
-            return vectors
-        seen = space.of_world(vectors)
-        normal = np.cross(*np.eye(3)[list(space.world_axes)])
-        return np.concatenate([seen, (vectors @ normal)[..., None]], axis=-1)
+        planned = balls.centres(dynamics, planned)
+        return BallRecord(driven=places, planned=planned, radii=balls.radii, anchors=anchors)
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation; `set_const` must follow.
@@ -443,32 +339,18 @@ def extent(plant: Plant) -> float:
     return off + reach + float(thickest)
 
 
-def geoms_in(robot: Robot, scene: Scene) -> CollisionGeoms | None:
-    """The geoms of a robot in a scene, with the obstacles of that; None if it has none. Raises InputError."""
-    geoms = robot.geoms
-    if geoms is None or geoms.of_scene(scene):
-        return geoms
-    raise InputError(f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles")
-
-
 def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
     """Names of the obstacles of a robot without a position: all that it can touch, except its floor.
 
-    Level planes are its floor if a joint lets it sink to them: a free joint, or a slide that is not level.
+    Level planes are its floor if a joint lets it sink to them.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
-    body, sinks = int(model.body(robot.body).id), False
-    while body and not sinks:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        for joint in range(first, first + count):
-            slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and abs(data.xaxis[joint, 2]) > 1e-9
-            sinks |= bool(slides or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
-        body = int(model.body_parentid[body])
+    floored = sinks(model, data, int(model.body(robot.body).id))
     level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in scene.world.obstacles]
     touched = [_can_be_touched(model, geom) for geom in scene.geoms]
     found = zip(scene.world.names, level, touched, strict=True)
-    return tuple(name for name, lies, near in found if near and not (sinks and lies))
+    return tuple(name for name, lies, near in found if near and not (floored and lies))
 
 
 def _can_be_touched(model: mujoco.MjModel, geom: int) -> bool:

@@ -9,16 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_kind,
-    check_number,
-    check_seed,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import Bounds, Line, check_fields

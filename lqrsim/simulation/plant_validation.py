@@ -186,7 +186,7 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
         for k, site, (body, *place) in anchors:
             there = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
             off = there - centres[k]
-            if plant.places is not None and plant.places.in_plane and robot.dynamics.state_coordinates.from_above:
+            if plant.shape.in_plane and robot.dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 raise InputError(

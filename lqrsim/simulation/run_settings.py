@@ -140,7 +140,7 @@ def _check_plan(given: Plan, plant: Plant) -> None:
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
         raise InputError(f"plan: got one of {shapes}, want {n} and {m}")
-    if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
+    if not plan.finite:
         raise InputError(f"plan: got one that is not finite ({given.status.name}), want one that can be run")
 
 

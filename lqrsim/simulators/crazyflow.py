@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.errors import Array, InputError, check_name, check_number, keep
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
@@ -45,7 +45,7 @@ class Crazyflow(Simulator):
     parameters = PARAMETERS
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "timestep", check_number("Crazyflow: timestep", self.timestep, above=0.0))
+        keep(self, timestep=check_number("Crazyflow: timestep", self.timestep, above=0.0))
         check_name("Crazyflow: integrator", self.integrator, INTEGRATORS)
         check_name("Crazyflow: drone", self.drone, DRONES)
 

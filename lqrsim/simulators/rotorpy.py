@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt, keep
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
@@ -45,7 +45,7 @@ class RotorPy(Simulator):
     wind = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "timestep", check_number("RotorPy: timestep", self.timestep, above=0.0))
+        keep(self, timestep=check_number("RotorPy: timestep", self.timestep, above=0.0))
         vehicle = self.vehicle
         if isinstance(vehicle, str):
             package("rotorpy", "rotorpy")
@@ -68,7 +68,7 @@ class RotorPy(Simulator):
                 f"RotorPy: vehicle: got motor_noise_std {noise:g}, want 0: its generator is shared by all trials; use"
                 " ControlNoise"
             )
-        object.__setattr__(self, "vehicle", dict(vehicle))
+        keep(self, vehicle=dict(vehicle))
         _ = self._frame
 
     @cached_property

@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen import distances
 from lqrsim.errors import Array
-from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.collision_spheres import clearances
-from lqrsim.problem.costs import ObstacleCost
+from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
@@ -79,7 +76,7 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
     if status.success:
         return ""
     if inside := problem.goal_inside:
-        geoms = any(one.geoms is not None for one in _kept_clear(problem))
+        geoms = any("geoms" in one.shape for one in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
     if status is Status.TIME_LIMIT and log:
         took = sum(one.seconds for one in log)
@@ -128,8 +125,7 @@ def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    shapes = [one for one in _kept_clear(problem) if one.balls is None and one.geoms is None]
-    radius = max((one.radius for one in shapes), default=0.0)
+    radius = max((one.shape.get("radius", 0.0) for one in problem.kept_clear), default=0.0)
     if plan is not None and radius:
         radius = Target(problem.dynamics.state_coordinates, goal, plan).on_the_way(radius)
     return radius or None
@@ -140,22 +136,10 @@ def clearance_of(problem: Problem, states: Array) -> Array | None:
 
     For a robot of several collision spheres or geoms it is the smallest of theirs.
     """
-    space = problem.dynamics.state_coordinates
-    place = states[:, list(space.position)]
-    kept = [one for one in _kept_clear(problem) if len(one.world)]
-    worlds = {(id(one.world), one.radius, id(one.balls), id(one.geoms)): one for one in kept}
     found = []
-    for one in worlds.values():
-        if one.geoms is not None:
-            found.append(one.geoms.clearances(problem.dynamics, one.world, states).min(axis=1))
-        elif one.balls is not None:
-            found.append(clearances(one.balls, problem.dynamics, one.world, states, problem.times).min(axis=1))
-        else:
-            seen = one.world.seen_by(space.plane, space.offset)
-            found.append(distances.signed_distance_at(seen, place[:, None], problem.times)[:, 0] - one.radius)
+    for one in each_once([one for one in problem.kept_clear if len(one.world)]):
+        shape, displaced = one.in_world(problem.dynamics), None
+        if shape.world.moving:
+            displaced = shape.world.displacements(problem.times)
+        found.append(shape.clearance(shape.places(states), displaced))
     return np.min(found, axis=0) if found else None
-
-
-def _kept_clear(problem: Problem) -> tuple[ObstacleCost | Clearance, ...]:
-    """The costs and constraints that keep the robot clear of obstacles."""
-    return (*problem.obstacle_costs, *(one for one in problem.constraints if isinstance(one, Clearance)))

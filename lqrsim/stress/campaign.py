@@ -126,7 +126,11 @@ def run_resolved(
         results.resolved = scenario
         unfinished = _unfinished(results)
         if unfinished:
-            _check_versions(results)
+            if others := changed(results.manifest["versions"]):
+                raise InputError(
+                    f"versions: got {others}, which may change the last bits, want those that {folder} was begun with,"
+                    " or another folder"
+                )
             results.trials.warm_up()  # here first: the workers then find everything compiled
         job = Job.of(results.trials, results.manifest["digest"], batch)
         total = campaign.trials * len(results.cells)
@@ -138,7 +142,7 @@ def run_resolved(
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = executors.run_here(job, unfinished, results.trials)
+            work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
@@ -148,14 +152,6 @@ def run_resolved(
             if (counted := results.tally(cell).total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
-
-
-def _check_versions(results: Results) -> None:
-    if others := changed(results.manifest["versions"]):
-        raise InputError(
-            f"versions: got {others}, which may change the last bits, want those that {results.folder} was begun with,"
-            " or another folder"
-        )
 
 
 def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:

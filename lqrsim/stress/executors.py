@@ -29,7 +29,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import CancelledError
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -38,7 +38,7 @@ from typing import Any
 from lqrsim import process
 from lqrsim.errors import InputError, format_error
 from lqrsim.stress.specification import Shard
-from lqrsim.stress.trials import Job, Trials
+from lqrsim.stress.trials import Job
 from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
@@ -51,12 +51,6 @@ _NAME = "lqrsim worker"
 _RUNS_THE_SCRIPT = 79  # exit code of a worker whose import of the caller's script starts the campaign again
 _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
 _serving = False  # whether this process is a worker that has imported the caller's script
-
-
-def run_here(job: Job, shards: Iterable[Shard], trials: Trials) -> FinishedShards:
-    """Run the shards in this process; yield each with its file. If the process dies, the campaign must be resumed."""
-    for shard in shards:
-        yield shard, job.work(shard, trials)
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:

@@ -27,6 +27,7 @@ from lqrsim.errors import (
     check_path,
     check_seed,
     check_text,
+    keep,
 )
 from lqrsim.machine import description
 from lqrsim.process import keeping
@@ -86,7 +87,7 @@ class ReliabilityProblem:
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
         check_text("sweep", self.sweep, "a name, such as 'light'")
-        object.__setattr__(self, "strength", check_number("strength", self.strength, above=0.0))
+        keep(self, strength=check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)
         if self.design_disturbances is not None:
             check_designed((self.policy,))
@@ -96,7 +97,7 @@ class ReliabilityProblem:
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
         for field in ("goal_radius", "goal_tolerance"):
             if (value := getattr(self, field)) is not None:
-                object.__setattr__(self, field, check_number(field, value, above=0.0))
+                keep(self, **{field: check_number(field, value, above=0.0)})
 
     @cached_property
     def score(self) -> TrialScore:

@@ -21,6 +21,7 @@ from lqrsim.errors import (
     check_number,
     check_seed,
     excerpt,
+    keep,
     numbers_of,
 )
 from lqrsim.problem.noise import Noise
@@ -166,9 +167,10 @@ def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike 
                 f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
             )
     none = np.zeros(len(starts), dtype=np.int64)
+    family = "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
     return Funnel(
         plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
-        shape=shapes, family=_family(shape), knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
+        shape=shapes, family=family, knots=np.array(starts), levels=none * 1.0, trials=none, successes=none,
         reasons=("",) * len(starts), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
         disturbances=trials.described, versions=versions(),
         rate=asked.rate, confidence=asked.confidence, seed=asked.seed,
@@ -222,8 +224,7 @@ class FunnelCheck:
         check_count("FunnelCheck: knot", self.knot, at_least=0)
         check_number("FunnelCheck: level", self.level, at_least=0.0)
         check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
-        successes = check_array("FunnelCheck: successes", self.successes, (None,)) != 0
-        object.__setattr__(self, "successes", successes)
+        keep(self, successes=check_array("FunnelCheck: successes", self.successes, (None,)) != 0)
 
 
 def check_funnel(
@@ -351,10 +352,6 @@ def _states(states: Sequence[str] | None, space: Coordinates) -> tuple[str, ...]
     if not given or len(set(given)) < len(given):
         raise InputError(f"states: got {excerpt(given)}, want different names, at least one")
     return tuple(check_name("states", name, known) for name in given)
-
-
-def _family(shape: object) -> str:
-    return "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
 
 
 def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list[int]) -> Array:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, numbers_of, shaped
+from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, keep, numbers_of, shaped
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import OUTCOMES as OUTCOMES
 from lqrsim.results.rollout import Rollout
@@ -50,11 +50,11 @@ class Outcomes:
         if not ((trial >= 0) & (trial == np.floor(trial)) & (trial < 2**63)).all():
             raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
         if type(self.trial) is not np.ndarray or self.trial.dtype != np.int64:
-            object.__setattr__(self, "trial", trial.astype(np.int64))
+            keep(self, trial=trial.astype(np.int64))
         for field in fields(self)[1:]:
             value, name = getattr(self, field.name), f"Outcomes: {field.name}"
             if field.name not in ("outcome", "obstacle"):
-                object.__setattr__(self, field.name, shaped(name, value, trial.shape))
+                keep(self, **{field.name: shaped(name, value, trial.shape)})
                 continue
             if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
                 raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_array, check_count, check_items, check_kind, check_seed, check_text
+from lqrsim.errors import InputError, check_array, check_count, check_items, check_kind, check_seed, check_text, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -38,8 +38,7 @@ class ComparedPlan:
     def __post_init__(self) -> None:
         check_text("ComparedPlan: start", self.start, "the name of a start", at_most=1000, empty=True)
         check_kind("ComparedPlan: solution", self.solution, Solution, "a Solution")
-        successes = check_array("ComparedPlan: successes", self.successes, (None,)) != 0
-        object.__setattr__(self, "successes", successes)
+        keep(self, successes=check_array("ComparedPlan: successes", self.successes, (None,)) != 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +57,7 @@ class SafestPlan:
 
     def __post_init__(self) -> None:
         check_kind("SafestPlan: solution", self.solution, Solution, "a Solution")
-        compared = check_items("SafestPlan: compared", self.compared, ComparedPlan, "a tuple of ComparedPlan")
-        object.__setattr__(self, "compared", compared)
+        keep(self, compared=check_items("SafestPlan: compared", self.compared, ComparedPlan, "a tuple of ComparedPlan"))
         check_kind("SafestPlan: reached", self.reached, Estimate, "an Estimate")
 
     def summary(self) -> str:
@@ -70,8 +68,7 @@ class SafestPlan:
             lines.append(f"  {plan.start}: cost {plan.solution.cost:.6g}, {found}")
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
 
 def smooth_safest(
@@ -110,7 +107,7 @@ def smooth_safest(
     found: list[tuple[str, Solution]] = []
     for candidate in first.candidates:
         plan = candidate.trajectory
-        if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
+        if not plan.finite:
             continue
         one = first if candidate.status is not None and candidate.cost == first.cost else smooth(problem, start=plan)
         if one.success and not any(_same(one, other) for _, other in found):

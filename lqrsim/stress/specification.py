@@ -20,6 +20,7 @@ from lqrsim.errors import (
     check_seed,
     check_text,
     excerpt,
+    keep,
 )
 from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
@@ -48,7 +49,7 @@ class Cell:
     def __post_init__(self) -> None:
         for name in ("policy", "sweep"):
             check_text(f"Cell: {name}", getattr(self, name), "a name")
-        object.__setattr__(self, "strength", check_number("Cell: strength", self.strength, at_least=0.0))
+        keep(self, strength=check_number("Cell: strength", self.strength, at_least=0.0))
 
     def __str__(self) -> str:
         return f"{self.policy},{self.sweep},{self.strength:g}"
@@ -133,11 +134,8 @@ class Campaign:
     design_disturbances: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
-        def keep(field: str, value: object) -> None:
-            object.__setattr__(self, field, value)
-
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
-        keep("scenario", from_anywhere(self.scenario))  # workers and reports may run in other folders
+        keep(self, scenario=from_anywhere(self.scenario))  # workers and reports may run in other folders
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
         wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
@@ -146,11 +144,11 @@ class Campaign:
             if "," in name:
                 raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")
         sweeps = self.sweeps.items()
-        keep("sweeps", {name: check_items(f"sweeps: {name}", some, Disturbance, wanted) for name, some in sweeps})
+        keep(self, sweeps={name: check_items(f"sweeps: {name}", some, Disturbance, wanted) for name, some in sweeps})
         strengths = check_items("strengths", self.strengths, object, "a tuple of numbers", at_most=1000)
-        keep("strengths", tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths))
+        keep(self, strengths=tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths))
         policies = check_items("policies", self.policies, object, f"a tuple of {', '.join(POLICIES)}", at_most=100)
-        keep("policies", tuple(check_name("policies", policy, POLICIES) for policy in policies))
+        keep(self, policies=tuple(check_name("policies", policy, POLICIES) for policy in policies))
         for field in ("strengths", "policies"):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):
@@ -162,10 +160,10 @@ class Campaign:
                 raise InputError(
                     "design_disturbances: got none, want at least one disturbance, or None for the default"
                 )
-            keep("design_disturbances", design)
+            keep(self, design_disturbances=design)
         for field in ("trials", "shard"):
-            keep(field, check_count(field, getattr(self, field)))
-        keep("seed", check_seed("seed", self.seed))
+            keep(self, **{field: check_count(field, getattr(self, field))})
+        keep(self, seed=check_seed("seed", self.seed))
         files = -(-self.trials // self.shard) * len(self.cells)
         if files > _MOST_FILES:
             raise InputError(
@@ -174,8 +172,8 @@ class Campaign:
             )
         for field in ("replan_every", "goal_radius", "goal_tolerance"):
             if (value := getattr(self, field)) is not None:
-                keep(field, check_number(field, value, above=0.0))
-        keep("time_limit", check_number("time_limit", self.time_limit, above=0.0))
+                keep(self, **{field: check_number(field, value, above=0.0)})
+        keep(self, time_limit=check_number("time_limit", self.time_limit, above=0.0))
 
     @property
     def cells(self) -> list[Cell]:

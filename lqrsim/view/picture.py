@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
-from lqrsim.errors import Array, InputError, check_count, check_items, check_kind, check_name, check_text, excerpt
+from lqrsim.errors import Array, InputError, check_count, check_items, check_kind, check_name, check_text, excerpt, keep
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -211,8 +211,7 @@ class PictureOptions:
             check_text("titles", title, "a title", at_most=100, empty=True)
         if len(insets) > MOST_INSETS:
             raise InputError(f"insets: got {len(insets)}, want {MOST_INSETS} at most")
-        for name, value in (("insets", insets), ("overlays", overlays), ("titles", titles), ("size", size)):
-            object.__setattr__(self, name, value)
+        keep(self, insets=insets, overlays=overlays, titles=titles, size=size)
 
     @property
     def settings(self) -> QualitySettings:

@@ -8,7 +8,7 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_name, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_name, check_number, excerpt, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
@@ -39,15 +39,13 @@ class MotorLag(Disturbance):
 
     time_constant: float
 
+    _scales = "time_constant"
+
     def __post_init__(self) -> None:
-        constant = check_number("MotorLag: time_constant", self.time_constant, at_least=0.0)
-        object.__setattr__(self, "time_constant", constant)
+        keep(self, time_constant=check_number("MotorLag: time_constant", self.time_constant, at_least=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"motor lag, time constant {self.time_constant:g} s"
-
-    def scaled(self, strength: float) -> "MotorLag":
-        return replace(self, time_constant=times(self, self.time_constant, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         if self.time_constant == 0:
@@ -92,11 +90,10 @@ class Saturation(Disturbance):
             got = "both" if given else "neither"
             raise InputError(f"Saturation: share: got {got} share and limits, want lowest, highest or both, or a share")
         for name in given:
-            object.__setattr__(self, name, check_numbers(self, name, getattr(self, name)))
+            keep(self, **{name: check_numbers(self, name, getattr(self, name))})
         if self.share is not None:
-            share = check_number("Saturation: share", self.share, at_least=0.0, at_most=1.0)
-            object.__setattr__(self, "share", share)
-        object.__setattr__(self, "strength", check_strength(self, self.strength))
+            keep(self, share=check_number("Saturation: share", self.share, at_least=0.0, at_most=1.0))
+        keep(self, strength=check_strength(self, self.strength))
 
     def describe(self, plant: Plant) -> str:
         space = plant.robot.dynamics.control_coordinates
@@ -181,9 +178,8 @@ class ActuatorLoss(Disturbance):
     def __post_init__(self) -> None:
         if self.actuator is not None and not isinstance(self.actuator, str):
             raise InputError(f"ActuatorLoss: actuator: got {excerpt(self.actuator)}, want a name, or None to draw one")
-        object.__setattr__(self, "at", check_number("ActuatorLoss: at", self.at, at_least=0.0))
-        remaining = check_number("ActuatorLoss: remaining", self.remaining, at_least=0.0, at_most=1.0)
-        object.__setattr__(self, "remaining", remaining)
+        keep(self, at=check_number("ActuatorLoss: at", self.at, at_least=0.0))
+        keep(self, remaining=check_number("ActuatorLoss: remaining", self.remaining, at_least=0.0, at_most=1.0))
 
     def describe(self, plant: Plant) -> str:
         which = self.actuator or f"one of {', '.join(plant.robot.actuators)}"
@@ -229,9 +225,7 @@ class ActuatorLoss(Disturbance):
         return Effect(alter=alter, actuate=actuate)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        if self.remaining == 1:
-            return Uncertainty()
-        return left_out(self, plant, "it is not a small deviation, and comes once")
+        return left_out(self, plant, "it is not a small deviation, and comes once", acts=self.remaining != 1)
 
 
 def check_gains(disturbance: Disturbance, plant: Plant) -> None:

@@ -9,7 +9,7 @@ plant that cannot have it; `uncertainty` describes it to filters, tracking laws 
 import abc
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
+    keep,
     real,
     shaped,
 )
@@ -86,14 +87,15 @@ class Effect:
                 factors[name] = check_array(f"Effect: factors: {name}", one, (None, None))
                 if not (factors[name] > 0).all():
                     raise InputError(f"Effect: factors: {name}: got {factors[name].min():g}, want numbers > 0")
-            object.__setattr__(self, "factors", factors)
+            keep(self, factors=factors)
         if self.displaced is not None:
-            displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
-            object.__setattr__(self, "displaced", displaced)
+            keep(self, displaced=shaped("Effect: displaced", self.displaced, (None, None, 3)))
 
 
 class Disturbance(abc.ABC):
     """Base class of all disturbances."""
+
+    _scales: ClassVar[str] = ""  # the field of a dataclass that is proportional to the effect
 
     def describe(self, plant: Plant) -> str:
         """The disturbance in words and units, for records. By default its repr.
@@ -112,6 +114,9 @@ class Disturbance(abc.ABC):
         Raises:
           InputError: the class does not implement it, or the strength is out of range.
         """
+        if self._scales:
+            one: Any = self
+            return replace(one, **{self._scales: times(self, getattr(self, self._scales), strength)})
         raise InputError(
             f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
         )
@@ -161,21 +166,18 @@ class GaussianDisturbance(Disturbance):
 
     std: Numbers
 
+    _scales = "std"
     along: ClassVar[str] = ""  # the components, if they are the same for every plant
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_numbers(self, "std", self.std, at_least=0.0))
+        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0))
         if self.along:
             fit(self, self.std, self.along)
 
-    def scaled(self, strength: float) -> Self:
-        """The same with `strength` times the standard deviation."""
-        return replace(self, std=times(self, self.std, strength))
 
-
-def left_out(disturbance: Disturbance, plant: Plant, why: str) -> Uncertainty:
-    """The Uncertainty of a disturbance that linear models cannot have: its description and the reason."""
-    return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",))
+def left_out(disturbance: Disturbance, plant: Plant, why: str, *, acts: bool = True) -> Uncertainty:
+    """The Uncertainty of a disturbance that linear models cannot have: description and reason, if it acts at all."""
+    return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",) if acts else ())
 
 
 def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:

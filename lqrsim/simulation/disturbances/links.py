@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, check_count, check_number
+from lqrsim.errors import Array, check_count, check_number, keep
+from lqrsim.results.fields import SHARE, Bounds, check_fields
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, Hook, check_strength, times, uniform
 from lqrsim.simulation.plant import Plant
@@ -25,13 +26,17 @@ class Late(Disturbance):
     periods: int
 
     what: ClassVar[str]
+    known_as: ClassVar[str]  # to an Uncertainty
 
     def __post_init__(self) -> None:
-        periods = check_count(f"{type(self).__name__}: periods", self.periods, at_least=0)
-        object.__setattr__(self, "periods", periods)
+        keep(self, periods=check_count(f"{type(self).__name__}: periods", self.periods, at_least=0))
 
     def describe(self, plant: Plant) -> str:
         return f"{self.what} late by {self.periods} control period{'' if self.periods == 1 else 's'}"
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        told: dict[str, Any] = {self.known_as: self.periods}
+        return Uncertainty(**told)
 
     def scaled(self, strength: float) -> Self:
         """The same with `strength` times the periods, rounded to whole ones.
@@ -49,7 +54,7 @@ class ControlDelay(Late):
       periods: the delay in control periods.
     """
 
-    what = "commands"
+    what, known_as = "commands", "delay"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         under_way: list[Array] = []
@@ -62,9 +67,6 @@ class ControlDelay(Late):
 
         return Effect(actuate=actuate)
 
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(delay=self.periods)
-
 
 class MeasurementLatency(Late):
     """Measurements arrive late; until then the first one is repeated.
@@ -73,7 +75,7 @@ class MeasurementLatency(Late):
       periods: the delay in control periods.
     """
 
-    what = "measurements"
+    what, known_as = "measurements", "latency"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         seen: list[Array] = []
@@ -83,9 +85,6 @@ class MeasurementLatency(Late):
             return seen.pop(0) if len(seen) > self.periods else seen[0].copy()
 
         return Effect(measure=measure)
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        return Uncertainty(latency=self.periods)
 
 
 @dataclass(frozen=True)
@@ -99,17 +98,13 @@ class GilbertElliott:
       lost_when_bad: share that is lost while bad.
     """
 
-    to_bad: float
-    to_good: float
-    lost_when_good: float = 0.0
-    lost_when_bad: float = 1.0
+    to_bad: Annotated[float, SHARE]
+    to_good: Annotated[float, Bounds(above=0.0, at_most=1.0)]  # or a bad link stays bad forever
+    lost_when_good: Annotated[float, SHARE] = 0.0
+    lost_when_bad: Annotated[float, SHARE] = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("to_bad", "to_good", "lost_when_good", "lost_when_bad"):
-            above, at_least = (0.0, None) if name == "to_good" else (None, 0.0)  # or a bad link stays bad forever
-            field = f"GilbertElliott: {name}"
-            value = check_number(field, getattr(self, name), above=above, at_least=at_least, at_most=1.0)
-            object.__setattr__(self, name, value)
+        check_fields(self)
 
     @property
     def bad(self) -> float:
@@ -151,11 +146,11 @@ class Dropouts(Disturbance):
     loss: float | GilbertElliott
 
     what: ClassVar[str]
+    known_as: ClassVar[str]  # to an Uncertainty
 
     def __post_init__(self) -> None:
         if not isinstance(self.loss, GilbertElliott):
-            loss = check_number(f"{type(self).__name__}: loss", self.loss, at_least=0.0, at_most=1.0)
-            object.__setattr__(self, "loss", loss)
+            keep(self, loss=check_number(f"{type(self).__name__}: loss", self.loss, at_least=0.0, at_most=1.0))
 
     def describe(self, plant: Plant) -> str:
         if not isinstance(self.loss, GilbertElliott):
@@ -181,6 +176,18 @@ class Dropouts(Disturbance):
         to_bad, lost = min(1.0, strength * loss.to_bad), min(1.0, strength * loss.lost_when_good)
         return replace(self, loss=replace(loss, to_bad=to_bad, lost_when_good=lost))
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """The share that is lost, as if losses were independent.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `loss` or `command_loss`.
+        """
+        told: dict[str, Any] = {self.known_as: self.share}
+        return Uncertainty(**told)
+
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
         """Draw whether each of T items is lost, (K, T)."""
         if isinstance(self.loss, GilbertElliott):
@@ -195,22 +202,11 @@ class MeasurementDropouts(Dropouts):
       loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
     """
 
-    what = "measurements"
+    what, known_as = "measurements", "loss"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         lost = self.draw(plan.steps + 1, generators)
         return Effect(measure=_last_received(lost, plan.states[0]))
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The share that is lost, as if losses were independent.
-
-        Args:
-          plant: as in `uncertainty_of`.
-
-        Returns:
-          An Uncertainty with `loss`.
-        """
-        return Uncertainty(loss=self.share)
 
 
 class CommandDropouts(Dropouts):
@@ -220,22 +216,11 @@ class CommandDropouts(Dropouts):
       loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
     """
 
-    what = "commands"
+    what, known_as = "commands", "command_loss"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         lost = self.draw(plan.steps, generators)
         return Effect(actuate=_last_received(lost, plan.controls[0]))
-
-    def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The share that is lost, as if losses were independent.
-
-        Args:
-          plant: as in `uncertainty_of`.
-
-        Returns:
-          An Uncertainty with `command_loss`.
-        """
-        return Uncertainty(command_loss=self.share)
 
 
 def _last_received(lost: npt.NDArray[np.bool_], first: Array) -> Hook:

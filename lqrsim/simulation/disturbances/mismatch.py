@@ -17,7 +17,7 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown, possible_unknowns
-from lqrsim.errors import Array, InputError, check_name, check_number, check_text
+from lqrsim.errors import Array, InputError, check_name, check_number, check_text, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.actuation import check_gains
 from lqrsim.simulation.disturbances.base import (
@@ -28,7 +28,6 @@ from lqrsim.simulation.disturbances.base import (
     check_strength,
     fit,
     left_out,
-    times,
     unknowns_of,
     words,
 )
@@ -61,12 +60,12 @@ class Mismatch(Disturbance):
             got = "neither of" if self.std is None else "both"
             raise InputError(f"{name}: got {got} std and factor, want one of the two")
         if self.std is not None:
-            object.__setattr__(self, "std", check_number(f"{name}: std", self.std, at_least=0.0, below=1 / CUT))
+            keep(self, std=check_number(f"{name}: std", self.std, at_least=0.0, below=1 / CUT))
         if self.factor is not None:
             factor = check_numbers(self, "factor", self.factor)
             if not np.min(factor) > 0:
                 raise InputError(f"{name}: factor: got {np.min(factor):g}, want numbers > 0")
-            object.__setattr__(self, "factor", factor)
+            keep(self, factor=factor)
 
     def parts(self, plant: Plant) -> Sequence[str]:
         """The parts that have a factor each."""
@@ -139,8 +138,10 @@ class Payload(Disturbance):
     mass: float
     body: str
 
+    _scales = "mass"
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("Payload: mass", self.mass, at_least=0.0))
+        keep(self, mass=check_number("Payload: mass", self.mass, at_least=0.0))
         check_text("Payload: body", self.body, "the name of a body")
 
     def check(self, plant: Plant) -> None:
@@ -153,14 +154,6 @@ class Payload(Disturbance):
 
     def describe(self, plant: Plant) -> str:
         return f"a load of {self.mass:g} kg on {self.body}"
-
-    def scaled(self, strength: float) -> "Payload":
-        """The same with another mass.
-
-        Args:
-          strength: factor of the mass, at least 0.
-        """
-        return replace(self, mass=times(self, self.mass, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
@@ -187,9 +180,8 @@ class InertiaMismatch(Mismatch):
     what = parameter = "inertia"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        if not self.spread(plant).any():
-            return Uncertainty()
-        return left_out(self, plant, "it changes the effect of controls, but not an undisturbed run")
+        why = "it changes the effect of controls, but not an undisturbed run"
+        return left_out(self, plant, why, acts=bool(self.spread(plant).any()))
 
 
 class ThrustMismatch(Mismatch):
@@ -287,9 +279,7 @@ class FrictionMismatch(WheelMismatch):
         simulations.expand("geom_friction")[:, wheels, 0] *= factors
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        if not self.spread(plant).any():
-            return Uncertainty()
-        return left_out(self, plant, "the dynamics of plans have no friction")
+        return left_out(self, plant, "the dynamics of plans have no friction", acts=bool(self.spread(plant).any()))
 
 
 def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertainty:

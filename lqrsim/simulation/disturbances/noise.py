@@ -1,13 +1,13 @@
 """Gaussian disturbances: noise on controls, measurements, forces and states, wrong starts and obstacles; and pushes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown
-from lqrsim.errors import Array, InputError, check_array, check_items, check_number
+from lqrsim.errors import Array, InputError, check_array, check_items, check_number, keep
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -19,7 +19,6 @@ from lqrsim.simulation.disturbances.base import (
     fit,
     left_out,
     normal,
-    times,
     unknowns_of,
     with_units,
     words,
@@ -27,14 +26,17 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-class StateError(GaussianDisturbance):
-    """Base class of Gaussian errors of the states."""
+class AddedError(GaussianDisturbance):
+    """Base class of Gaussian errors that are added to states or controls: anew at each step, or one for a whole run."""
 
     what: ClassVar[str]
+    hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # of an `Effect`
+    lasts: ClassVar[bool] = True
 
     def _coordinates(self, plant: Plant) -> Coordinates:
         """The quantity to which the error is added."""
-        return plant.robot.dynamics.state_coordinates
+        dynamics = plant.robot.dynamics
+        return dynamics.control_coordinates if self.hook == "actuate" else dynamics.state_coordinates
 
     def describe(self, plant: Plant) -> str:
         return f"{self.what}, std {with_units(self, self.std, self._coordinates(plant))}"
@@ -48,101 +50,76 @@ class StateError(GaussianDisturbance):
         std = self._deviations(plant)
         return tuple(std.tolist()) if std.any() else 0.0
 
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
+        errors = std * normal(generators, steps, len(std))
+        if self.hook == "initial_states":
+            return Effect(initial_states=lambda states: states + errors[:, 0])
+        hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.lasts else step]}
+        return Effect(**hooks)
 
-class ControlNoise(StateError):
+
+class ControlNoise(AddedError):
     """White noise on each control, redrawn each control period.
 
     Args:
       std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, or one per control.
     """
 
-    what = "control noise"
-
-    def _coordinates(self, plant: Plant) -> Coordinates:
-        return plant.robot.dynamics.control_coordinates
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self._deviations(plant)
-        noise = std * normal(generators, plan.steps, len(std))
-        return Effect(actuate=lambda step, controls: controls + noise[:, step])
+    what, hook, lasts = "control noise", "actuate", False
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return Uncertainty(control=self._std_for_filters(plant))
 
 
-class ControlOffset(StateError):
+class ControlOffset(AddedError):
     """A constant error of each control, drawn for each trial from a normal distribution.
 
     Args:
       std: standard deviation in the control's unit; one number, or one per control.
     """
 
-    what = "control offset"
-
-    def _coordinates(self, plant: Plant) -> Coordinates:
-        return plant.robot.dynamics.control_coordinates
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self._deviations(plant)
-        offset = std * normal(generators, 1, len(std))[:, 0]
-        return Effect(actuate=lambda step, controls: controls + offset)
+    what, hook = "control offset", "actuate"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         controls = zip(self._coordinates(plant).names, self._deviations(plant).tolist(), strict=True)
         return unknowns_of(self, plant, [Unknown(OFFSET + name, std) for name, std in controls])
 
 
-class MeasurementNoise(StateError):
+class MeasurementNoise(AddedError):
     """White noise on each measured state.
 
     Args:
       std: standard deviation in the state's unit; one number, or one per state.
     """
 
-    what = "measurement noise"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self._deviations(plant)
-        noise = std * normal(generators, plan.steps + 1, len(std))
-        return Effect(measure=lambda step, states: states + noise[:, step])
+    what, hook, lasts = "measurement noise", "measure", False
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return Uncertainty(measurement=self._std_for_filters(plant))
 
 
-class MeasurementBias(StateError):
+class MeasurementBias(AddedError):
     """A constant error of each measured state, drawn for each trial from a normal distribution.
 
     Args:
       std: standard deviation in the state's unit; one number, or one per state.
     """
 
-    what = "measurement bias"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self._deviations(plant)
-        bias = std * normal(generators, 1, len(std))[:, 0]
-        return Effect(measure=lambda step, states: states + bias)
+    what, hook = "measurement bias", "measure"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        if not np.any(self.std):
-            return Uncertainty()
-        return left_out(self, plant, "measurements cannot distinguish it from the state")
+        return left_out(self, plant, "measurements cannot distinguish it from the state", acts=bool(np.any(self.std)))
 
 
-class InitialStateError(StateError):
+class InitialStateError(AddedError):
     """The robot begins off the first state of the plan.
 
     Args:
       std: standard deviation in the state's unit; one number, or one per state.
     """
 
-    what = "initial state off"
-
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        std = self._deviations(plant)
-        error = std * normal(generators, 1, len(std))[:, 0]
-        return Effect(initial_states=lambda states: states + error)
+    what, hook = "initial state off", "initial_states"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return Uncertainty(start=self._std_for_filters(plant))
@@ -160,11 +137,8 @@ class WrenchNoise(GaussianDisturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         vectors = fit(self, self.std, self.along) * normal(generators, plan.steps, 3)
-
-        def push(step: int, states: Array) -> Array:
-            return vectors[:, step]
-
-        return Effect(force=push) if self.kind == "force" else Effect(torque=push)
+        hooks: dict[str, Any] = {self.kind: lambda step, states: vectors[:, step]}
+        return Effect(**hooks)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         axes = zip(self.along, fit(self, self.std, self.along).tolist(), strict=True)
@@ -287,15 +261,14 @@ class Push(Disturbance):
     impulse: Sequence[float]
     at: float
 
+    _scales = "impulse"
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "impulse", tuple(check_array("Push: impulse", self.impulse, (3,)).tolist()))
-        object.__setattr__(self, "at", check_number("Push: at", self.at, at_least=0.0))
+        keep(self, impulse=tuple(check_array("Push: impulse", self.impulse, (3,)).tolist()))
+        keep(self, at=check_number("Push: at", self.at, at_least=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"push of {words(self.impulse)} N s at {self.at:g} s"
-
-    def scaled(self, strength: float) -> "Push":
-        return replace(self, impulse=times(self, self.impulse, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         period = int(self.at / plan.dt + 1e-9)  # a time that is a knot up to rounding belongs to the period after it
@@ -306,4 +279,4 @@ class Push(Disturbance):
         return Effect(force=lambda step, states: np.broadcast_to(forces[step], (len(states), 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "it comes once, and noise does not") if any(self.impulse) else Uncertainty()
+        return left_out(self, plant, "it comes once, and noise does not", acts=any(self.impulse))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.control.uncertainty import Uncertainty, Unknown
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, keep
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
@@ -55,14 +55,13 @@ class MeanWind(Wind):
 
     velocity: Sequence[float]
 
+    _scales = "velocity"
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "velocity", tuple(check_array("MeanWind: velocity", self.velocity, (3,)).tolist()))
+        keep(self, velocity=tuple(check_array("MeanWind: velocity", self.velocity, (3,)).tolist()))
 
     def describe(self, plant: Plant) -> str:
         return f"wind of {words(self.velocity)} m/s"
-
-    def scaled(self, strength: float) -> "MeanWind":
-        return replace(self, velocity=times(self, self.velocity, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
@@ -93,17 +92,15 @@ class Gusts(Wind):
     std: Numbers = 1.0
     time_constant: float = 1.0
 
+    _scales = "std"
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_numbers(self, "std", self.std, at_least=0.0))
+        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0))
         fit(self, self.std, "xyz")
-        constant = check_number("Gusts: time_constant", self.time_constant, above=0.0)
-        object.__setattr__(self, "time_constant", constant)
+        keep(self, time_constant=check_number("Gusts: time_constant", self.time_constant, above=0.0))
 
     def describe(self, plant: Plant) -> str:
         return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
-
-    def scaled(self, strength: float) -> "Gusts":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
@@ -135,10 +132,9 @@ class Dryden(Wind):
         if isinstance(self.wind, str):
             check_name("Dryden: wind", self.wind, SEVERITIES)
         else:
-            object.__setattr__(self, "wind", check_number("Dryden: wind", self.wind, at_least=0.0))
-        altitude = check_number("Dryden: altitude", self.altitude, at_least=0.0, at_most=1000 * FOOT)
-        object.__setattr__(self, "altitude", altitude)
-        object.__setattr__(self, "direction", check_number("Dryden: direction", self.direction))
+            keep(self, wind=check_number("Dryden: wind", self.wind, at_least=0.0))
+        keep(self, altitude=check_number("Dryden: altitude", self.altitude, at_least=0.0, at_most=1000 * FOOT))
+        keep(self, direction=check_number("Dryden: direction", self.direction))
 
     @property
     def wind_at_20_ft(self) -> float:

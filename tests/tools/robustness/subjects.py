@@ -25,17 +25,7 @@ from robustness.place import Place
 
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
-HOOKS |= {
-    "displace",
-    "across",
-    "clearance_at",
-    "middles",
-    "travel",
-    "world_seen",
-    "record_of_balls",
-    "uncertainty",
-    "spread",
-}
+HOOKS |= {"displace", "world_seen", "filling", "record_of_balls", "uncertainty", "spread", "KeepsClear.in_world"}
 HOOKS |= {
     "solving",
     "softened",
@@ -43,7 +33,6 @@ HOOKS |= {
     "contact_modes",
     "check_period",
     "ControllerRun.control",
-    "Plant.nearest",
     "effect",
 }
 HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for name in ("step", "states", "place")}

@@ -1,0 +1,306 @@
+"""What of a robot must stay clear of obstacles: a ball at its position, several balls, or the geoms of an MJCF.
+
+`ShapeInWorld` is such a shape among obstacles, with all that plans, chances of collision and simulations ask of it.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.distances import distances_with_normals, signed_distance, signed_distance_displaced
+from lqrsim.codegen.sources import Source
+from lqrsim.codegen.user_functions import Term
+from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
+from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.scenes.scene import Scene
+from lqrsim.scenes.world import ROW, World
+from lqrsim.scenes.world import signed_distance as signed_distance_of_one
+
+TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
+
+
+@dataclass(frozen=True)
+class GeomDistances(Term):
+    """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
+
+    The source defines `distances(x, data, out)`, which writes one number per row, and `distances_jacobian(x, data, out,
+    slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
+
+    Attributes:
+      parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle; -1
+        for the nearest of all.
+      moved: number of states, from the first one on, that the distances depend on.
+    """
+
+    parts: tuple[str, ...]
+    obstacles: tuple[int, ...]
+    moved: int
+
+    def filling(self, kernel: Source) -> Source:
+        """A kernel of costs or constraints, with the distances as what it calls places."""
+        return kernel.filled(places=(self.code, "distances"), places_jacobian=(self.code, "distances_jacobian"))
+
+
+class CollisionGeoms(abc.ABC):
+    """The colliding geoms of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
+
+    `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all of it clear.
+    """
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> float:
+        """The radius of the largest geom's bounding sphere, in metres."""
+
+    @abc.abstractmethod
+    def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
+        """The distances up to `reach` in m, for a system. `clearances` and `slopes` raise InputError as this does.
+
+        Raises:
+          InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
+        """
+
+    @abc.abstractmethod
+    def clearances(
+        self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
+    ) -> Array:
+        """Signed distances (..., O) in m to the obstacles at states (..., n).
+
+        With obstacles displaced by (K, O, 3) in m, the states are (K, ..., n).
+        """
+
+    @abc.abstractmethod
+    def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
+        """Signed distances (K, O) in m to the obstacles at states (K, n), and their derivatives (K, O, n)."""
+
+    @abc.abstractmethod
+    def of_scene(self, scene: Scene) -> bool:
+        """Whether these are the geoms of that scene, with its obstacles."""
+
+    @abc.abstractmethod
+    def travel(self, before: Array, after: Array) -> Array:
+        """How far any point moves at most on a straight line between states (..., n), (...) in m."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeInWorld:
+    """A robot's collision shape among obstacles: one ball, or several; of geoms it is a `GeomsInWorld`.
+
+    Its *places* at states (..., n) are the middles of its balls, (..., B, 2 or 3) in m; of geoms the states, (..., 1,
+    n).
+
+    Attributes:
+      dynamics: of the robot. world: the obstacles, in the coordinates of the places.
+      radii: of the balls in m, (B,); of geoms that of the largest one.
+      names: of the balls. centers: their middles; None for one ball at the robot's position.
+    """
+
+    dynamics: Dynamics
+    world: World
+    radii: Array
+    names: tuple[str, ...] = ("",)
+    centers: SphereCenters | None = None
+
+    @property
+    def moved_by(self) -> tuple[int, ...]:
+        """The states that the places depend on, by their indices."""
+        return self.dynamics.state_coordinates.position if self.centers is None else self.centers.depends_on
+
+    @property
+    def in_plane(self) -> bool:
+        """Whether the places are in the plane of the robot's position."""
+        return len(self.dynamics.state_coordinates.position) == 2 if self.centers is None else self.centers.in_plane
+
+    def places(self, states: Array) -> Array:
+        """The places at states (..., n)."""
+        if self.centers is None:
+            return states[..., None, list(self.moved_by)]
+        return evaluate(self.centers, len(self.radii), states)
+
+    def clearance(self, places: Array, displaced: Array | None = None) -> Array:
+        """Signed distance to the nearest obstacle, minus the radius, at places: (...) in m; infinite without obstacles.
+
+        Args:
+          displaced: (K, O, 3) in m, by how much obstacles are elsewhere; the first axis of the places is then K.
+        """
+        if not len(self.world):
+            return np.full(places.shape[:-2], np.inf)
+        if displaced is None:
+            return (signed_distance(self.world, places) - self.radii).min(axis=-1)
+        flat = places.reshape(len(places), -1, places.shape[-1])
+        found = signed_distance_displaced(self.world, flat, displaced).reshape(places.shape[:-1])
+        return (found - self.radii).min(axis=-1)
+
+    def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
+        """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).
+
+        They are those of the nearest ball.
+        """
+        knots, count, size = np.arange(len(states))[:, None], len(self.radii), states.shape[1]
+        if self.centers is None:
+            places, move = self.places(states), np.eye(size)[list(self.moved_by)]
+            slopes = np.broadcast_to(move, (len(states), 1, *move.shape))
+        else:
+            places, slopes = evaluate_slopes(self.centers, count, states)
+        distances, normals = distances_with_normals(self.world, places.reshape(-1, places.shape[-1]))
+        clearance = distances.reshape(len(states), count, -1) - self.radii[:, None]
+        nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
+        normals = normals.reshape(len(states), count, -1, places.shape[-1])[knots, nearest, obstacle]
+        moves = slopes[knots, nearest][..., list(along)]
+        return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
+
+    def nearest(self, places: Array, displaced: Array) -> int:
+        """The number of the obstacle that is nearest at places (B, 2 or 3), when displaced by (O, 3)."""
+        points, table = np.zeros((len(places), 3)), self.world.table.ravel()
+        points[:, : places.shape[1]] = places
+        found = np.full(len(self.world), np.inf)
+        larger = self.radii - self.radii.min()  # what all have changes no order, except by rounding
+        for point, radius in zip(points, larger, strict=True):
+            there = (point - displaced).tolist()  # seen from where each obstacle is
+            own = [signed_distance_of_one(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
+            found = np.minimum(found, own)
+        return int(np.argmin(found))
+
+    def travel(self, before: Array, after: Array) -> Array:
+        """How far any point goes at most on a straight line between places, (...) in m."""
+        return np.linalg.norm(after - before, axis=-1).max(axis=-1)
+
+    def inside(self, state: Array) -> tuple[str, str] | None:
+        """Where a state, which may have NaNs, is inside an obstacle, and the remedy, as texts; None if it is clear."""
+        for name, radius, place in zip(self.names, self.radii, self.places(state), strict=True):
+            if len(self.world) and not np.isnan(place).any():
+                distances = self.world.distances(place) - radius
+                if distances.min() < 0:
+                    what, whose = (f"with {name!r} ", "its radius") if self.centers else ("", "the robot's radius")
+                    at, deep = ", ".join(f"{value:g}" for value in place), -distances.min()
+                    obstacle = self.world.names[int(distances.argmin())]
+                    where = f"{what}at ({at}) m, {deep:.3g} m inside obstacle {obstacle!r}"
+                    return where, f" of obstacles by {whose} of {radius:g} m"
+        return None
+
+    def across(self, vectors: Array) -> Array:
+        """Vectors (..., 3) along the axes of the scene, along those of `world`."""
+        space = self.dynamics.state_coordinates
+        if not self.in_plane:
+            return vectors
+        normal = np.cross(*np.eye(3)[list(space.world_axes)])
+        return np.concatenate([space.of_world(vectors), (vectors @ normal)[..., None]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GeomsInWorld(ShapeInWorld):
+    """Geoms among obstacles.
+
+    Attributes:
+      geoms: the geoms, which know their distances.
+    """
+
+    geoms: CollisionGeoms
+
+    @property
+    def moved_by(self) -> tuple[int, ...]:
+        return tuple(range(self.geoms.bind(self.dynamics, self.world, 0.0).moved))
+
+    @property
+    def in_plane(self) -> bool:
+        return False
+
+    def places(self, states: Array) -> Array:
+        return states[..., None, :]
+
+    def clearance(self, places: Array, displaced: Array | None = None) -> Array:
+        """NaN where the states are."""
+        states = places[..., 0, :]
+        known = np.asarray(np.isfinite(states).all(axis=-1))
+        if not len(self.world):
+            return np.full(known.shape, np.inf)
+        states = np.where(known[..., None], states, 0.0)
+        found = self.geoms.clearances(self.dynamics, self.world, states, displaced).min(axis=-1)
+        return found if known.all() else np.where(known, found, np.nan)
+
+    def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
+        distances, slopes = self.geoms.slopes(self.dynamics, self.world, states)
+        return distances, slopes[..., list(along)]
+
+    def nearest(self, places: Array, displaced: Array) -> int:
+        return int(self.geoms.clearances(self.dynamics, self.world, places[None], displaced[None])[0, 0].argmin())
+
+    def travel(self, before: Array, after: Array) -> Array:
+        return self.geoms.travel(before[..., 0, :], after[..., 0, :])
+
+    def inside(self, state: Array) -> tuple[str, str] | None:
+        if not len(self.world) or np.isnan(state).any():
+            return None
+        distances = self.geoms.clearances(self.dynamics, self.world, state)
+        if distances.min() >= -TOUCHING:
+            return None
+        where = f"{-distances.min():.3g} m inside obstacle {self.world.names[int(distances.argmin())]!r}"
+        return where, "; or, if that geom is no obstacle, obstacles= of the robot without it"
+
+
+def shape_in(
+    dynamics: Dynamics, world: World, *, radius: float = 0.0, balls: CollisionSpheres | None = None,
+    geoms: CollisionGeoms | None = None,
+) -> ShapeInWorld:  # fmt: skip
+    """The shape of a robot among obstacles; a ball at its position, of a robot that has none, is among none.
+
+    Raises:
+      InputError: it does not fit the dynamics.
+    """
+    space = dynamics.state_coordinates
+    if geoms is not None:
+        return GeomsInWorld(dynamics, world, np.array([geoms.size]), geoms=geoms)
+    if balls is not None:
+        centers = balls.bind(dynamics)
+        return ShapeInWorld(dynamics, centers.world_seen(world, space), balls.radii, balls.names, centers)
+    seen = world.seen_by(space.plane, space.offset) if space.position else World()
+    return ShapeInWorld(dynamics, seen, np.array([radius]))
+
+
+class KeepsClear:
+    """A cost or a constraint that keeps a robot clear of obstacles.
+
+    Attributes:
+      world: the obstacles. shape: the robot's, as the one keyword that was given of radius, balls and geoms.
+      radius: as given; of balls that of the largest, of geoms 0. balls, geoms: None where they were not given.
+    """
+
+    def _set_shape(
+        self, world: World, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None
+    ) -> None:
+        who = type(self).__name__
+        if not isinstance(world, World):
+            raise InputError(f"{who}: world: got {excerpt(world)}, want a World, such as scene.world")
+        check_kind(f"{who}: balls", balls, (CollisionSpheres, type(None)), "CollisionSpheres(places, radii)")
+        check_kind(f"{who}: geoms", geoms, (CollisionGeoms, type(None)), "those of a robot from an MJCF, robot.geoms")
+        shape: dict[str, Any] = {"radius": radius, "balls": balls, "geoms": geoms}
+        self.shape = {name: one for name, one in shape.items() if one is not None}
+        if len(self.shape) != 1:
+            got = " and ".join(self.shape) or "none of radius, balls and geoms"
+            wanted = "one of them: radius=robot.radius, balls=robot.balls or geoms=robot.geoms"
+            raise InputError(f"{who}: got {got}, want {wanted}")
+        if radius is not None:
+            self.shape["radius"] = check_number(f"{who}: radius", radius, at_least=0.0)
+        self.world, self.balls, self.geoms = world, balls, geoms
+        self.radius: float = self.shape.get("radius", 0.0 if balls is None else float(balls.radii.max()))
+
+    @property
+    def moving(self) -> bool:
+        return self.world.moving
+
+    def in_world(self, dynamics: Dynamics, time: float = 0.0) -> ShapeInWorld:
+        """The shape among the obstacles, where they are at a time in s. Raises InputError if it does not fit."""
+        if "radius" in self.shape and not dynamics.state_coordinates.position:
+            wanted = "Dynamics(..., position=(names)), or balls="
+            raise InputError(f"{type(self).__name__}: got dynamics without a position, want {wanted}")
+        return shape_in(dynamics, self.world.moved(time) if time else self.world, **self.shape)
+
+
+def each_once(kept: Sequence[KeepsClear]) -> list[KeepsClear]:
+    """Those with other obstacles, or another shape, than those before."""
+    return list({(id(one.world), *one.shape.items()): one for one in kept}.values())
