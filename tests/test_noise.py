@@ -107,6 +107,20 @@ def test_the_risk_that_is_too_high_is_named():
     assert ls.largest_risk(problem_of(numbers, noise=ls.Noise(0 * numbers.e.T)), solution) == np.inf
 
 
+@pytest.mark.parametrize("times", [1.05, 3.0])
+def test_where_the_start_has_no_pass_at_all_the_risk_is_named_about_the_plan_without_one(times, differential_drive):
+    """About the drive's first rollout, through a wall, no backward pass succeeds whatever the risk."""
+    problem = differential_drive.problem.driven_by(ls.Noise(0.008 * np.diag([1.0, 1.0, 2.5])), None)
+    most = ls.largest_risk(problem, ls.smooth(problem))
+    solution = ls.smooth(problem, risk=times * most)
+    assert solution.status is ls.Status.RISK_TOO_HIGH
+    said = f"about the best plan risk {times * most:g} is too high at step "
+    assert solution.detail.startswith(said)
+    will_do = float(solution.detail.partition(", and at most ")[2].split()[0])
+    assert will_do == pytest.approx(most, rel=1e-3)  # the two plans are the same to the tolerance of a solve
+    assert ls.smooth(problem, risk=0.9 * will_do).success
+
+
 def shaken(x: Any, u: Any, p: Any) -> Any:
     from sympy import sin
 

@@ -304,7 +304,9 @@ class Search:
             return
         begin = policy_of(found, "a plan without a risk")
         run = self._add(replace(begin, cost_to_go=found.values["cost_to_go"], multipliers=found.multipliers))
-        self._offer(run, self._finish(run))
+        result = self._finish(run)
+        # Of plans whose risk is too high, this one is near an optimum.
+        self._offer(run, result, better=result.rank <= self.best[1].rank)
 
     def soften(self) -> None:
         """Plan for softer contacts and limits, less and less soft, and then for the true ones.
