@@ -160,7 +160,7 @@ def made(scenario: ls.Scenario, solution: ls.Solution) -> dict[str, ls.Controlle
     return {
         "estimating": ls.OffsetFree(problem, solution, STATED, tolerate=TOLERATE, record=True),
         "estimating, planning again": ls.OffsetFree(
-            problem, solution, STATED, tolerate=TOLERATE, record=True, replan_every=5.0, replan_always=True
+            problem, solution, STATED, tolerate=TOLERATE, record=True, replan_every=12.0, replan_always=True
         ),
         "planning again": ls.Replanner(problem, solution, every=2.0, computing=lambda rng: rng.uniform(0.0, 0.3)),
     }

@@ -95,6 +95,7 @@ def test_videos_move_and_last_as_long_as_their_runs(pictures: Mapping[str, tuple
         assert all(np.abs(one - other).max() > 50 for one, other in zip(frames, frames[6:], strict=False)), name
 
 
+@pytest.mark.long
 def test_script_makes_them_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if not gl.available():
         pytest.skip("no OpenGL here")

@@ -289,7 +289,7 @@ def shaken(x, u, p):
 
 def problem(**changed: Any) -> ls.Problem:
     stated: dict[str, Any] = {
-        "dynamics": CART, "dt": 0.2, "steps": 6, "initial": ls.QuadraticCost([50.0, 50.0, 5.0], about=[0, 0, 0.3]),
+        "dynamics": CART, "dt": 0.2, "steps": 5, "initial": ls.QuadraticCost([50.0, 50.0, 5.0], about=[0, 0, 0.3]),
         "stage_cost": ls.ControlCost([1.0, 0.3], about=[0.2, 0.0]) + ls.ObstacleCost(WORLD, radius=0.1, sharpness=4.0),
         "final_cost": ls.QuadraticCost([40.0, 40.0, 4.0], about=[1.4, 0.5, 0.0]),
     }  # fmt: skip

@@ -219,6 +219,7 @@ def test_the_search_passes_the_circles_on_the_side_that_costs_less(seed: int, co
     assert solution.cost <= 1.01 * cost  # optima differ by the knots at which a circle is touched
 
 
+@pytest.mark.long
 def test_the_rocket_lands_in_least_time() -> None:
     """The optimum's curvature is a billionth of that of its barrier. IPOPT's cost is 378.146 in 364 iterations."""
     problem, start = problems.FAMILIES["rocket_least_time"].make(0)

@@ -144,8 +144,8 @@ def standing(quadrotor: ls.Scenario) -> ls.Solution:
     "disturbance",
     [
         MeanWind((3.0, 0.0, 0.0)),
-        MeanWind((-1.7, 1.7, 1.7)),
-        MassMismatch(factor=0.8),
+        pytest.param(MeanWind((-1.7, 1.7, 1.7)), marks=pytest.mark.long),
+        pytest.param(MassMismatch(factor=0.8), marks=pytest.mark.long),
         MassMismatch(factor=1.2),
     ],
     ids=str,
