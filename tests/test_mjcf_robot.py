@@ -203,7 +203,7 @@ def test_names_units_limits_and_what_wraps() -> None:
     assert (space.position, space.rotation_vectors, space.plane) == ((0, 1, 2), (3,), "xyz")
     assert box.dynamics.control_coordinates.names == ("unnamed_actuator_0", "unnamed_actuator_1")
     wheel, _ = robot_of("wheel", 0)
-    assert wheel.dynamics.state_coordinates.names == ("axle", "axle_velocity", "activation_0")
+    assert wheel.dynamics.state_coordinates.names == ("axle", "axle_velocity", "drive_activation")
 
 
 def test_states_by_name_and_keyframe() -> None:
@@ -252,6 +252,64 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
     left = data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator
     worst = int(np.argmax(np.abs(left)))
     assert f"; j{worst} falls short by {abs(left[worst]):.3g} N m" in str(weakling)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        '<general gear="-4" dyntype="filter" dynprm="0.05" ctrlrange="-9 9" {}/>',
+        '<general gainprm="3" dyntype="filterexact" dynprm="0.02" {}/>',
+        '<position kp="60" kv="1" timeconst="0.03" {}/>',
+        '<intvelocity kp="80" actrange="-3 3" {}/>',
+        '<motor {}/>',
+    ],
+)  # fmt: skip
+@settings(max_examples=5, deadline=None)
+@given(seed=SEEDS)
+def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
+    """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `settled` return."""
+    rng = np.random.default_rng(seed)
+    bodies = (
+        f'<body pos="{{}} 0 0"><joint name="{name}" axis="0 1 0" damping="0.5" armature="0.05"/>'
+        '<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>'
+        for name in ("upper", "fore")
+    )
+    xml = f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/>
+      <worldbody>{"".join(bodies).format(0, rng.uniform(0.2, 0.3))}</body></body></worldbody>
+      <actuator>{kind.format('name="first" joint="upper"')}{kind.format('name="second" joint="fore"')}</actuator>
+      </mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
+    model, angles = robot.scene.model, dict(zip(("upper", "fore"), rng.uniform(-1, 1, 2), strict=True))
+    state = robot.at(None, **angles)
+    np.testing.assert_array_equal(robot.settled(state), state)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], robot.hold(state)
+    mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
+    np.testing.assert_allclose(np.concatenate([data.qpos, data.qvel, data.act]), state, rtol=0, atol=1e-9)
+    assert "falls short" not in str(robot)
+    if model.na:
+        named = robot.at(None, **angles, first_activation=0.25)
+        np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
+
+
+def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
+    """Four cables to a mass in a plane: of the tensions that hold it, all within their limits, by `mj_step`."""
+    sites = {"a": (-2, 3), "b": (2, 3), "c": (-2, 0), "d": (2, 0)}
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true"/><worldbody>
+      {"".join(f'<site name="{name}" pos="{x} 0 {z}"/>' for name, (x, z) in sites.items())}
+      <body name="mass" pos="0 0 1.5"><joint name="x" type="slide"/><joint name="z" type="slide" axis="0 0 1"/>
+      <geom size="0.1" mass="3" contype="0" conaffinity="0"/><site name="hook"/></body></worldbody>
+      <tendon>{"".join(f'<spatial name="{name}"><site site="{name}"/><site site="hook"/></spatial>' for name in sites)}
+      </tendon><actuator>{"".join(f'<general tendon="{name}" gear="-1" dyntype="filter" dynprm="0.05"'
+                                  ' ctrlrange="2 90"/>' for name in sites)}</actuator></mujoco>""", "cables"))  # fmt: skip
+    state = robot.at(x=-0.7, z=-0.4)
+    held, data = robot.hold(state), mujoco.MjData(robot.scene.model)
+    assert (held >= 2).all()
+    np.testing.assert_array_equal(state[4:], held)
+    data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], held
+    mujoco.mj_forward(robot.scene.model, data)
+    np.testing.assert_allclose(data.qacc, 0, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(robot.settled(state)[:2], state[:2])  # winches drive it
 
 
 @settings(max_examples=10, deadline=None)

@@ -60,8 +60,8 @@ class MjcfRobot(Robot):
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
-    `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
-    actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
+    `<name>_` where the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
+    angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
     `unnamed_joint_0`.
 
     Where the file has no camera, or no light, it gets one named overview.
@@ -164,8 +164,7 @@ class MjcfRobot(Robot):
                 else:
                     unit = "m" if one.kind == "slide" else "rad"
                     yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
-        for number in range(self.activations):
-            yield f"activation_{number}", ""
+        yield from ((name, "") for name in mjcf_joints.activations_of(self.scene.model))
 
     def _position(
         self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
@@ -217,7 +216,7 @@ class MjcfRobot(Robot):
         """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
 
         Args:
-          state: (n,), whose velocities do not count.
+          state: (n,), whose velocities do not count; nor do activations, which take the values that hold it, too.
 
         Returns:
           (m,), within their limits; where nothing holds it, those with the least sum of squared forces left.
@@ -231,6 +230,7 @@ class MjcfRobot(Robot):
         """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
 
         Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
+        Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -251,6 +251,7 @@ class MjcfRobot(Robot):
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        found[2 * model.nv :] = self._held(found).activations
         return found
 
     def _held(self, state: Array) -> Holding:
@@ -377,7 +378,8 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        Joints that an equality constraint couples to others follow these, unless they are named.
+        Joints that an equality constraint couples to others follow these, unless they are named. Activations of
+        actuators are those that hold the robot there, unless they are named or the keyframe's.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -403,6 +405,9 @@ class MjcfRobot(Robot):
         for one in mjcf_joints.couplings_of(model) if keyframe is None or values else ():
             if names[one.dof] not in values:
                 state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
+        if self.activations and keyframe is None:
+            unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
+            state[unnamed] = self._held(state).activations[np.array(unnamed, dtype=np.intp) - 2 * model.nv]
         return state
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:

@@ -136,6 +136,16 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
     return tuple(found)
 
 
+def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
+    """The names of the states of actuators, (na,): `<actuator>_activation`, numbered where an actuator has several."""
+    names = [""] * model.na
+    for number in range(model.nu):
+        first, count = int(model.actuator_actadr[number]), int(model.actuator_actnum[number])
+        for i in range(count if first >= 0 else 0):
+            names[first + i] = f"{model.actuator(number).name}_activation" + (f"_{i}" if count > 1 else "")
+    return tuple(names)
+
+
 def _unit(model: mujoco.MjModel, number: int) -> str:
     """The unit of a control, for plain motors and servos of joints; empty for others, whose unit depends on their
     use."""
