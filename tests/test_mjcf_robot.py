@@ -292,6 +292,42 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
         np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: int) -> None:
+    """A chassis that is welded to a base without mass, with wheels: the position is the base's, and so are pushes."""
+    rng = np.random.default_rng(seed)
+    nested = int(rng.integers(1, 3))
+    wheels = "".join(
+        f'<body pos="{x} 0.1 0"><joint name="wheel{i}"/><geom size="0.05" mass="0.1"/></body>'
+        for i, x in enumerate((0, 1))
+    )
+    inner = f'<geom size="0.1" mass="2"/>{wheels}'
+    for depth in range(nested):
+        inner = f'<body name="part{depth}" pos="{rng.uniform(-0.3, 0.3)} 0 0">{inner}</body>'
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody><body name="base"><freejoint name="root"/>{inner}</body>
+      </worldbody><actuator><motor joint="wheel0"/></actuator></mujoco>""", "car"))  # fmt: skip
+    space = robot.dynamics.state_coordinates
+    assert robot.body == "base"
+    assert [space.names[i] for i in space.position] == ["root_x", "root_y", "root_z"]
+    assert "body: base, with the position root_x, root_y, root_z" in str(robot)
+    assert "unnamed" not in str(robot).split("body:")[1].splitlines()[0]
+    with pytest.raises(InputError, match=r"want 2 or 3 that are the position of the body 'part0', among: none"):
+        ls.MjcfRobot(robot.scene, body="part0", position=("root_x", "root_y"))
+    assert "body: part0, whose position is no state of its own" in str(ls.MjcfRobot(robot.scene, body="part0"))
+
+
+def test_weights_of_a_problem_by_name_and_by_unit() -> None:
+    robot, _ = robot_of("cart", 0)
+    start, goal = robot.at(pole=1.0), robot.at()
+    asked: dict[str, Any] = {"steps": 5, "limits": 0.0, "damping": 0.0}
+    by_name = robot.problem(start, goal, weights={"rad": 3.0, "slider": 2.0}, effort={"push": 0.5}, **asked)
+    by_number = robot.problem(start, goal, weights=[2.0, 3.0, 0, 0], effort=0.5, **asked)
+    assert by_name.digest == by_number.digest
+    with pytest.raises(InputError, match=r"weight: got 'N', want one of: slider"):
+        robot.problem(start, goal, weights={"N": 1.0})
+
+
 def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     """Four cables to a mass in a plane: of the tensions that hold it, all within their limits, by `mj_step`."""
     sites = {"a": (-2, 3), "b": (2, 3), "c": (-2, 0), "d": (2, 0)}
@@ -571,7 +607,10 @@ def test_bad_arguments_are_named() -> None:
     robot = ls.MjcfRobot(scene)
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"body": "hull"}, "body: got 'hull', want one of: cart, pole"),
-        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that are the body's position, among: slider"),
+        (
+            {"position": ("pole", "slider")},
+            "position: got .*, want 2 or 3 that are the position of the body 'cart', among: slider",
+        ),
         ({"position": ("nose",)}, "position: got 'nose'"),
         ({"radius": -1.0}, "radius: got -1"),
         ({"floors": 3}, "floors: got 3"),

@@ -36,8 +36,8 @@ def mjcf(
       goal: the goal, in the same form.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
         others then have none.
-      effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a
-        control at its limit, or at 1 without one, costs 1; see `MjcfRobot.problem`.
+      effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see
+        `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
       steps: number of control periods.
       body: as in `MjcfRobot`.

@@ -19,6 +19,7 @@ from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import evaluate
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
+from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import ROW, World, signed_distance
 from lqrsim.simulation import plant_validation
@@ -313,18 +314,28 @@ class Plant:
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
 
+        A robot with neither balls nor a position has one about what of it is farthest out.
+
         Args:
           planned: states (T+1, n).
           driven: states (K, T+1, n).
 
         Returns:
-          The record; None if the robot has no balls.
+          The record; None if the robot has a position and no balls.
         """
+        dynamics, known = self.robot.dynamics, np.isfinite(driven).all(axis=2)
         if self.balls is None:
-            return None
-        dynamics, anchors = self.robot.dynamics, np.full((len(self.balls), 4), np.nan)
+            if dynamics.state_coordinates.position:
+                return None
+            number, place, radius = mjcf_joints.farthest_out(self.model, self.body)
+            places = np.full((*driven.shape[:2], 1, 3), np.nan)
+            places[known] = self._places_on(number, place, driven[known])
+            return BallRecord(
+                driven=places, planned=self._places_on(number, place, planned), radii=np.array([radius]),
+                anchors=np.array([[number, *place]]),
+            )  # fmt: skip
+        anchors = np.full((len(self.balls), 4), np.nan)
         places = np.full((*driven.shape[:2], len(self.balls), 3), np.nan)
-        known = np.isfinite(driven).all(axis=2)
         places[known] = self.balls.centres(dynamics, driven[known])
         for k, site in enumerate(self.balls.sites):
             if site is not None:
@@ -332,6 +343,15 @@ class Plant:
         return BallRecord(
             driven=places, planned=self.balls.centres(dynamics, planned), radii=self.balls.radii, anchors=anchors
         )
+
+    def _places_on(self, number: int, place: Array, states: Array) -> Array:
+        """Where a point of a body is, (k, 1, 3), in these states (k, n)."""
+        data, found = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
+        for k, qpos in enumerate(self.robot.configuration(states)[0]):
+            data.qpos[self.qpos] = qpos
+            mujoco.mj_kinematics(self.model, data)
+            found[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
+        return found
 
     def across(self, vectors: Array) -> Array:
         """Convert vectors from the axes of the scene to those of `world`.
