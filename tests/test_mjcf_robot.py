@@ -331,13 +331,14 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
 def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     """Four cables to a mass in a plane: of the tensions that hold it, all within their limits, by `mj_step`."""
     sites = {"a": (-2, 3), "b": (2, 3), "c": (-2, 0), "d": (2, 0)}
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true"/><worldbody>
-      {"".join(f'<site name="{name}" pos="{x} 0 {z}"/>' for name, (x, z) in sites.items())}
+    places = "".join(f'<site name="{name}" pos="{x} 0 {z}"/>' for name, (x, z) in sites.items())
+    cables = "".join(f'<spatial name="{name}"><site site="{name}"/><site site="hook"/></spatial>' for name in sites)
+    lag = 'gear="-1" dyntype="filter" dynprm="0.05" ctrlrange="2 90"'
+    winches = "".join(f'<general tendon="{name}" {lag}/>' for name in sites)
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true"/><worldbody>{places}
       <body name="mass" pos="0 0 1.5"><joint name="x" type="slide"/><joint name="z" type="slide" axis="0 0 1"/>
       <geom size="0.1" mass="3" contype="0" conaffinity="0"/><site name="hook"/></body></worldbody>
-      <tendon>{"".join(f'<spatial name="{name}"><site site="{name}"/><site site="hook"/></spatial>' for name in sites)}
-      </tendon><actuator>{"".join(f'<general tendon="{name}" gear="-1" dyntype="filter" dynprm="0.05"'
-                                  ' ctrlrange="2 90"/>' for name in sites)}</actuator></mujoco>""", "cables"))  # fmt: skip
+      <tendon>{cables}</tendon><actuator>{winches}</actuator></mujoco>""", "cables"))  # fmt: skip
     state = robot.at(x=-0.7, z=-0.4)
     held, data = robot.hold(state), mujoco.MjData(robot.scene.model)
     assert (held >= 2).all()

@@ -232,8 +232,8 @@ class StateBounds(Constraint):
     Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
     Args:
-      bounds: a dictionary of name or unit of a state: (low, high), in its unit; an infinite one is none. A name wins over
-        a unit.
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit; an infinite one is none. A name wins
+        over a unit.
       **named: name of a state -> (low, high), which says the same as a dictionary.
 
     Raises:

@@ -61,8 +61,8 @@ class MjcfRobot(Robot):
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
     `<name>_` where the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
-    angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
-    `unnamed_joint_0`.
+    angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
+    name in the MJCF get one, such as `unnamed_joint_0`.
 
     Where the file has no camera, or no light, it gets one named overview.
 
@@ -181,7 +181,8 @@ class MjcfRobot(Robot):
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
             raise InputError(
-                f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r}, among: {told}"
+                f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r},"
+                f" among: {told}"
             )
         return tuple(found), plane if len(found) == 2 else ""
 

@@ -154,7 +154,7 @@ class Plant:
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
         whose, larger = f"scene {self.scene.name}", "a larger <option timestep=.../> there"
-        other = f'; or set <option timestep="{period / max(round(min(steps, 1e9)), 1):.17g}"/> there'
+        other = f'; or set <option timestep="{float(period / max(round(min(steps, 1e9)), 1))!r}"/> there'
         if self.simulator is not None:
             whose, larger, other = self.simulator.name, "a larger one", ""
         if steps > MOST_SUBSTEPS:
