@@ -123,6 +123,32 @@ def test_a_resting_box_is_linearised_through_its_contacts() -> None:
     np.testing.assert_allclose(found, A, rtol=0, atol=1e-4 * np.abs(A).max())
 
 
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+def test_columns_of_a_helper_have_the_bits_of_ones_own(kind: str, integrator: str) -> None:
+    """A helper that computes all columns of a job, whichever thread would have got there first otherwise."""
+    robot, drawn = robot_of(kind, 4, integrator)
+    dynamics, dt = robot.dynamics, 0.005 * drawn.substeps
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    team, job, width = dynamics.physics.team, dynamics.physics._job, n + m
+    points = [near_rest(robot, seed) for seed in range(10)]
+    alone = [dynamics.linearize(*point, dt) for point in points]
+    helper = threading.Thread(target=dynamics.compiled.help_out, args=(dynamics.data,))
+    helper.start()
+    try:
+        for point, (a, b, _) in zip(points, alone, strict=True):
+            job[0], job[1 : 1 + width], job[1 + width : 7 + width] = drawn.substeps, np.concatenate(point), 0
+            team[kernel.DONE] = 0
+            team[kernel.TICKET] = kernel.JOBS * (team[kernel.TICKET] // kernel.JOBS + 1)
+            while team[kernel.DONE] < width:
+                time.sleep(1e-4)
+            np.testing.assert_array_equal(job[7 + width :].reshape(n, width), np.hstack([a, b]))
+    finally:
+        team[kernel.STOP] = 1
+        helper.join()
+        team[kernel.STOP] = 0
+
+
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
 def test_helpers_change_no_bit(kind: str) -> None:
     robot, drawn = robot_of(kind, 11)
