@@ -246,7 +246,13 @@ class StateBounds(Constraint):
         self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
     def of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
-        """The bounds of each state that has any, by its index.
+        """The bounds of each state that has any.
+
+        Args:
+          dynamics: whose states they are of.
+
+        Returns:
+          Index of a state -> (low, high).
 
         Raises:
           InputError: the dynamics have no state of such a name or unit.
