@@ -142,6 +142,39 @@ def test_viewers_follow_its_last_ball(plant: ls.Plant, plan: ls.Solution, run: l
         Closing(1, **viewer.arguments_for_rollout(run, 0) | {"balls": None})
 
 
+@pytest.mark.parametrize("kind", ["turning", "folding"])
+def test_a_robot_with_neither_position_nor_balls_is_drawn_by_what_is_farthest_out(kind: str, tmp_path: Path) -> None:
+    """A body on a ball joint, or two links that touch nothing; places by MuJoCo's kinematics of the recorded frames."""
+    flag = '<geom name="{}" type="capsule" fromto="{} 0 0 {} 0 0.1" size="0.03" contype="0" conaffinity="0"/>'
+    inner = {
+        "turning": f'<joint name="turn" type="ball" damping="0.1"/>{flag.format("tip", 0.4, 0.6)}',
+        "folding": f'<joint name="turn" axis="0 1 0"/>{flag.format("inner", 0, 0.3)}<body name="fore" pos="0.3 0 0">'
+        f'<joint name="elbow" axis="0 1 0"/>{flag.format("tip", 0, 0.3)}</body>',
+    }[kind]
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"""<mujoco><worldbody><body name="hub">{inner}</body></worldbody>
+      <actuator><general joint="turn" gear="1 0.5 0.2"/></actuator></mujoco>"""
+    )
+    robot = ls.MjcfRobot(scene, outline=False)
+    assert robot.balls is None
+    plant = ls.Plant(robot, robot.scene)
+    problem = robot.problem(robot.at(), robot.at(), steps=10)
+    run = ls.simulate(plant, ls.smooth(problem, max_iterations=2), disturbances=[ls.disturbances.ControlNoise(0.5)])
+    assert run.balls is not None
+    data = mujoco.MjData(plant.model)
+    for time, frame in zip(run.frame_times, run.frames[0], strict=True):
+        data.qpos[:] = frame
+        mujoco.mj_kinematics(plant.model, data)
+        knot = time / run.plan.dt
+        if abs(knot - round(knot)) < 1e-9:
+            place = run.places(0)[round(knot)]
+            np.testing.assert_allclose(place, data.geom("tip").xpos, rtol=0, atol=1e-6)  # frames are single floats
+    assert np.ptp(run.places(0), axis=0).max() > 0.01  # and not the middle, which stays
+    still = ls.view.render_still(run, tmp_path / "still.png", size=(160, 120))
+    assert np.asarray(Image.open(still)).std() > 0
+
+
 def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.Plant, tmp_path: Path) -> None:
     bare = dataclasses.replace(run, balls=None)
     with pytest.raises(ls.InputError, match="or a run of a robot with balls that has frames"):

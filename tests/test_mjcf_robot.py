@@ -123,6 +123,32 @@ def test_a_resting_box_is_linearised_through_its_contacts() -> None:
     np.testing.assert_allclose(found, A, rtol=0, atol=1e-4 * np.abs(A).max())
 
 
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+def test_columns_of_a_helper_have_the_bits_of_ones_own(kind: str, integrator: str) -> None:
+    """A helper that computes all columns of a job, whichever thread would have got there first otherwise."""
+    robot, drawn = robot_of(kind, 4, integrator)
+    dynamics, dt = robot.dynamics, 0.005 * drawn.substeps
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    team, job, width = dynamics.physics.team, dynamics.physics._job, n + m
+    points = [near_rest(robot, seed) for seed in range(10)]
+    alone = [dynamics.linearize(*point, dt) for point in points]
+    helper = threading.Thread(target=dynamics.compiled.help_out, args=(dynamics.data,))
+    helper.start()
+    try:
+        for point, (a, b, _) in zip(points, alone, strict=True):
+            job[0], job[1 : 1 + width], job[1 + width : 7 + width] = drawn.substeps, np.concatenate(point), 0
+            team[kernel.DONE] = 0
+            team[kernel.TICKET] = kernel.JOBS * (team[kernel.TICKET] // kernel.JOBS + 1)
+            while team[kernel.DONE] < width:
+                time.sleep(1e-4)
+            np.testing.assert_array_equal(job[7 + width :].reshape(n, width), np.hstack([a, b]))
+    finally:
+        team[kernel.STOP] = 1
+        helper.join()
+        team[kernel.STOP] = 0
+
+
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
 def test_helpers_change_no_bit(kind: str) -> None:
     robot, drawn = robot_of(kind, 11)
@@ -203,7 +229,7 @@ def test_names_units_limits_and_what_wraps() -> None:
     assert (space.position, space.rotation_vectors, space.plane) == ((0, 1, 2), (3,), "xyz")
     assert box.dynamics.control_coordinates.names == ("unnamed_actuator_0", "unnamed_actuator_1")
     wheel, _ = robot_of("wheel", 0)
-    assert wheel.dynamics.state_coordinates.names == ("axle", "axle_velocity", "activation_0")
+    assert wheel.dynamics.state_coordinates.names == ("axle", "axle_velocity", "drive_activation")
 
 
 def test_states_by_name_and_keyframe() -> None:
@@ -252,6 +278,101 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
     left = data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator
     worst = int(np.argmax(np.abs(left)))
     assert f"; j{worst} falls short by {abs(left[worst]):.3g} N m" in str(weakling)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        '<general gear="-4" dyntype="filter" dynprm="0.05" ctrlrange="-9 9" {}/>',
+        '<general gainprm="3" dyntype="filterexact" dynprm="0.02" {}/>',
+        '<position kp="60" kv="1" timeconst="0.03" {}/>',
+        '<intvelocity kp="80" actrange="-3 3" {}/>',
+        '<motor {}/>',
+    ],
+)  # fmt: skip
+@settings(max_examples=5, deadline=None)
+@given(seed=SEEDS)
+def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
+    """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `settled` return."""
+    rng = np.random.default_rng(seed)
+    bodies = (
+        f'<body pos="{{}} 0 0"><joint name="{name}" axis="0 1 0" damping="0.5" armature="0.05"/>'
+        '<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>'
+        for name in ("upper", "fore")
+    )
+    xml = f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/>
+      <worldbody>{"".join(bodies).format(0, rng.uniform(0.2, 0.3))}</body></body></worldbody>
+      <actuator>{kind.format('name="first" joint="upper"')}{kind.format('name="second" joint="fore"')}</actuator>
+      </mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
+    model, angles = robot.scene.model, dict(zip(("upper", "fore"), rng.uniform(-1, 1, 2), strict=True))
+    state = robot.at(None, **angles)
+    np.testing.assert_array_equal(robot.settled(state), state)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], robot.hold(state)
+    mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
+    np.testing.assert_allclose(np.concatenate([data.qpos, data.qvel, data.act]), state, rtol=0, atol=1e-9)
+    assert "falls short" not in str(robot)
+    if model.na:
+        named = robot.at(None, **angles, first_activation=0.25)
+        np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: int) -> None:
+    """A chassis that is welded to a base without mass, with wheels: the position is the base's, and so are pushes."""
+    rng = np.random.default_rng(seed)
+    nested = int(rng.integers(1, 3))
+    wheels = "".join(
+        f'<body pos="{x} 0.1 0"><joint name="wheel{i}"/><geom size="0.05" mass="0.1"/></body>'
+        for i, x in enumerate((0, 1))
+    )
+    inner = f'<geom size="0.1" mass="2"/>{wheels}'
+    for depth in range(nested):
+        inner = f'<body name="part{depth}" pos="{rng.uniform(-0.3, 0.3)} 0 0">{inner}</body>'
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody><body name="base"><freejoint name="root"/>{inner}</body>
+      </worldbody><actuator><motor joint="wheel0"/></actuator></mujoco>""", "car"))  # fmt: skip
+    space = robot.dynamics.state_coordinates
+    assert robot.body == "base"
+    assert [space.names[i] for i in space.position] == ["root_x", "root_y", "root_z"]
+    assert "body: base, with the position root_x, root_y, root_z" in str(robot)
+    assert "unnamed" not in str(robot).split("body:")[1].splitlines()[0]
+    with pytest.raises(InputError, match=r"want 2 or 3 that are the position of the body 'part0', among: none"):
+        ls.MjcfRobot(robot.scene, body="part0", position=("root_x", "root_y"))
+    assert "body: part0, whose position is no state of its own" in str(ls.MjcfRobot(robot.scene, body="part0"))
+
+
+def test_weights_of_a_problem_by_name_and_by_unit() -> None:
+    robot, _ = robot_of("cart", 0)
+    start, goal = robot.at(pole=1.0), robot.at()
+    asked: dict[str, Any] = {"steps": 5, "limits": 0.0, "damping": 0.0}
+    by_name = robot.problem(start, goal, weights={"rad": 3.0, "slider": 2.0}, effort={"push": 0.5}, **asked)
+    by_number = robot.problem(start, goal, weights=[2.0, 3.0, 0, 0], effort=0.5, **asked)
+    assert by_name.digest == by_number.digest
+    with pytest.raises(InputError, match=r"weight: got 'N', want one of: slider"):
+        robot.problem(start, goal, weights={"N": 1.0})
+
+
+def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
+    """Four cables to a mass in a plane: of the tensions that hold it, all within their limits, by `mj_step`."""
+    sites = {"a": (-2, 3), "b": (2, 3), "c": (-2, 0), "d": (2, 0)}
+    places = "".join(f'<site name="{name}" pos="{x} 0 {z}"/>' for name, (x, z) in sites.items())
+    cables = "".join(f'<spatial name="{name}"><site site="{name}"/><site site="hook"/></spatial>' for name in sites)
+    lag = 'gear="-1" dyntype="filter" dynprm="0.05" ctrlrange="2 90"'
+    winches = "".join(f'<general tendon="{name}" {lag}/>' for name in sites)
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true"/><worldbody>{places}
+      <body name="mass" pos="0 0 1.5"><joint name="x" type="slide"/><joint name="z" type="slide" axis="0 0 1"/>
+      <geom size="0.1" mass="3" contype="0" conaffinity="0"/><site name="hook"/></body></worldbody>
+      <tendon>{cables}</tendon><actuator>{winches}</actuator></mujoco>""", "cables"))  # fmt: skip
+    state = robot.at(x=-0.7, z=-0.4)
+    held, data = robot.hold(state), mujoco.MjData(robot.scene.model)
+    assert (held >= 2).all()
+    np.testing.assert_array_equal(state[4:], held)
+    data.qpos[:], data.act[:], data.ctrl[:] = state[:2], state[4:], held
+    mujoco.mj_forward(robot.scene.model, data)
+    np.testing.assert_allclose(data.qacc, 0, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(robot.settled(state)[:2], state[:2])  # winches drive it
 
 
 @settings(max_examples=10, deadline=None)
@@ -513,7 +634,10 @@ def test_bad_arguments_are_named() -> None:
     robot = ls.MjcfRobot(scene)
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"body": "hull"}, "body: got 'hull', want one of: cart, pole"),
-        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that are the body's position, among: slider"),
+        (
+            {"position": ("pole", "slider")},
+            "position: got .*, want 2 or 3 that are the position of the body 'cart', among: slider",
+        ),
         ({"position": ("nose",)}, "position: got 'nose'"),
         ({"radius": -1.0}, "radius: got -1"),
         ({"floors": 3}, "floors: got 3"),

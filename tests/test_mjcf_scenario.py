@@ -71,6 +71,20 @@ def test_a_clearance_is_the_same_in_python_in_a_setting_and_as_an_option(tmp_pat
         robot.problem(start, goal, clearance="near")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [("", True), (",steps=20", True), (",start=tilted,goal=tilted", True), (",start=tilted", False),
+     (",goal={'pole': 0.1}", False)],
+)  # fmt: skip
+def test_a_goal_that_is_the_start_is_said(
+    cart: Path, settings: str, told: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    resolve(f"{cart}{settings}")
+    said = [one.message for one in caplog.records if "start and goal are the same" in one.message]
+    assert len(said) == told
+    assert all("goal={'slider': 0.1}" in one for one in said)
+
+
 def test_numbers_of_the_mjcf_are_by_name(cart: Path) -> None:
     scenario = resolve(f"{cart},parameters={{'cart_mass': 2.5, 'pole_damping': 0.03}},steps=20")
     plain = resolve(f"{cart},steps=20")

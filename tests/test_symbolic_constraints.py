@@ -353,6 +353,38 @@ def test_derivatives_are_right() -> None:
     assert all(check.good for check in checks)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_goals_and_bounds_by_unit_are_those_by_name(seed: int) -> None:
+    """A chain of masses: what is said of a unit is said of each state in it, and a name wins over a unit."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 5))
+    places, speeds = [f"x{i}" for i in range(count)], [f"v{i}" for i in range(count)]
+    chain = ls.Dynamics(
+        lambda x, u, p: [*x[count:], *u],
+        states=dict.fromkeys(places, "m") | dict.fromkeys(speeds, "m/s"),
+        controls={f"a{i}": "m/s^2" for i in range(count)},
+    )
+
+    def of(*constraints: ls.Constraint) -> ls.Problem:
+        return ls.Problem(
+            dynamics=chain, dt=0.1, steps=10, initial=ls.FixedState(np.zeros(2 * count)),
+            stage_cost=ls.ControlCost(np.ones(count)),
+            final_cost=ls.QuadraticCost(np.ones(2 * count), about=np.zeros(2 * count)), constraints=constraints,
+        )  # fmt: skip
+
+    wide, own, goal = rng.uniform(1, 2), rng.uniform(3, 4), rng.uniform(0, 0.5)
+    short = of(ls.StateBounds({"m/s": (-wide, wide), "v1": (-own, own)}), ls.GoalState({"m/s": 0.0, "m": goal}, x1=0.1))
+    bounds = dict.fromkeys(speeds, (-wide, wide)) | {"v1": (-own, own)}
+    long = of(
+        ls.StateBounds(bounds), ls.GoalState(dict.fromkeys(speeds, 0.0) | dict.fromkeys(places, goal) | {"x1": 0.1})
+    )
+    assert short.digest == long.digest
+    with pytest.raises(InputError, match=r"got v0 of at least 5 and at most"):
+        of(*short.constraints, ls.StateBounds({"m/s": (5.0, 6.0)}))
+    with pytest.raises(InputError, match=r"StateBounds: states: got 'rad', want one of: x0, .*, m, m/s"):
+        of(ls.StateBounds({"rad": (0.0, 1.0)}))
+
+
 def test_kinds_and_steps_are_part_of_the_digest() -> None:
     kinds = [{}, {"equality": True}, {"at": "final"}, {"equality": True, "at": "final"}]
     cases = [problem(ls.SymbolicConstraint(line, parameters={"slope": 0.1}, **kind)) for kind in kinds]
@@ -385,7 +417,7 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
         (lambda: ls.StateBounds(x=(1, -1)), "StateBounds: 'x': got 1 to -1, want low below high"),
         (lambda: ls.StateBounds(x=(-np.inf, np.inf)), "StateBounds: 'x': got -inf to inf, want low below high, and"),
         (lambda: anything.StateBounds([0, 0]), "StateBounds: got [0, 0], want (low, high) by name of a state"),
-        (lambda: anything.StateBounds(x=1.0), "StateBounds: 'x': got shape (), want (2,)"),
+        (lambda: anything.StateBounds(x=1.0), "StateBounds: 'x': got 1.0, want (low, high)"),
         (lambda: ls.StateBounds(x=(np.nan, 1)), "StateBounds: 'x': got nan"),
         (lambda: problem(ls.StateBounds(y=(0, 1))), "StateBounds: states: got 'y', want one of: x, v"),
         (lambda: problem(ls.StateBounds(x=(-np.inf, 0.5)), ls.GoalState([1, 0])),

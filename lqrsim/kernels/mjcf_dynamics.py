@@ -5,6 +5,9 @@ of a rotation vector), then the velocities, then the actuators' own states. `p` 
 addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
 each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads, a slot also has
 a model of its own.
+
+A step and what helps it are compiled apart. What does arithmetic here is therefore `outline` and `exact`: LLVM would
+reorder sums by where they are inlined, and bits would depend on the thread.
 """
 
 from math import atan2, cos, nan, pi, sqrt
@@ -16,9 +19,11 @@ from lqrsim.kernels.declarations import (
     at,
     call,
     claim,
+    exact,
     fetch_add,
     int32,
     load,
+    outline,
     rows_at,
     stack,
     store,
@@ -172,6 +177,8 @@ def linearize_here(z, p, wrench, address, warm):
         warm[i] = accelerations[i]
 
 
+@outline
+@exact
 def column(k, z, p, wrench, substeps, address, warm, jacobian):
     """Write the k-th column of the Jacobian. Controls come first: they do not change the stage of velocities.
 
@@ -325,6 +332,8 @@ def read_from(near, p, one, out):
             out[i] = nan
 
 
+@outline
+@exact
 def write_quaternion(x, first, qpos, q):
     """Write the quaternion of the rotation vector that begins at x[first]."""
     square = 0.0
@@ -336,6 +345,8 @@ def write_quaternion(x, first, qpos, q):
         qpos[q + 1 + i] = ratio * x[first + i]
 
 
+@outline
+@exact
 def rotation_vector_near(qpos, q, near, first, out):
     """Write the rotation vector of a quaternion to out[first]: the one nearest to that of `near`."""
     sine, along, length = 0.0, 0.0, 0.0

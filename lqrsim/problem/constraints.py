@@ -179,8 +179,8 @@ class GoalState(Constraint):
         ls.GoalState(x=1.0, velocity=0.0)
 
     Args:
-      goal: (n,) the state, in the states' units; or a dictionary of name: number, for some of the states. Angles count
-        whole turns, as for a QuadraticCost.
+      goal: (n,) the state, in the states' units; or a dictionary of name or unit: number, for some of the states, such
+        as {"m/s": 0} for all velocities. Angles count whole turns, as for a QuadraticCost.
       **named: name of a state -> number, which says the same as a dictionary.
 
     Raises:
@@ -198,7 +198,7 @@ class GoalState(Constraint):
         """The goal of each state that has one, by its index. Raises InputError if it does not fit."""
         names, goal = dynamics.state_coordinates.names, self.goal
         if isinstance(goal, dict):
-            return {names.index(check_name("GoalState: states", name, names)): goal[name] for name in goal}
+            return dynamics.state_coordinates._by_name("GoalState: states", goal, check_number)
         if len(goal) != len(names):
             each = f"one for each of {', '.join(names)}"
             raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
@@ -222,7 +222,8 @@ class StateBounds(Constraint):
     Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
 
     Args:
-      bounds: a dictionary of name of a state: (low, high), in its unit; an infinite one is none.
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit; an infinite one is none. A name wins
+        over a unit.
       **named: name of a state -> (low, high), which says the same as a dictionary.
 
     Raises:
@@ -233,6 +234,20 @@ class StateBounds(Constraint):
         self, bounds: Mapping[str, tuple[float, float]] | None = None, /, **named: tuple[float, float]
     ) -> None:
         self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
+
+    def of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
+        """The bounds of each state that has any.
+
+        Args:
+          dynamics: whose states they are of.
+
+        Returns:
+          Index of a state -> (low, high).
+
+        Raises:
+          InputError: the dynamics have no state of such a name or unit.
+        """
+        return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, _bound)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_to_goal(dynamics, {}, 0)
@@ -246,8 +261,8 @@ class StateBounds(Constraint):
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         data, described = [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
-            for name, number in ((name, bound[side]) for name, bound in self.bounds.items()):
-                i = names.index(check_name("StateBounds: states", name, names))
+            for i, bound in self.of(dynamics).items():
+                name, number = names[i], bound[side]
                 if not np.isfinite(number):
                     continue
                 wanted = f"{name} of {word} {_quantity(number, units[i])}"
@@ -279,7 +294,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
       InputError: they do not fit it, or each other.
     """
     goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
-    _check_bounds([one for one in constraints if isinstance(one, StateBounds)])
+    _check_bounds([one for one in constraints if isinstance(one, StateBounds)], dynamics)
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
             term = constraint._bind_to_goal(dynamics, goals, steps)
@@ -289,11 +304,13 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     return tuple(terms)
 
 
-def _check_bounds(bounds: Sequence[StateBounds]) -> None:
+def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics) -> None:
     """Raises InputError if several bounds of a state leave nothing between them."""
-    for name in {name for one in bounds for name in one.bounds}:
-        lows, highs = zip(*(one.bounds[name] for one in bounds if name in one.bounds), strict=True)
+    found = [one.of(dynamics) for one in bounds]
+    for i in {i for one in found for i in one}:
+        lows, highs = zip(*(one[i] for one in found if i in one), strict=True)
         if not max(lows) < min(highs):
+            name = dynamics.state_coordinates.names[i]
             raise InputError(
                 f"constraints: got {name} of at least {max(lows):g} and at most {min(highs):g}, want bounds with room"
                 " between them"
@@ -337,6 +354,8 @@ def by_name(
 
 def _bound(field: str, given: object) -> tuple[float, float]:
     """(low, high), one of them finite."""
+    if isinstance(given, (int, float)):
+        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); an infinite one is none")
     low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
     if not low < high or not np.isfinite([low, high]).any():
         raise InputError(f"{field}: got {low:g} to {high:g}, want low below high, and one of them finite")

@@ -103,8 +103,8 @@ class Problem:
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits out of order or beyond the actuators' range, or a start that
-        collides.
+        cost that depends on the control, control limits out of order or with nothing of the actuators' range, or a
+        start that collides.
     """
 
     dynamics: Dynamics

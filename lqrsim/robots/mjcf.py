@@ -1,7 +1,7 @@
 """A robot from any MJCF: its dynamics are MuJoCo's own steps, and nothing is derived by hand."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
@@ -60,9 +60,9 @@ class MjcfRobot(Robot):
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
-    `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
-    actuators' names, limited by their ctrlrange. Elements without a name in the MJCF get one, such as
-    `unnamed_joint_0`.
+    `<name>_` where the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
+    angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
+    name in the MJCF get one, such as `unnamed_joint_0`.
 
     Where the file has no camera, or no light, it gets one named overview.
 
@@ -74,7 +74,7 @@ class MjcfRobot(Robot):
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
       body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
-        that moves and has mass.
+        that moves and has mass, itself or by bodies that are fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
         MuJoCo's kinematics. () for none.
       radius: radius of a ball about the body's origin that contains everything that may collide; by default the
@@ -164,8 +164,7 @@ class MjcfRobot(Robot):
                 else:
                     unit = "m" if one.kind == "slide" else "rad"
                     yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
-        for number in range(self.activations):
-            yield f"activation_{number}", ""
+        yield from ((name, "") for name in mjcf_joints.activations_of(self.scene.model))
 
     def _position(
         self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
@@ -181,7 +180,10 @@ class MjcfRobot(Robot):
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
-            raise InputError(f"{who}: position: got {got}, want 2 or 3 that are the body's position, among: {told}")
+            raise InputError(
+                f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r},"
+                f" among: {told}"
+            )
         return tuple(found), plane if len(found) == 2 else ""
 
     def _balls_at(self, state: Array) -> Array:
@@ -217,7 +219,7 @@ class MjcfRobot(Robot):
         """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
 
         Args:
-          state: (n,), whose velocities do not count.
+          state: (n,), whose velocities do not count; nor do activations, which take the values that hold it, too.
 
         Returns:
           (m,), within their limits; where nothing holds it, those with the least sum of squared forces left.
@@ -231,6 +233,7 @@ class MjcfRobot(Robot):
         """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
 
         Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
+        Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -251,6 +254,7 @@ class MjcfRobot(Robot):
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
+        found[2 * model.nv :] = self._held(found).activations
         return found
 
     def _held(self, state: Array) -> Holding:
@@ -264,8 +268,8 @@ class MjcfRobot(Robot):
         *,
         steps: int = 150,
         dt: float | None = None,
-        weights: npt.ArrayLike = 100.0,
-        effort: npt.ArrayLike | None = None,
+        weights: PerEntry = 100.0,
+        effort: PerEntry | None = None,
         damping: float = 1e-3,
         limits: float = 100.0,
         clearance: float | None = None,
@@ -283,8 +287,10 @@ class MjcfRobot(Robot):
           goal: (n,), a state.
           steps: the number of control periods.
           dt: the control period in seconds; by default about 0.02.
-          weights: weights of the final error, one number for all states, or (n,).
-          effort: weights of the controls, (m,); by default such that a control at its limit costs 1/2.
+          weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
+            that are not named then have none.
+          effort: weights of the controls, likewise; by default 1 over the square of a control's largest size, so that
+            one that is off by that much costs 1/2: by its limits, else those of its force, else 1.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
           limits: weight of what a joint is closer to its limits, at each step, than 0.1 rad or m, 5 % of its range, or
             start and goal are.
@@ -302,7 +308,8 @@ class MjcfRobot(Robot):
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
-        cost: Cost = ControlCost(efforts(model, self._numbers) ** -2.0 if effort is None else effort, about=about)
+        spent = efforts(model, self._numbers) ** -2.0 if effort is None else effort
+        cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
         damping, moves = check_number("damping", damping, at_least=0.0), np.zeros(n)
         for one in self._joints:
             moves[model.nv : 2 * model.nv][one.dofs] = damping if one.kind != "free" else 0.0
@@ -319,7 +326,7 @@ class MjcfRobot(Robot):
         return Problem(
             dynamics=dynamics, dt=dynamics.period_near(_PERIOD) or float(model.opt.timestep) if dt is None else dt,
             steps=steps, initial=FixedState(start), stage_cost=cost,
-            final_cost=QuadraticCost(check_weights("weights", weights, n), about=goal),
+            final_cost=QuadraticCost(_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
             constraints=kept,
         )  # fmt: skip
@@ -345,6 +352,9 @@ class MjcfRobot(Robot):
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {_listed(space.names)}",
+            f"  body: {self.body}, with the position {', '.join(space.names[i] for i in space.position)}"
+            if space.position
+            else f"  body: {self.body}, whose position is no state of its own",
             f"  held at rest by: {_listed(told)}{short}",
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",
@@ -377,7 +387,8 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        Joints that an equality constraint couples to others follow these, unless they are named.
+        Joints that an equality constraint couples to others follow these, unless they are named. Activations of
+        actuators are those that hold the robot there, unless they are named or the keyframe's.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -403,6 +414,9 @@ class MjcfRobot(Robot):
         for one in mjcf_joints.couplings_of(model) if keyframe is None or values else ():
             if names[one.dof] not in values:
                 state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
+        if self.activations and keyframe is None:
+            unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
+            state[unnamed] = self._held(state).activations[np.array(unnamed, dtype=np.intp) - 2 * model.nv]
         return state
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
@@ -436,6 +450,11 @@ class MjcfRobot(Robot):
             else:
                 parts.append(own)
         return np.concatenate(parts, axis=-1), state[..., model.nv : 2 * model.nv].copy()
+
+
+def _weights(field: str, given: PerEntry, size: int) -> PerEntry:
+    """Weights by name as they are, or one for each of `size` entries."""
+    return given if isinstance(given, Mapping) else check_weights(field, given, size)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -175,7 +175,7 @@ class MjcfDynamics(Dynamics):
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
                 f"dt: got {dt:g} s, want a multiple of the physics step of {self.name}, {timestep:g} s;"
-                f' or set <option timestep="{dt / max(round(steps), 1):.17g}"/> there'
+                f' or set <option timestep="{float(dt / max(round(steps), 1))!r}"/> there'
             )
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:

@@ -1,13 +1,18 @@
 """A scenario from any MJCF: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenarios.packaged import Scenario
+
+_log = logging.getLogger("lqrsim")
 
 Place = str | Mapping[str, float] | None
 
@@ -33,11 +38,11 @@ def mjcf(
       path: path of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
-      goal: the goal, in the same form.
+      goal: the goal, in the same form. Without a start and a goal the robot is to stay at rest, and a warning says so.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
         others then have none.
-      effort: weights of the controls, about those that hold the robot: a number, or by name or unit; by default a
-        control at its limit, or at 1 without one, costs 1; see `MjcfRobot.problem`.
+      effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see
+        `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
       steps: number of control periods.
       body: as in `MjcfRobot`.
@@ -55,8 +60,14 @@ def mjcf(
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")
         robot = robot.with_parameters(**{name: given[name] for name in names})
     space, controls = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
+    begin, end = _state(robot, "start", start), _state(robot, "goal", goal)
+    if np.array_equal(begin, end):
+        _log.warning(
+            "%s: start and goal are the same, so there is nothing to do; say one by name, as goal={'%s': 0.1}",
+            Path(path).name, space.names[0],
+        )  # fmt: skip
     problem = robot.problem(
-        _state(robot, "start", start), _state(robot, "goal", goal), steps=steps, dt=dt,
+        begin, end, steps=steps, dt=dt,
         weights=per_entry("weights", weights, space),
         effort=None if effort is None else per_entry("effort", effort, controls, above=0.0),
         clearance=clearance,

@@ -21,20 +21,54 @@ class Holding:
 
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
+      activations: (na,), the states of actuators with which they do: a filter's is its control, an integrator's what it
+        has come to.
       missed: N or N m, (nv,), the force that each joint is short of; 0 for joints that follow others.
       held: whether they hold it.
     """
 
     controls: Array
+    activations: Array
     missed: Array
     held: bool
 
 
-def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
-    """The controls of actuators, in that order, with which nothing accelerates at rest.
+class _Levels:
+    """What each actuator's force is affine in: its control or, where it has one, its activation.
 
-    Actuator forces are assumed to be affine in the controls, like those of motors and servos: inverse dynamics give the
-    required forces, and least squares within the controls' limits finds the controls.
+    A filter's and a muscle's activation comes to rest at the control, an integrator's anywhere, with a control of zero.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        kinds, D = model.actuator_dyntype, mujoco.mjtDyn
+        self.integrates = kinds == D.mjDYN_INTEGRATOR.value
+        follows = np.isin(kinds, [one.value for one in (D.mjDYN_FILTER, D.mjDYN_FILTEREXACT, D.mjDYN_MUSCLE)])
+        self.activated = np.flatnonzero(follows | self.integrates)
+        self.places = model.actuator_actadr[self.activated] + model.actuator_actnum[self.activated] - 1
+        self.low, self.high = np.full((2, model.nu), [[-np.inf], [np.inf]])
+        for limited, (low, high), which in (
+            (model.actuator_ctrllimited, model.actuator_ctrlrange.T, ~self.integrates),
+            (model.actuator_actlimited, model.actuator_actrange.T, follows | self.integrates),
+        ):
+            bounded = limited.astype(bool) & which
+            self.low = np.where(bounded, np.maximum(self.low, low), self.low)
+            self.high = np.where(bounded, np.minimum(self.high, high), self.high)
+
+    def controls(self, levels: Array) -> Array:
+        return np.where(self.integrates, 0.0, levels)
+
+    def act(self, levels: Array, data: mujoco.MjData) -> None:
+        """Apply levels (nu,) to the model's data."""
+        data.ctrl[:] = self.controls(levels)
+        data.act[self.places] = levels[self.activated]
+
+
+def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
+    """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
+
+    Actuator forces are assumed to be affine in the controls or activations, like those of motors and servos: inverse
+    dynamics give the required forces, and least squares within the limits finds the controls. `act` counts for
+    actuators of other kinds alone.
     """
     from scipy.optimize import lsq_linear
 
@@ -45,12 +79,11 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     data.qpos[:], data.act[:] = qpos, act
     mujoco.mj_inverse(free, data)
     wanted = data.qfrc_inverse.copy()
-    low, high = model.actuator_ctrlrange.T
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+    levels = _Levels(model)
+    low, high = levels.low, levels.high
 
-    def force(controls: Array) -> Array:
-        data.ctrl[:] = controls
+    def force(asked: Array) -> Array:
+        levels.act(asked, data)
         mujoco.mj_forward(free, data)
         return data.qfrc_actuator.copy()
 
@@ -72,7 +105,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     found[np.abs(found) * scale < 1e-12 * size] = 0.0  # rounding
     missed = np.zeros(model.nv)
     missed[kept] = wanted - rest - columns @ (found - middle)
-    return Holding(found[actuators], missed, bool((np.abs(missed) <= _HELD * size).all()))
+    levels.act(found, data)
+    return Holding(data.ctrl[actuators], data.act.copy(), missed, bool((np.abs(missed) <= _HELD * size).all()))
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
@@ -81,11 +115,11 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     Newton's method, with the smallest steps: contacts are springs, and nothing moves in a free direction, such as along
     a floor.
     """
-    data = mujoco.MjData(model)
+    data, levels = mujoco.MjData(model), _Levels(model)
     data.qpos[:] = qpos
 
-    def forces(controls: Array) -> Array:
-        data.ctrl[:] = controls
+    def forces(asked: Array) -> Array:
+        levels.act(asked, data)
         mujoco.mj_forward(model, data)
         return data.qfrc_actuator.copy()
 

@@ -136,6 +136,16 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
     return tuple(found)
 
 
+def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
+    """The names of the states of actuators, (na,): `<actuator>_activation`, numbered where an actuator has several."""
+    names = [""] * model.na
+    for number in range(model.nu):
+        first, count = int(model.actuator_actadr[number]), int(model.actuator_actnum[number])
+        for i in range(count if first >= 0 else 0):
+            names[first + i] = f"{model.actuator(number).name}_activation" + (f"_{i}" if count > 1 else "")
+    return tuple(names)
+
+
 def _unit(model: mujoco.MjModel, number: int) -> str:
     """The unit of a control, for plain motors and servos of joints; empty for others, whose unit depends on their
     use."""
@@ -192,15 +202,17 @@ def is_linear(model: mujoco.MjModel, number: int) -> bool:
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
-    """The id of the body of that name; without a name, of the first moving body in the world. Raises InputError."""
+    """The id of the body of that name; without a name, of the first that moves and has mass. Raises InputError."""
     if name is not None:
         names = [model.body(number).name for number in range(1, model.nbody)]
         return int(model.body(check_name(f"{what}: body", name, names)).id)
     moving = [number for number in range(1, model.nbody) if model.body_jntnum[number] > 0]
     if not moving:
         raise InputError(f"{what}: got no joints, want a robot that moves: at least one <joint> or <freejoint/>")
-    # Several bodies may carry a slide each before there is any mass: the robot is the first that has some.
-    return next((number for number in moving if model.body_mass[number] > 0), moving[0])
+    # Several bodies may carry a slide each before there is any mass: the robot is the first that has some, itself or by
+    # bodies that are fixed to it.
+    masses = np.bincount(model.body_weldid, weights=model.body_mass, minlength=model.nbody)
+    return next((number for number in moving if masses[number] > 0), moving[0])
 
 
 def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array, Array]:
@@ -250,6 +262,22 @@ def axes_of(quaternion: Array) -> Array:
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, quaternion)
     return axes.reshape(3, 3)
+
+
+def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
+    """The geom that moves with a body and is farthest from its origin at rest; the body itself if it has none.
+
+    Returns:
+      The number of its body, its place (3,) there, and the radius of the ball that it is in, in metres.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
+    own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))
+    if not len(own):
+        return body, np.zeros(3), 0.0
+    geom = int(own[np.argmax(np.linalg.norm(data.geom_xpos[own] - data.xpos[body], axis=1))])
+    return int(model.geom_bodyid[geom]), model.geom_pos[geom].copy(), float(model.geom_rbound[geom])
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:

@@ -18,6 +18,7 @@ from lqrsim.errors import Array, InputError, check_kind, check_number, check_tex
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
+from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_obstacles import sinks
 from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import World
@@ -150,7 +151,7 @@ class Plant:
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
         whose, larger = f"scene {self.scene.name}", "a larger <option timestep=.../> there"
-        other = f'; or set <option timestep="{period / max(round(min(steps, 1e9)), 1):.17g}"/> there'
+        other = f'; or set <option timestep="{float(period / max(round(min(steps, 1e9)), 1))!r}"/> there'
         if self.simulator is not None:
             whose, larger, other = self.simulator.name, "a larger one", ""
         if steps > MOST_SUBSTEPS:
@@ -226,24 +227,40 @@ class Plant:
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
 
+        A robot with neither balls nor a position has one about what of it is farthest out.
+
         Args:
           planned: states (T+1, n).
           driven: states (K, T+1, n).
 
         Returns:
-          The record; None if the robot has no balls.
+          The record; None if the robot has a position and no balls.
         """
-        balls, dynamics = self.robot.balls, self.robot.dynamics
+        balls, dynamics, known = self.robot.balls, self.robot.dynamics, np.isfinite(driven).all(axis=2)
         if balls is None:
-            return None
+            if dynamics.state_coordinates.position:
+                return None
+            number, place, radius = mjcf_joints.farthest_out(self.model, self.body)
+            places = np.full((*driven.shape[:2], 1, 3), np.nan)
+            places[known] = self._places_on(number, place, driven[known])
+            planned, anchor = self._places_on(number, place, planned), np.array([[number, *place]])
+            return BallRecord(driven=places, planned=planned, radii=np.array([radius]), anchors=anchor)
         anchors, places = np.full((len(balls), 4), np.nan), np.full((*driven.shape[:2], len(balls), 3), np.nan)
-        known = np.isfinite(driven).all(axis=2)
         places[known] = balls.centres(dynamics, driven[known])
         for k, site in enumerate(balls.sites):
             if site is not None:
                 anchors[k] = plant_validation.anchor_of(self.model, site)
         planned = balls.centres(dynamics, planned)
         return BallRecord(driven=places, planned=planned, radii=balls.radii, anchors=anchors)
+
+    def _places_on(self, number: int, place: Array, states: Array) -> Array:
+        """Where a point of a body is, (k, 1, 3), in these states (k, n)."""
+        data, found = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
+        for k, qpos in enumerate(self.robot.configuration(states)[0]):
+            data.qpos[self.qpos] = qpos
+            mujoco.mj_kinematics(self.model, data)
+            found[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
+        return found
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation; `set_const` must follow.
