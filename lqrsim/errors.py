@@ -10,7 +10,7 @@ import inspect
 import itertools
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -344,6 +344,28 @@ def excerpt(value: object) -> str:
         return f"a {type(value).__name__}"
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def brief(value: object) -> str:
+    """A value within the text of a record: numbers in six digits, long arrays by their shape, functions by name."""
+    if isinstance(value, (bool, str)) or value is None:
+        return repr(value)
+    if isinstance(value, (int, float, np.number)):
+        return f"{value + 0:.6g}"  # no -0
+    if isinstance(value, np.ndarray):
+        square = value.ndim == 2 and value.shape[0] == value.shape[1]
+        if square and len(value) > 1 and not (value - np.diag(np.diag(value))).any():
+            return f"diag({brief(np.diag(value).tolist())})"
+        return brief(value.tolist()) if value.ndim <= 1 and value.size <= 12 else f"array {value.shape}"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {brief(one)}" for name, one in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        listed = [brief(one) for one in value]
+        text = (
+            f"{listed[0]}, ... {len(listed)} times" if len(listed) > 3 and len(set(listed)) == 1 else ", ".join(listed)
+        )
+        return f"[{text}]" if isinstance(value, list) else f"({text})"
+    return getattr(value, "__qualname__", None) or repr(value)
 
 
 def format_error(error: BaseException) -> str:

@@ -19,6 +19,44 @@ def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
     assert ((a + b) + c).terms == (a + (b + c)).terms == (a, b, c)
 
 
+@given(
+    weights=st.lists(st.integers(1, 999), min_size=3, max_size=3), goal=st.integers(-99, 99), bound=st.integers(3, 9),
+    margin=st.integers(1, 9), obstacles=st.integers(0, 5), free=st.booleans(),
+)  # fmt: skip
+def test_a_problem_and_its_parts_print_what_they_were_made_of(
+    weights: list[int], goal: int, bound: int, margin: int, obstacles: int, free: bool
+) -> None:
+    world = ls.World([
+        ls.Obstacle(f"ball {k}", "sphere", np.array([5.0 * k, 5, 0]), np.eye(3), np.ones(3)) for k in range(obstacles)
+    ])  # fmt: skip
+    stated: dict[str, Any] = {"duration": (1.0, 9.0), "time_weight": 2.0} if free else {}
+    problem = ls.Problem(
+        dynamics=ls.DifferentialDrive().dynamics, dt=0.1, steps=20, initial=ls.FixedState(heading=0.5),
+        stage_cost=ls.ControlCost({"m/s": 7.0}) + ls.ObstacleCost(world, radius=0.25),
+        final_cost=ls.QuadraticCost(weights, about={"y": goal}),
+        constraints=[
+            ls.GoalState(x=goal), ls.StateBounds(y=(-bound, np.inf)),
+            ls.Clearance(world, radius=0.25, margin=margin / 100),
+        ], control_limits=(-0.5, 0.75), **stated,
+    )  # fmt: skip
+    text = str(problem)
+    assert " at 0x" not in text + repr(problem) + repr(problem.dynamics)
+    lines = {line[:14].strip(" :") or "more": line[15:] for line in text.splitlines()}
+    assert lines["states"] == "x (m), y (m), heading (rad)"
+    assert lines["start"] == "FixedState([0, 0, 0.5])"
+    assert ("1 to 9 s in all" if free else "20 steps of 0.1 s, 2 s in all") in lines["dynamics"]
+    assert ("cost of time" in lines) is free
+    assert lines["limits"].count("-0.5 to 0.75") == 2
+    shown = f"World({obstacles} obstacles: " if obstacles else "World()"
+    assert "ControlCost(weight=diag([7, 7])" in lines["stage cost"]
+    assert f"ObstacleCost(world={shown}" in lines["stage cost"]
+    listed = ", ".join(map(str, weights))
+    assert f"QuadraticCost(weight=diag([{listed}]), about=[0, {goal}, 0])" in lines["final cost"]
+    assert f"GoalState(goal={{x: {goal}}})" in text
+    assert f"StateBounds(bounds={{y: (-{bound}, inf)}})" in text
+    assert f"margin={margin / 100:g}, radius=0.25)" in text
+
+
 def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> None:
     """Gradient by central differences of the value, step 1e-6: 1e-5 of gradients of order ten."""
     problem = quadrotor.problem

@@ -4,7 +4,7 @@
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -292,6 +292,10 @@ class KeepsClear:
     @property
     def moving(self) -> bool:
         return self.world.moving
+
+    def _stated(self) -> Mapping[str, object]:
+        own = {name: value for name, value in vars(self).items() if name not in ("shape", "radius", "balls", "geoms")}
+        return own | self.shape
 
     def in_world(self, dynamics: Dynamics, time: float = 0.0) -> ShapeInWorld:
         """The shape among the obstacles, where they are at a time in s. Raises InputError if it does not fit."""

@@ -27,6 +27,7 @@ from lqrsim.codegen.user_functions import (
 from lqrsim.errors import (
     Array,
     InputError,
+    brief,
     check_array,
     check_count,
     check_flag,
@@ -144,6 +145,9 @@ class CollisionSpheres:
         if self.depends_on is not None and self.level == "symbolic":
             wanted = "None: they are derived"
             raise InputError(f"CollisionSpheres: depends_on: got names for a symbolic function, want {wanted}")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} balls, radii {brief(self.radii.tolist())} m)"
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
         """Check and set the attributes of each ball."""

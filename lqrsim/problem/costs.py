@@ -27,6 +27,7 @@ from lqrsim.codegen.user_functions import (
 from lqrsim.errors import (
     Array,
     InputError,
+    brief,
     check_array,
     check_count,
     check_flag,
@@ -108,6 +109,18 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """Whether it changes with time; see `_bind_at`."""
         return False
 
+    def _stated(self) -> Mapping[str, object]:
+        """What it was made of, by name."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    def __repr__(self) -> str:
+        parts = [
+            f"{name}={brief(value)}"
+            for name, value in self._stated().items()
+            if not (value is None or value is False or (isinstance(value, Mapping) and not value))
+        ]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
     def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
         """Bind it to a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
@@ -158,6 +171,9 @@ class CostSum(Cost):
     def __init__(self, terms: tuple[Cost, ...]) -> None:
         self.terms = terms
 
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.terms))
+
     def bind(self, dynamics: Dynamics) -> CostTerm:
         raise InputError("cost: got a sum to bind, want its terms one by one")
 
@@ -190,10 +206,13 @@ class _SquareCost(Cost):
     controls: ClassVar[bool]
 
     def __init__(self, weight: PerEntry, about: PerEntry | None) -> None:
-        self._stated = {"weight": weight, "about": about}
+        self._given = {"weight": weight, "about": about}
         self._numbers: tuple[Array, Array] | None = None
-        if not any(isinstance(numbers, Mapping) for numbers in self._stated.values()):
+        if not any(isinstance(numbers, Mapping) for numbers in self._given.values()):
             self._numbers = self._checked(weight, about)
+
+    def _stated(self) -> Mapping[str, object]:
+        return self._given if self._numbers is None else {"weight": self.weight, "about": self.about}
 
     def _checked(self, weight: Any, about: Any) -> tuple[Array, Array]:
         weight = check_weight(f"{self.name}: weight", weight, definite=self.controls)
@@ -219,7 +238,7 @@ class _SquareCost(Cost):
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
         space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
         if self._numbers is None:
-            weight = self._stated["weight"]
+            weight = self._given["weight"]
             if self.controls and isinstance(weight, Mapping):
                 weighed = space._by_name(f"{self.name}: weight", weight, check_number)
                 missing = [name for i, name in enumerate(space.names) if i not in weighed]
@@ -229,7 +248,7 @@ class _SquareCost(Cost):
                     )
             found = {
                 field: space._numbers(f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
-                for field, given in self._stated.items()
+                for field, given in self._given.items()
             }
             other = copy.copy(self)
             other._numbers = self._checked(**found)

@@ -161,6 +161,10 @@ class Dynamics:
             if name not in ("_plain", "disturbed", "compiled", "step_curvature")
         }
 
+    def __repr__(self) -> str:
+        states, controls = (", ".join(space.labels) for space in (self.state_coordinates, self.control_coordinates))
+        return f"{type(self).__name__}({self.name}: states {states}; controls {controls})"
+
     @property
     def name(self) -> str:
         """The name of the dynamics in messages: that of `f`."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from lqrsim.errors import (
     Array,
     InputError,
+    brief,
     check_array,
     check_count,
     check_items,
@@ -58,6 +59,9 @@ class FixedState:
             if not len(found):
                 raise InputError("FixedState: state: got no numbers, want one per state")
         keep(self, state=found)
+
+    def __repr__(self) -> str:
+        return f"FixedState({brief(self.state)})"
 
     @property
     def numbers(self) -> Array:
@@ -344,6 +348,25 @@ class Problem:
         """
         changed = {name: value for name, value in (("noise", noise), ("risk", risk)) if value is not None}
         return replace(self, **changed) if changed else self
+
+    def __str__(self) -> str:
+        space, controls = self.dynamics.state_coordinates, self.control_coordinates
+        low, high = (self.steps * self.dt,) * 2 if self.duration is None else self.duration
+        seconds = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
+        limited = [
+            f"{name} {low:g} to {high:g}"
+            for name, low, high in zip(controls.names, controls.low, controls.high, strict=True)
+            if np.isfinite([low, high]).any()
+        ]
+        lines = {
+            "dynamics": f"{self.dynamics.name}; {self.steps} steps of {self.dt:.6g} s, {seconds} in all",
+            "states": ", ".join(space.labels), "controls": ", ".join(controls.labels), "limits": ", ".join(limited),
+            "start": repr(self.initial), "stage cost": repr(self.stage_cost), "final cost": repr(self.final_cost),
+            "constraints": "\n               ".join(map(repr, self.constraints)),
+            "noise": "" if self.noise is None else f"{self.noise!r}, risk {self.risk:g}",
+            "cost of time": f"{self.time_weight:g} a second" if self.time_weight else "",
+        }  # fmt: skip
+        return "\n".join(f"{name + ':':14s} {text}" for name, text in lines.items() if text)
 
     @property
     def digest(self) -> str:

@@ -97,6 +97,10 @@ class World:
     def __len__(self) -> int:
         return len(self.obstacles)
 
+    def __repr__(self) -> str:
+        names = [repr(name) for name in self.names[:3]] + ["..."] * (len(self) > 3)
+        return f"World({len(self)} obstacles: {', '.join(names)})" if names else "World()"
+
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(obstacle.name for obstacle in self.obstacles)
