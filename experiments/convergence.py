@@ -33,10 +33,9 @@ from paper.convergence_runs import (
 )
 from paper.rates import CLOSE, FEWEST, ROUNDING, rate
 from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
-from scipy import stats
 
 import lqrsim as ls
-from lqrsim.stress.statistics import Estimate
+from lqrsim.stress.statistics import bootstrap
 
 SHOWN = (1, 2, 4, 8, 16, 32)  # iterations whose gap is told
 
@@ -129,11 +128,7 @@ def rates(found: Sequence[Measured], case: str, solver: str) -> dict[str, Any]:
 def middle(values: Iterable[float]) -> list[float]:
     """The median of the known values, with its interval where there are several; empty without any."""
     known = [value for value in values if np.isfinite(value)]
-    if len(known) < 2:
-        return known
-    resampled = stats.bootstrap([known], np.median, method="percentile", n_resamples=10_000, batch=1000, rng=0)
-    ends = resampled.confidence_interval
-    return interval(Estimate(float(np.median(known)), float(ends.low), float(ends.high)))
+    return interval(bootstrap(np.median, known)) if len(known) > 1 else known
 
 
 def explained(factors: Sequence[float], measured: Sequence[float | None]) -> dict[str, Any]:

@@ -354,7 +354,7 @@ def brief(value: object) -> str:
         return f"{value + 0:.6g}"  # no -0
     if isinstance(value, np.ndarray):
         square = value.ndim == 2 and value.shape[0] == value.shape[1]
-        if square and len(value) > 1 and not (value - np.diag(np.diag(value))).any():
+        if square and not (value - np.diag(np.diag(value))).any():
             return f"diag({brief(np.diag(value).tolist())})"
         return brief(value.tolist()) if value.ndim <= 1 and value.size <= 12 else f"array {value.shape}"
     if isinstance(value, Mapping):

@@ -45,6 +45,28 @@ def test_a_cart_pushes_and_brakes_for_half_of_the_way_each(way: float, push: flo
     np.testing.assert_allclose(solution.trajectory.controls[:, 0], expected, atol=1e-6)
 
 
+def test_bounds_and_goals_by_unit_are_of_the_states_alone() -> None:
+    """A free duration is in s, too; a clock among the states has the bounds of its unit, and the duration has none."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[1], u[0], 1.0], states={"x": "m", "v": "m/s", "clock": "s"}, controls={"push": "m/s^2"},
+        control_limits=(-1, 1),
+    )  # fmt: skip
+    free = ls.Problem(
+        dynamics=dynamics, dt=0.2, steps=20, initial=ls.FixedState(np.zeros(3)), stage_cost=ls.ControlCost([1e-6]),
+        final_cost=ls.QuadraticCost(np.zeros(3), about=[1.0, 0.0, 0.0]), duration=(0.1, 20.0), time_weight=1.0,
+    )  # fmt: skip
+    goal = ls.GoalState(x=1.0, v=0.0)
+    kept = (
+        (ls.StateBounds({"s": (-1.0, 9.0)}), ls.StateBounds(clock=(-1.0, 9.0)), 2.0),
+        (ls.GoalState({"s": 3.0}), ls.GoalState(clock=3.0), 3.0),
+    )
+    for by_unit, by_name, seconds in kept:  # two are the least
+        one, other = (ls.smooth(dataclasses.replace(free, constraints=[goal, kept])) for kept in (by_unit, by_name))
+        assert one.status is Status.CONVERGED
+        np.testing.assert_array_equal(one.trajectory.states, other.trajectory.states)
+        assert one.trajectory.horizon == pytest.approx(seconds, rel=1e-6)
+
+
 def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
     free = dataclasses.replace(problem(), stage_cost=ls.SymbolicCost(lambda x, u, p: 1e-12 * x[0] ** 2, convex=True))
     solution = ls.smooth(free)

@@ -141,6 +141,7 @@ def test_columns_of_a_helper_have_the_bits_of_ones_own(kind: str, integrator: st
             team[kernel.DONE] = 0
             team[kernel.TICKET] = kernel.JOBS * (team[kernel.TICKET] // kernel.JOBS + 1)
             while team[kernel.DONE] < width:
+                assert helper.is_alive()
                 time.sleep(1e-4)
             np.testing.assert_array_equal(job[7 + width :].reshape(n, width), np.hstack([a, b]))
     finally:
@@ -340,7 +341,7 @@ def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: in
     assert "unnamed" not in str(robot).split("body:")[1].splitlines()[0]
     with pytest.raises(InputError, match=r"want 2 or 3 that are the position of the body 'part0', among: none"):
         ls.MjcfRobot(robot.scene, body="part0", position=("root_x", "root_y"))
-    assert "body: part0, whose position is no state of its own" in str(ls.MjcfRobot(robot.scene, body="part0"))
+    assert "body: part0, whose position is not among the states" in str(ls.MjcfRobot(robot.scene, body="part0"))
 
 
 def test_weights_of_a_problem_by_name_and_by_unit() -> None:

@@ -47,7 +47,7 @@ def test_a_problem_and_its_parts_print_what_they_were_made_of(
     assert ("1 to 9 s in all" if free else "20 steps of 0.1 s, 2 s in all") in lines["dynamics"]
     assert ("cost of time" in lines) is free
     assert lines["limits"].count("-0.5 to 0.75") == 2
-    shown = f"World({obstacles} obstacles: " if obstacles else "World()"
+    shown = f"World({obstacles} obstacle{'s' * (obstacles > 1)}: " if obstacles else "World()"
     assert "ControlCost(weight=diag([7, 7])" in lines["stage cost"]
     assert f"ObstacleCost(world={shown}" in lines["stage cost"]
     listed = ", ".join(map(str, weights))

@@ -198,7 +198,7 @@ def test_what_is_printed_while_a_file_is_written(flown: Path, tmp_path: Path) ->
     """That nobody reads it is no error of the file."""
     if not gl.available():
         pytest.skip("no OpenGL here")
-    options = ["--out", tmp_path / "a.mp4", "--fps", "6", "--size", "320", "180"]
+    options = ["--out", tmp_path / "a.mp4", "--fps", "240", "--size", "1280", "720"]
     with start(*COMMAND, "render", flown, *options) as process:
         assert process.stdout is not None
         assert process.stderr is not None

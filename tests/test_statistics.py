@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 
 import lqrsim as ls
-from lqrsim.stress.statistics import compare, holm, mean, paired_difference, rate, wilson
+from lqrsim.stress.statistics import bootstrap, compare, holm, mean, paired_difference, rate, wilson
 
 
 def at_least(successes: int, trials: int, p: float) -> float:
@@ -146,6 +146,33 @@ def test_mean_has_student_s_interval() -> None:
     np.testing.assert_allclose((found.low, found.high), (2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), atol=1e-4)
 
 
+def test_bootstrap_of_a_mean_is_near_the_normal_interval() -> None:
+    """At 2,000 normal draws the two agree to the noise of 10,000 resamples: 3 % of the width."""
+    sample = np.random.default_rng(1).normal(size=2000)
+    found = bootstrap(lambda x, axis: x.mean(axis), sample)
+    half = 1.96 * sample.std() / np.sqrt(len(sample))
+    assert found.low == pytest.approx(sample.mean() - half, abs=0.06 * half)
+    assert found.high == pytest.approx(sample.mean() + half, abs=0.06 * half)
+    assert found == bootstrap(lambda x, axis: x.mean(axis), sample)
+
+
+def test_bootstrap_keeps_pairs_together() -> None:
+    """The ratio of a sample to twice itself is 1/2 in each resample."""
+    sample = np.random.default_rng(1).exponential(size=50)
+    found = bootstrap(lambda x, y, axis: x.mean(axis) / y.mean(axis), sample, 2 * sample)
+    np.testing.assert_allclose((found.value, found.low, found.high), 0.5, rtol=1e-12)
+    assert f"{found:.2f}" == "0.50 [0.50, 0.50]"
+
+
+def test_bootstrap_covers() -> None:
+    """The median of 40 counts, where other intervals are not defined: of 200 studies 95 %, less three deviations."""
+    rng = np.random.default_rng(3)
+    draws = rng.exponential(size=(200, 40))
+    found = [bootstrap(lambda x, axis: np.median(x, axis), draw, resamples=500) for draw in draws]
+    covered = sum(one.low <= np.log(2) <= one.high for one in found)
+    assert covered >= 200 * 0.95 - 3 * np.sqrt(200 * 0.95 * 0.05)
+
+
 @pytest.mark.parametrize(
     ("call", "field"),
     [
@@ -158,6 +185,8 @@ def test_mean_has_student_s_interval() -> None:
         (lambda: paired_difference(3, 2, 4), "trials: got 4, want at least the 5"),
         (lambda: paired_difference(-1, 2, 4), "only_first: got -1"),
         (lambda: mean([1.0]), "sample: got 1 numbers"),
+        (lambda: bootstrap(np.mean, [1.0]), "samples: got lengths"),
+        (lambda: bootstrap(np.mean, [1.0, 2.0], [1.0]), "samples: got lengths"),
     ],
 )
 def test_bad_input_is_named(call: Callable[[], object], field: str) -> None:

@@ -52,7 +52,6 @@ def of(problem: ls.Problem) -> list[Kept]:
 def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     dynamics, steps = problem.dynamics, problem.steps
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    names = dynamics.state_coordinates.names
     # Of all steps; and of those that states can still be changed at, for of a start that is given nothing can.
     everywhere, changeable = np.ones(steps + 1, bool), np.ones(steps + 1, bool)
     changeable[0] = not isinstance(problem.initial, ls.FixedState)
@@ -75,8 +74,8 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
         indices, wanted = list(goal), np.array(list(goal.values()))
         return Kept(lambda z: z[..., indices] - wanted, np.tile(at_end[:, None], (1, len(indices))), True)
     if isinstance(constraint, ls.StateBounds):
-        bounds = constraint.bounds.items()
-        rows = [(names.index(name), sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for name, bound in bounds]
+        bounds = constraint._of(dynamics).items()
+        rows = [(i, sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for i, bound in bounds]
         indices, signs, numbers = (np.array(column) for column in zip(*rows, strict=True))
         indices, signs, numbers = (column[np.isfinite(numbers)] for column in (indices, signs, numbers))
         goals = [one for one in problem.constraints if isinstance(one, ls.GoalState)]

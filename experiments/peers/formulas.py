@@ -195,8 +195,7 @@ def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
     high = -low
     for one in problem.constraints:
         if isinstance(one, ls.StateBounds):
-            for name, (least, most) in one.bounds.items():
-                i = names.index(name)
+            for i, (least, most) in one._of(problem.dynamics).items():
                 last = problem.steps if i in fixed else problem.steps + 1
                 low[1:last, i] = np.maximum(low[1:last, i], least)
                 high[1:last, i] = np.minimum(high[1:last, i], most)

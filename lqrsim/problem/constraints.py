@@ -235,18 +235,8 @@ class StateBounds(Constraint):
     ) -> None:
         self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
-    def of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
-        """The bounds of each state that has any.
-
-        Args:
-          dynamics: whose states they are of.
-
-        Returns:
-          Index of a state -> (low, high).
-
-        Raises:
-          InputError: the dynamics have no state of such a name or unit.
-        """
+    def _of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
+        """(low, high) of each state that has any, by its index."""
         return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, _bound)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
@@ -261,7 +251,7 @@ class StateBounds(Constraint):
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         data, described = [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
-            for i, bound in self.of(dynamics).items():
+            for i, bound in self._of(dynamics).items():
                 name, number = names[i], bound[side]
                 if not np.isfinite(number):
                     continue
@@ -306,7 +296,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
 
 def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics) -> None:
     """Raises InputError if several bounds of a state leave nothing between them."""
-    found = [one.of(dynamics) for one in bounds]
+    found = [one._of(dynamics) for one in bounds]
     for i in {i for one in found for i in one}:
         lows, highs = zip(*(one[i] for one in found if i in one), strict=True)
         if not max(lows) < min(highs):

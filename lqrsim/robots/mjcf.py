@@ -354,7 +354,7 @@ class MjcfRobot(Robot):
             f"  states: {_listed(space.names)}",
             f"  body: {self.body}, with the position {', '.join(space.names[i] for i in space.position)}"
             if space.position
-            else f"  body: {self.body}, whose position is no state of its own",
+            else f"  body: {self.body}, whose position is not among the states",
             f"  held at rest by: {_listed(told)}{short}",
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",

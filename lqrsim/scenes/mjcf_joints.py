@@ -265,7 +265,7 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
-    """The geom that moves with a body and is farthest from its origin at rest; the body itself if it has none.
+    """The geom of the tree of a body that is farthest from its origin at rest; the body itself if it has none.
 
     Returns:
       The number of its body, its place (3,) there, and the radius of the ball that it is in, in metres.

@@ -99,7 +99,7 @@ class World:
 
     def __repr__(self) -> str:
         names = [repr(name) for name in self.names[:3]] + ["..."] * (len(self) > 3)
-        return f"World({len(self)} obstacles: {', '.join(names)})" if names else "World()"
+        return f"World({len(self)} obstacle{'s' * (len(self) > 1)}: {', '.join(names)})" if names else "World()"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -156,7 +156,7 @@ def with_duration(problem: Problem) -> Problem:
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
         stage_cost=CostSum(stage), final_cost=CostSum((*final, time)), control_limits=problem.control_limits,
-        constraints=(*(_longer(one, dynamics.state_coordinates.names) for one in problem.constraints), bounds),
+        constraints=(*(_longer(one, dynamics) for one in problem.constraints), bounds),
         begin=problem.begin,
     )  # fmt: skip
 
@@ -195,14 +195,16 @@ def _longer_cost(cost: Cost, n: int) -> Cost:
     )
 
 
-def _longer(constraint: Constraint, names: Sequence[str]) -> Constraint:
-    """A constraint of the states of these names as one of these and another, independent of the last."""
+def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
+    """A constraint of these dynamics' states as one of these and another, independent of the last."""
+    names = dynamics.state_coordinates.names  # numbers by unit would be those of the last state, too
     if isinstance(constraint, GoalState):
-        goal = constraint.goal
-        return GoalState(goal if isinstance(goal, dict) else dict(zip(names, goal.tolist(), strict=True)))
+        return GoalState({names[i]: number for i, number in constraint._numbers(dynamics).items()})
+    if isinstance(constraint, StateBounds):
+        return StateBounds({names[i]: sides for i, sides in constraint._of(dynamics).items()})
     if isinstance(constraint, SymbolicConstraint):
         return _of_fewer(constraint, len(names))
-    if isinstance(constraint, (StateBounds, Clearance)):
+    if isinstance(constraint, Clearance):
         return constraint
     raise InputError(
         f"duration: got a {type(constraint).__name__} beside it, want GoalState, StateBounds, Clearance and"

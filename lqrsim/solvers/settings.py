@@ -15,6 +15,7 @@ from lqrsim.errors import (
     check_memory,
     check_name,
     check_number,
+    keep,
 )
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
@@ -46,13 +47,13 @@ class Settings:
         self._check_positive("tolerance")
         # A log of that length takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
-        object.__setattr__(self, "max_iterations", most)
+        keep(self, max_iterations=most)
         self._check_positive("time_limit")
 
     def _check_positive(self, name: str) -> None:
         """Check an option that is a positive number, or None for its default."""
         if (value := getattr(self, name)) is not None:
-            object.__setattr__(self, name, check_number(name, value, above=0.0))
+            keep(self, **{name: check_number(name, value, above=0.0)})
 
     @property
     def core_form(self) -> str:
@@ -84,17 +85,17 @@ class SmootherSettings(Settings):
         if self.finish is not None:
             check_name("finish", self.finish, ("newton",))
         if self.starts is not None:
-            object.__setattr__(self, "starts", check_count("starts", self.starts, at_most=MOST_STARTS))
+            keep(self, starts=check_count("starts", self.starts, at_most=MOST_STARTS))
             if self.starts > 1 and self.start is not None:
                 raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
-        object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
+        keep(self, gap_tolerance=check_number("gap_tolerance", self.gap_tolerance, above=0.0))
         self._check_positive("constraint_tolerance")
         self._check_positive("penalty")
         if self.penalty is not None and self.start is None:
             raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
         check_name("form", self.form, tuple(compiled.FORMS))
         check_name("first_pass", self.first_pass, ("forward", "backward"))
-        object.__setattr__(self, "safeguard", check_flag("safeguard", self.safeguard))
+        keep(self, safeguard=check_flag("safeguard", self.safeguard))
 
     @property
     def core_form(self) -> str:

@@ -70,7 +70,7 @@ def smooth(
         1e-4 without Newton's method.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
-        has as many.
+        has as many, also those that are tried where no plan keeps the constraints yet.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. An iteration that would end later, if it took as long as the last, is not begun.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
@@ -80,7 +80,8 @@ def smooth(
         With constraints the answer costs no more than a feasible plan that is given.
       starts: how many starts to try. By default 7 where there is an ObstacleCost; 3 where the first plan touches an
         inequality of the states, other than StateBounds, in a problem with a position; else 1, the straight way to the
-        goal or the nominal control. The candidates are in the solution.
+        goal or the nominal control, and more where that leads to no plan that keeps the constraints. The candidates are
+        in the solution.
       constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
         equalities no more than that. Where the augmented Lagrangian handles them (see `finish`), inequalities are
         solved with this margin, by default 1e-3.

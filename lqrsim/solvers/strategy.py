@@ -102,9 +102,10 @@ def solve(
             search.run()
             default = settings.start is None and settings.starts is None
             # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-            poor = search.says_infeasible or (default and search.is_unacceptable)
+            poor, tried = search.says_infeasible or (default and search.is_unacceptable), not settings.safeguard
             if settings.safeguard and not stop.due and poor:
                 search.widen()
+                tried = not stop.due
             if settings.start is None and search.best[0].second_order and not stop.due:
                 search.look_aside()
             if problem.risk > 0 and settings.safeguard and not stop.due:
@@ -114,7 +115,7 @@ def solve(
             if not search.best[1].success and not stop.due:
                 search.keep_modes()
     chosen, found = search.best
-    if found.status is Status.INFEASIBLE and stop.due and settings.safeguard:
+    if found.status is Status.INFEASIBLE and not tried and stop.error is None:
         untried = "no time was left for other starts, which may keep the constraints"
         found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
@@ -253,6 +254,8 @@ class Search:
         problem, cost = self._problem, self.best[1].cost
         found = list[tuple[float, str, Trajectory]]()
         for name, prior in along_paths(problem, self._moving(), cost if 0 < cost < np.inf else 1.0).items():
+            if self._budget.stop.due:
+                break
             run = self._another(resolve(prior, problem))
             run.smooth(FOLLOW)
             states, controls = (part.copy() for part in run.work.arrays.rollout)
@@ -395,7 +398,8 @@ class Search:
         """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
 
         Far is farther than the robot's radius, or, without a position, than the tolerance of a goal; through is deeper
-        than half the radius, or half that of the largest collision sphere.
+        than half the radius, or half that of the largest collision sphere. Without an ObstacleCost: one that violates
+        the constraints, or does nothing.
         """
         problem = self._problem
         space = problem.dynamics.state_coordinates

@@ -1,4 +1,4 @@
-"""Statistics of trials: exact intervals of rates, and paired comparisons. Most of it is SciPy's."""
+"""Statistics of trials: exact intervals of rates, paired comparisons, bootstrap intervals. Most of it is SciPy's."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_number, check_seed, excerpt
 from lqrsim.results.fields import check_fields
 
 CONFIDENCE = 0.95
@@ -155,3 +155,51 @@ def holm(p_values: npt.ArrayLike) -> Array:
     adjusted = np.empty(len(values))
     adjusted[order] = raised
     return adjusted
+
+
+def bootstrap(
+    statistic: Callable[..., Array | float],
+    *samples: npt.ArrayLike,
+    confidence: float = CONFIDENCE,
+    resamples: int = 10_000,
+    seed: int = 0,
+) -> Estimate:
+    """A statistic of paired samples, (K,) each, with its percentile bootstrap interval.
+
+    Args:
+      statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example
+        `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
+      samples: numbers (K,); row i of each belongs to the same trial.
+      confidence: confidence of the interval.
+      resamples: number of bootstrap samples.
+      seed: seed of the resampling.
+
+    Raises:
+      InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such
+        function.
+    """
+    arrays = [check_array("samples", sample, (None,)) for sample in samples]
+    if not arrays or any(len(array) != len(arrays[0]) for array in arrays) or len(arrays[0]) < 2:
+        raise InputError(f"samples: got lengths {[len(array) for array in arrays]}, want one length of at least 2")
+    check_function("statistic", statistic, "a function of the samples and axis", optional=False)
+    check_number("confidence", confidence, above=0, below=1)
+    check_count("resamples", resamples, at_most=1_000_000)
+    seed = check_seed("seed", seed)
+    try:
+        value = float(statistic(*arrays, axis=0))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"statistic: got {excerpt(statistic)}, want a function of the samples and axis ({error})"
+        ) from None
+    interval = stats.bootstrap(
+        arrays,
+        statistic,
+        paired=True,
+        vectorized=True,
+        n_resamples=resamples,
+        batch=max(1, min(1000, 10_000_000 // len(arrays[0]))),  # bounds the memory
+        confidence_level=confidence,
+        method="percentile",  # BCa is undefined for medians of counts, which we have
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high), confidence)
