@@ -166,7 +166,10 @@ def made(scenario: ls.Scenario, solution: ls.Solution) -> dict[str, ls.Controlle
     }
 
 
-@pytest.mark.parametrize("name", ["estimating", "estimating, planning again", "planning again"])
+@pytest.mark.parametrize(
+    "name",
+    ["estimating", pytest.param("estimating, planning again", marks=pytest.mark.long), "planning again"],
+)
 def test_one_controller_serves_two_runs_at_once(
     plant: ls.Plant, differential_drive: ls.Scenario, drive_solution: ls.Solution, name: str
 ) -> None:

@@ -100,6 +100,7 @@ LOOKED_AT = """(() => {
 })()"""
 
 
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
 def test_pages_fit_a_narrow_and_a_wide_screen_in_light_and_dark(site: Path, tmp_path: Path) -> None:
     """What is too wide scrolls, and its shadow says so; videos play and stop."""

@@ -170,6 +170,7 @@ SWIMMER = """<mujoco><option timestep="0.01" density="4000" viscosity="0.1" inte
   </actuator></mujoco>"""
 
 
+@pytest.mark.long
 def test_softening_does_not_bring_back_a_plan_that_does_nothing() -> None:
     robot = ls.MjcfRobot(scene_from_xml(SWIMMER, "swimmer"))
     low, high = robot.dynamics.control_coordinates.low, robot.dynamics.control_coordinates.high
