@@ -57,6 +57,15 @@ def test_a_problem_and_its_parts_print_what_they_were_made_of(
     assert f"margin={margin / 100:g}, radius=0.25)" in text
 
 
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_weights_of_any_number_of_controls_are_printed(size: int) -> None:
+    listed = {1: "7", 2: "7, 7", 5: "7, ... 5 times"}[size]
+    assert repr(ls.ControlCost(np.full(size, 7.0))).startswith(f"ControlCost(weight=diag([{listed}]), about=[")
+    full = np.eye(size) + 1
+    shown = "diag([2])" if size == 1 else f"array ({size}, {size})"
+    assert repr(ls.ControlCost(full)).startswith(f"ControlCost(weight={shown}, about=[")
+
+
 def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> None:
     """Gradient by central differences of the value, step 1e-6: 1e-5 of gradients of order ten."""
     problem = quadrotor.problem

@@ -260,7 +260,7 @@ class UserFunction:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
             raise InputError(
-                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {brief(x)}"
+                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {first_numbers(x)}"
             ) from error
         return written or [self._vector(returned)]
 
@@ -496,7 +496,7 @@ def _view(address: int, size: int) -> Array:
     return np.frombuffer(memory, dtype=np.float64)
 
 
-def brief(x: Array) -> str:
+def first_numbers(x: Array) -> str:
     """The first few numbers, for a message."""
     return "(" + ", ".join(f"{value:g}" for value in x[:6]) + (", ...)" if len(x) > 6 else ")")
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.user_functions import Term, UserFunction, address_of, brief, plain_calls
+from lqrsim.codegen.user_functions import Term, UserFunction, address_of, first_numbers, plain_calls
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
@@ -48,7 +48,7 @@ def _parts(problem: Problem) -> list[Dynamics | Term]:
 
 def check_start(problem: Problem, x: Array, u: Array) -> None:
     """Raises InputError if the dynamics or a cost is not finite at a state (n,) and control (m,)."""
-    where = f"at the start, x = {brief(x)}, u = {brief(u)}"
+    where = f"at the start, x = {first_numbers(x)}, u = {first_numbers(u)}"
     dynamics, names = problem.dynamics, problem.dynamics.state_coordinates.names
     called = dynamics.name if dynamics.discrete else f"{dynamics.name}(x, u, p)"
     with np.errstate(all="ignore"):
@@ -166,7 +166,7 @@ class DerivativeCheck:
         return (
             f"{self.what}: {verdict}; worst at row {self.row}, column {self.column}: {self.stated:.8g} stated,"
             f" {self.difference:.8g} by central differences (error {self.error:.1e}, tolerance {self.tolerance:.0e};"
-            f" x = {brief(self.state)}, u = {brief(self.control)})"
+            f" x = {first_numbers(self.state)}, u = {first_numbers(self.control)})"
         )
 
 

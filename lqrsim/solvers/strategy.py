@@ -253,7 +253,7 @@ class Search:
         """Motions along paths from start to goal, by name; those first that violate the constraints least."""
         problem, cost = self._problem, self.best[1].cost
         found = list[tuple[float, str, Trajectory]]()
-        for name, prior in along_paths(problem, self._moving(), cost if 0 < cost < np.inf else 1.0).items():
+        for name, prior in along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
             if self._budget.stop.due:
                 break
             run = self._another(resolve(prior, problem))
@@ -264,7 +264,7 @@ class Search:
                 found.append((missed, name, Trajectory(states, controls, problem.dt)))
         return [(name, motion) for _, name, motion in sorted(found, key=lambda one: one[0])]
 
-    def _moving(self) -> list[int]:
+    def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else those on which constraints to be passed depend."""
         problem, work, moving = self._problem, self.best[0].work, set[int]()
         position = list(problem.dynamics.state_coordinates.position)
