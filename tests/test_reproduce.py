@@ -71,7 +71,8 @@ def test_a_script_that_fails_does_not_stop_the_others(
 
 def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("table_1", "figure_2"):
-        (scripts / f"{name}.py").write_text(GOOD.replace("## It works", f"## {name}"))
+        mine = GOOD.replace("## It works", f"## {name}").replace('lqrsim="0"', f'lqrsim="of {name}"')
+        (scripts / f"{name}.py").write_text(mine)
     out = tmp_path / "out"
     assert main(["reproduce", "table_1", "--keep", "--out", str(out)]) == 2
     assert "--keep: got" in capsys.readouterr().err  # there is nothing to keep yet
@@ -81,6 +82,10 @@ def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys
     before = json.loads((out / "results.json").read_text())
     (out / "results.json").write_text(json.dumps(before | {"machine": "another machine"}))
     assert main(["reproduce", "figure_2", "--keep", "--out", str(out)]) == 0
+    page = (out / "results.md").read_text()
+    assert "Computed with lqrsim of figure_2 on another machine." in page
+    assert re.search(r"figure_2.py`, \d+ s, on (?!another)", page)
+    assert re.search(r"table_1.py`, \d+ s, with lqrsim of table_1, on (?!another)", page)
     saved = json.loads((out / "results.json").read_text())
     assert list(saved["results"]) == ["figure_2", "table_1"]  # in the order of the page
     assert saved["results"]["table_1"] == before["results"]["table_1"]

@@ -87,7 +87,7 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
                 failures.append(outcome)
                 console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
             else:
-                results[name] = outcome | {"seconds": round(seconds)}
+                results[name] = outcome | {"seconds": round(seconds), "machine": description()}
                 console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
             bar.update()
     if results:
@@ -179,7 +179,13 @@ def results_page(saved: Mapping[str, Any]) -> str:
         ]
     for name, one in results.items():
         options = "" if not saved["quick"] else " --quick"
-        parts += [one["report"], f"`python experiments/{name}.py{options}`, {one['seconds']} s."]
+        # With --keep, a result may be of another version or machine than the page's first lines say.
+        other = [
+            f"{what} {version}" for what, version in one["result"]["versions"].items() if versions.get(what) != version
+        ]
+        where = [] if one.get("machine", saved["machine"]) == saved["machine"] else [f"on {one['machine']}"]
+        said = ", ".join([f"{one['seconds']} s", *(["with " + " and ".join(other)] if other else []), *where])
+        parts += [one["report"], f"`python experiments/{name}.py{options}`, {said}."]
     return "\n\n".join(parts) + "\n"
 
 
