@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 from pucks import RADIUS, STEPS, Puck, left, plant, solution
+from sampling import examples
 from scipy import stats
 
 import lqrsim as ls
@@ -197,7 +198,7 @@ WHOLE = st.fixed_dictionaries(
 
 
 @hypothesis.given(WHOLE)
-@hypothesis.settings(max_examples=40, deadline=None)
+@hypothesis.settings(max_examples=examples(40), deadline=None)
 def test_whole_inputs(given: dict[str, Any]) -> None:
     """Whatever is asked for, it is refused in one line, or the funnel is whole: what it says of itself holds."""
     here = whole_inputs_plant()

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from linear_plans import DT, Linear, double_integrator, linear
+from sampling import rarely
 from tracking import hover, track
 
 import lqrsim as ls
@@ -144,9 +145,7 @@ def standing(quadrotor: ls.Scenario) -> ls.Solution:
     "disturbance",
     [
         MeanWind((3.0, 0.0, 0.0)),
-        pytest.param(MeanWind((-1.7, 1.7, 1.7)), marks=pytest.mark.long),
-        pytest.param(MassMismatch(factor=0.8), marks=pytest.mark.long),
-        MassMismatch(factor=1.2),
+        *rarely(MeanWind((-1.7, 1.7, 1.7)), MassMismatch(factor=0.8), MassMismatch(factor=1.2)),
     ],
     ids=str,
 )
@@ -322,7 +321,7 @@ def test_the_digest_is_of_all_that_the_controls_depend_on() -> None:
 # Better sensors.
 
 
-@pytest.mark.parametrize("level", ["light", "severe"])
+@pytest.mark.parametrize("level", ["severe", *rarely("light")])
 def test_exact_sensors_keep_nearer_to_the_plan_than_noisy_ones(level: str, quadrotor: ls.Scenario) -> None:
     """Hovering for 2 s, 12 flights in a whole preset and in a drawn half of it. None without noise diverges.
 
