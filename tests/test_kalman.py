@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, double_integrator, linear
-from sampling import examples
+from sampling import examples, rarely
 from scipy.linalg import expm
 from scipy.stats import binom, chi2
 
@@ -142,7 +142,7 @@ class Truth:
         self.x += self.mispredicted * rng.normal(size=self.x.shape)
 
 
-@pytest.mark.parametrize("case", range(len(CASES)))
+@pytest.mark.parametrize("case", [0, 3, *rarely(1, 2)])
 def test_it_is_consistent_in_a_thousand_trials(case: int) -> None:
     """Mean NEES and NIS over the trials within the 95 % bands of chi-square, knot by knot.
 

@@ -57,7 +57,7 @@ def wait_for(found: Path, pattern: str, process: subprocess.Popen[str]) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("module", ["tyro", "numpy", "lqrsim.problem.costs", "mujoco"])
+@pytest.mark.parametrize("module", ["tyro", "mujoco", *rarely("numpy", "lqrsim.problem.costs")])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_it_starts_is_one_line(module: str, number: int) -> None:
     """As soon as it says that a module has been imported; it goes on for a while."""
