@@ -451,7 +451,7 @@ def test_a_full_disk_stops_it_until_there_is_room(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="No space left on device"):
-        run_campaign(CAMPAIGN, tmp_path, workers=2)
+        run_campaign(CAMPAIGN, tmp_path, workers=1)
     monkeypatch.undo()
     assert not multiprocessing.active_children()
     partial = Results(tmp_path)

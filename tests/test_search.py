@@ -393,6 +393,7 @@ class TestWhatContactsHold:
             ends = np.array([few.start, few.goal]) * (prior.weight > 0)
             np.testing.assert_allclose(one.about[[0, -1]], ends, atol=1e-12)  # the sine of pi
 
+    @pytest.mark.long
     def test_the_first_pass_is_not_lost(self, on_wheels) -> None:
         """Attracted by its position alone, the robot is tilted in the first pass, which is NOT_FINITE."""
         ((_, prior),) = guides(on_wheels, 1)
