@@ -174,7 +174,7 @@ class TestOracle:
         """Against a dense solver, with the Runge-Kutta step of a linear system written as a Taylor polynomial."""
         compared = 0
         for kind in (kind for kind in KINDS if problems.family(kind) == "linear"):
-            for index in range(examples(16)):
+            for index in range(examples(32)):
                 problem = problems.draw(kind, index)
                 if isinstance(problem.initial, ls.FixedState):
                     continue

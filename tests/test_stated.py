@@ -260,7 +260,7 @@ def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest
 
 
 def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2"
+    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2 --workers 0"
     assert main(["stress", "differential_drive", *options.split(), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     rows = [line for line in printed if line.startswith("light")]
