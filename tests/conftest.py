@@ -7,9 +7,27 @@ import pytest
 
 import lqrsim as ls
 
-# Machines may be busy, so examples have no time limit.
-hypothesis.settings.register_profile("untimed", deadline=None)
-hypothesis.settings.load_profile("untimed")
+# Machines may be busy, so examples have no time limit. Where long tests are left out, families are drawn less often
+# (tests/helpers/sampling.py) and the predictions of runs have fewer trials, unless a test says how many.
+hypothesis.settings.register_profile("whole", deadline=None)
+hypothesis.settings.register_profile("short", deadline=None, max_examples=25)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    hypothesis.settings.load_profile("short" if is_short(config) else "whole")
+
+
+def is_short(config: pytest.Config) -> bool:
+    return config.option.markexpr == "not long"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        if is_short(pytestconfig):
+            patch.setattr("lqrsim.control.tubes.FEWEST", 400)
+            patch.setattr("lqrsim.control.tubes.MOST", 400)
+        yield
 
 
 # The slowest files start first: a file is not divided among processors, and one that starts last keeps all waiting.
@@ -27,10 +45,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c_is_heard() -> Iterator[None]:
-    """Restore Ctrl-C: shells start background jobs with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Restore Ctrl-C: shells start background jobs with SIGINT ignored. Where hang-ups are, as by nohup, they still are
+    here, but not by the processes that tests start.
+    """
+    before = {signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    hang_up = getattr(signal, "SIGHUP", None)
+    if hang_up and signal.getsignal(hang_up) == signal.SIG_IGN:
+        before[hang_up] = signal.signal(hang_up, lambda *_: None)
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)

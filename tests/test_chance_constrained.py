@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.disturbances import Uncertainty
@@ -99,13 +100,16 @@ def test_ctrl_c_keeps_the_best_plan_so_far(problem: ls.Problem) -> None:
     assert plan.tube.collision_chance == min(one[-1] for one in plan.rounds)
 
 
-@pytest.mark.parametrize("sharpness", [10.0, 100.0])
-def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: float) -> None:
+@pytest.mark.parametrize("sharpness", [10.0, *rarely(100.0)])
+def test_a_plan_is_not_much_safer_than_asked(
+    problem: ls.Problem, sharpness: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where one clearance for all directions, as the second plan has, is too much: noise is along the way, not across.
 
     Without a margin the plan collides too often; with one as large across as along it is five times safer than asked,
     and costs more than it need.
     """
+    monkeypatch.setattr("lqrsim.control.tubes.MOST", 20_000)  # as without the few of the short run
     cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
     changed: dict[str, Any] = {"stage_cost": cost}
     narrow = Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.8}, measurement=0.01)

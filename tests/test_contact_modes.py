@@ -8,6 +8,7 @@ import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -54,7 +55,7 @@ def modes_of(robot: ls.MjcfRobot) -> ContactModes:
 
 @pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
-@settings(max_examples=6)
+@settings(max_examples=examples(6))
 @given(mass=MASSES, speed=SPEEDS, depth=st.floats(-0.015, 0.015))
 def test_a_period_is_that_of_the_dynamics_and_its_first_switch_the_distance(
     kind: str, integrator: str, mass: float, speed: float, depth: float
@@ -69,7 +70,7 @@ def test_a_period_is_that_of_the_dynamics_and_its_first_switch_the_distance(
 
 
 @pytest.mark.parametrize("kind", FILES)
-@settings(max_examples=6)
+@settings(max_examples=examples(6))
 @given(mass=MASSES, speed=SPEEDS, part=st.floats(0.1, 0.9))
 def test_derivatives_beside_a_jump_are_those_of_free_flight(kind: str, mass: float, speed: float, part: float) -> None:
     robot, control = robot_of(kind, mass), np.array([0.0])
@@ -130,7 +131,7 @@ def least_cost(mass: float, goal: float, speed: float) -> float:
     return float(found.fun)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3, *rarely(1, 2)])
 def test_nothing_beside_a_plan_that_is_called_optimal_is_cheaper(seed: int) -> None:
     draws = np.random.default_rng(seed)
     mass, goal, speed = draws.uniform(0.7, 2), draws.uniform(1.03, 1.2), draws.uniform(0.5, 1.0)
@@ -193,7 +194,7 @@ def test_smooth_converges_beside_a_jump_and_says_what_is_there(tmp_path: Path) -
     assert loaded.certificate == solution.certificate
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None:
     draws = np.random.default_rng(seed)

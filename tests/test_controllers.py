@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, MeasurementDropouts, MeasurementNoise
@@ -168,7 +169,7 @@ def made(scenario: ls.Scenario, solution: ls.Solution) -> dict[str, ls.Controlle
 
 @pytest.mark.parametrize(
     "name",
-    ["estimating", pytest.param("estimating, planning again", marks=pytest.mark.long), "planning again"],
+    ["estimating", *rarely("estimating, planning again", "planning again")],
 )
 def test_one_controller_serves_two_runs_at_once(
     plant: ls.Plant, differential_drive: ls.Scenario, drive_solution: ls.Solution, name: str

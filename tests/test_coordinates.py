@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
@@ -15,7 +16,7 @@ SPACE = ls.types.Coordinates(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_nearest_is_the_same_pose_and_the_nearest_of_all(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -211,6 +211,7 @@ def presets() -> str:
     return "\n".join(lines)
 
 
+@pytest.mark.long
 def test_stress_testing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     page = (DOCS / "stress_testing.md").read_text(encoding="utf-8")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 from tracking import hover, track
 
 import lqrsim as ls
@@ -432,7 +433,7 @@ def by_hand(rollout: ls.Rollout, table: Outcomes, k: int) -> None:
     assert table.ended[k] == min(first, rollout.plan.horizon)
 
 
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(
     st.sampled_from([0.0, 0.5, 2.0, 1e6, 1e13]), st.sampled_from([0.0, 1.9]), st.integers(0, 1000), st.booleans(),
     st.sampled_from([1, 5]),

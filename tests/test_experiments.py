@@ -141,6 +141,7 @@ def test_benchmark_of_intervals() -> None:
     assert "rare failures, 95 % intervals" in script.report(result)
 
 
+@pytest.mark.long
 def test_benchmark_of_sensors() -> None:
     """A small part: a drawn half of a preset and four noises; what is counted is what the trials say."""
     script = import_module("benchmark_sensors")

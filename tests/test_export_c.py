@@ -16,6 +16,7 @@ import pytest
 from export_c import QEMU, VARIANTS, WARNINGS, CompiledLaw, difference
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -160,7 +161,7 @@ def product(case: Case, matrices: Array, k: int, x: Array, off: Array) -> Array:
 
 
 @needs_compiler
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(drawn=affine_policies(), interpolate=st.booleans())
 def test_policies_command_what_they_do_in_python(
     drawn: tuple[Case, ls.AffinePolicy], interpolate: bool, tmp_path_factory: pytest.TempPathFactory
@@ -205,7 +206,7 @@ def test_policies_command_what_they_do_in_python(
 
 
 @needs_compiler
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(drawn=filters())
 def test_filters_estimate_and_command_what_they_do_in_python(
     drawn: tuple[Case, ls.types.OutputFeedbackPolicy], tmp_path_factory: pytest.TempPathFactory
@@ -293,7 +294,7 @@ def test_what_python_refuses_is_refused_and_changes_nothing(
 
 
 @needs_compiler
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(drawn=affine_policies() | filters(), size=st.floats(20.0, 38.5))
 def test_numbers_that_overflow_are_refused_and_change_nothing(
     drawn: tuple[Case, ls.AffinePolicy | ls.types.OutputFeedbackPolicy],

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
@@ -132,7 +133,7 @@ class Firmware:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(seed=st.integers(0, 2**32 - 1), dt=st.sampled_from([0.01, 1 / 30]))
 def test_the_crazyflie_flies_the_law_when_told_to(
     seed: int, dt: float, tmp_path_factory: pytest.TempPathFactory

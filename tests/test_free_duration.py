@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Status
@@ -31,7 +32,7 @@ def problem(
     )  # fmt: skip
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=examples(15), deadline=None, derandomize=True)
 @given(st.floats(0.1, 5.0), st.floats(0.3, 3.0), st.integers(5, 20))
 def test_a_cart_pushes_and_brakes_for_half_of_the_way_each(way: float, push: float, half: int) -> None:
     """The least time is 2 sqrt(way / push); an even number of steps can have the switch where it belongs.

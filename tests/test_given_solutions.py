@@ -20,7 +20,7 @@ from lqrsim.view import viewer
 DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))
 CAMPAIGN = ls.stress.Campaign(
     scenario=DRIVE, sweeps={"light": LIGHT}, strengths=(1.0,),
-    policies=("smooth", "ilqr", "open_loop", "replan", "track", "offset_free"), replan_every=12.0, trials=4, shard=2,
+    policies=("smooth", "ilqr", "open_loop", "replan", "track", "offset_free"), replan_every=12.0, trials=2, shard=1,
     design_disturbances=LIGHT,
 )  # fmt: skip
 FEW = ["--sweep", "scenario", "--strengths", "1", "--trials", "2", "--workers", "0"]
@@ -78,7 +78,7 @@ def test_the_trials_of_a_campaign_are_those_of_the_given_solution(
     assert laws.keys() == {*CAMPAIGN.policies}
     for policy, law in laws.items():
         plan = left if law else ls.ilqr(problem)  # which is the baseline, from its own plan
-        rollout = ls.simulate(plant, plan, controller=law, disturbances=LIGHT, trials=4, contacts=False)
+        rollout = ls.simulate(plant, plan, controller=law, disturbances=LIGHT, trials=2, contacts=False, frames=False)
         wanted, rows = ls.stress.outcomes(rollout, problem), results.outcomes(ls.stress.Cell(policy, "light", 1.0))
         np.testing.assert_array_equal(rows.clearance, wanted.clearance, err_msg=policy)
         np.testing.assert_array_equal(rows.outcome, wanted.outcome)

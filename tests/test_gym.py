@@ -13,6 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from mjcf_files import arm, cart
 from PIL import Image
+from sampling import rarely
 
 import lqrsim as ls
 import lqrsim.gym
@@ -53,8 +54,8 @@ def test_gymnasiums_own_check_finds_nothing(case: tuple[str, ls.Scenario, ls.Sol
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        *((name, "") for name in NAMES),
-        ("lqrsim/Scenario-v0", "scenario='quadrotor'"),
+        ("lqrsim/Quadrotor-v0", ""),
+        *rarely(("lqrsim/DifferentialDrive-v0", ""), ("lqrsim/Scenario-v0", "scenario='quadrotor'")),
         ("lqrsim/Quadrotor-v0", "num_envs=2"),
     ],
 )

@@ -9,6 +9,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
+from sampling import examples, rarely
 from shooting import Shooting
 
 import lqrsim as ls
@@ -130,7 +131,7 @@ def drawn(number: int) -> ls.Problem:
 
 
 numbers = st.integers(0, 2**32 - 1)
-enough = settings(max_examples=40, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+enough = settings(max_examples=examples(40), derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 
 
 @enough
@@ -141,7 +142,7 @@ def test_what_can_be_solved_is(number: int) -> None:
     is_optimal(of, solution)
 
 
-@settings(enough, max_examples=15)
+@settings(enough, max_examples=examples(15))
 @given(number=numbers, size=st.sampled_from([1.0, 10.0]))
 def test_what_can_be_solved_is_not_called_infeasible_from_any_start(number: int, size: float) -> None:
     of, rng = drawn(number), np.random.default_rng(number + 1)
@@ -182,7 +183,7 @@ def test_units_do_not_matter(name: str, factor: float) -> None:
     np.testing.assert_allclose(other.trajectory.controls / units["force"], plan.controls, rtol=0, atol=1e-5)
 
 
-@settings(enough, max_examples=20)
+@settings(enough, max_examples=examples(20))
 @given(powers=st.tuples(*[st.floats(-3, 3)] * 4))
 def test_nor_do_all_of_them_at_once(powers: tuple[float, ...]) -> None:
     units = dict(zip(UNITS, (10.0**power for power in powers), strict=True))
@@ -249,7 +250,7 @@ def test_a_price_above_the_largest_multiplier_is_as_good_as_none(which: int) -> 
 
 
 @pytest.mark.parametrize("which", range(3))
-@pytest.mark.parametrize("share", [0.03, 0.4, 0.8])
+@pytest.mark.parametrize("share", [0.4, *rarely(0.03, 0.8)])
 def test_a_price_below_it_is_paid(which: int, share: float) -> None:
     of = priced()[which]
     hard = solved(of)

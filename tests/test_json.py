@@ -260,6 +260,7 @@ def test_demo(printed: Any, tmp_path: Path) -> None:
     assert all(Path(path).is_file() for path in found["wrote"])
 
 
+@pytest.mark.long
 def test_reproduce(printed: Any, tmp_path: Path) -> None:
     found = printed("reproduce", "figure_3", "--quick", "--out", str(tmp_path))
     file = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))

@@ -20,6 +20,7 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from programs import SIZES, arguments, for_python, numbers_in, on_tracked, programs
 from rounding import Unsure, functions_on_tracked, tracked
+from sampling import examples
 from scipy import special
 
 from lqrsim.codegen import language
@@ -63,7 +64,7 @@ def assert_does_as_python(text: str, seed: int) -> None:
 WITHOUT_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
 
 
-@settings(max_examples=40, phases=WITHOUT_SHRINKING)
+@settings(max_examples=examples(40), phases=WITHOUT_SHRINKING)
 @given(text=programs, seed=st.integers(0, 2**32 - 1))
 def test_programs_do_as_python_does(text: str, seed: int) -> None:
     assert_does_as_python(text, seed)
@@ -407,7 +408,7 @@ class _Replaced(ast.NodeTransformer):
         return self.new if node is self.old else self.generic_visit(node)
 
 
-@settings(max_examples=30, phases=WITHOUT_SHRINKING)
+@settings(max_examples=examples(30), phases=WITHOUT_SHRINKING)
 @given(text=programs, seed=st.integers(0, 2**32 - 1))
 def test_what_is_changed_at_random_compiles_or_is_refused(text: str, seed: int) -> None:
     """No other exception, and no IR that LLVM does not take."""

@@ -10,6 +10,7 @@ from bounded import DT, bounded, matrices, random_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic, solve_dense
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -40,7 +41,7 @@ class TestLinearQuadratic:
         seed=st.integers(0, 10**6), steps=st.integers(1, 12), limit=st.floats(0.05, 3), fixed=st.booleans(),
         first_pass=st.sampled_from(["forward", "backward"]),
     )  # fmt: skip
-    @settings(max_examples=60)
+    @settings(max_examples=examples(60))
     def test_it_is_what_bounded_least_squares_finds(self, seed, steps, limit, fixed, first_pass) -> None:
         problem = random_problem(seed, steps=steps, limit=limit, fixed=fixed)
         solution = ls.smooth(problem, first_pass=first_pass, **TIGHT)
@@ -181,7 +182,7 @@ class TestDifferentialDrive:
     @given(
         state=st.tuples(*[st.floats(-1e3, 1e3)] * 3), t=st.floats(0, 40), interpolate=st.booleans(),
     )  # fmt: skip
-    @settings(max_examples=200)
+    @settings(max_examples=examples(200))
     def test_the_policy_never_leaves_the_box(self, limited: ls.Solution, state, t: float, interpolate: bool) -> None:
         assert (np.abs(limited.policy(state, t, interpolate=interpolate)) <= LIMIT).all()
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
@@ -65,7 +66,7 @@ def by_bindings(robot: ls.MjcfRobot, state: Array, displaced: Array | None = Non
 
 @pytest.mark.parametrize("other", OBSTACLES)
 @pytest.mark.parametrize("own", SHAPES)
-@settings(max_examples=3, deadline=None, derandomize=True)
+@settings(max_examples=examples(3), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str, seed: int) -> None:
     robot, rng = arm(own, other, seed), np.random.default_rng(seed)
@@ -90,7 +91,7 @@ def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str
         np.testing.assert_allclose(np.linalg.norm(slope[:, :3], axis=1), 1.0, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=examples(10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_obstacles_that_are_elsewhere(seed: int) -> None:
     robot, rng = arm("mesh", "box", seed), np.random.default_rng(seed)
@@ -165,7 +166,7 @@ def arm_file(folder: Path, kind: str = "mesh", more: str = "", gravity: float = 
     return file
 
 
-@pytest.mark.parametrize("kind", ["mesh", "ellipsoid"])
+@pytest.mark.parametrize("kind", ["mesh", *rarely("ellipsoid")])
 def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> None:
     """The plan keeps its margin, and the run has the clearance of the bindings; a plan through the post collides."""
     robot = ls.MjcfRobot(arm_file(tmp_path, kind), obstacles=("post",))
@@ -197,7 +198,7 @@ def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> N
 SITES = '<site name="tool" pos="0.25 0.01 0.02" euler="10 20 30"/>'
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=examples(10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     rng = np.random.default_rng(seed)

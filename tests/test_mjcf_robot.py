@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
@@ -53,7 +54,7 @@ def stepped(robot: ls.MjcfRobot, state: Array, control: Array, substeps: int, *,
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(seed=SEEDS)
 def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> None:
     robot, drawn = robot_of(kind, seed)
@@ -65,7 +66,7 @@ def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> 
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_its_derivatives_are_those_of_the_steps(kind: str, seed: int) -> None:
     """Against central differences of MuJoCo's own steps, ten times wider: the two differ by curvature and rounding.
@@ -185,7 +186,7 @@ def test_threads_do_not_disturb_each_other() -> None:
 
 
 @pytest.mark.parametrize("kind", mjcf_files.KINDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS)
 def test_states_and_mujocos_numbers_are_the_same_place(kind: str, seed: int) -> None:
     robot, _ = robot_of(kind, 0)
@@ -249,7 +250,7 @@ def test_states_by_name_and_keyframe() -> None:
 
 
 @pytest.mark.parametrize("kind", ["motor", "position", "general"])
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> None:
     """The acceleration by MuJoCo is zero there; and where a limit is too tight, the joint that is short is told of."""
@@ -291,7 +292,7 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
         '<motor {}/>',
     ],
 )  # fmt: skip
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=examples(5), deadline=None)
 @given(seed=SEEDS)
 def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
     """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `settled` return."""
@@ -319,7 +320,7 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
         np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: int) -> None:
     """A chassis that is welded to a base without mass, with wheels: the position is the base's, and so are pushes."""
@@ -376,7 +377,7 @@ def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     np.testing.assert_array_equal(robot.settled(state)[:2], state[:2])  # winches drive it
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
     """Two fingers that one motor moves; against gravity and each other's weight, by MuJoCo's own steps."""
@@ -416,7 +417,7 @@ def test_joint_limits_are_bounds() -> None:
         _ = robot_of("wheel", 0)[0].joint_limits
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(seed=SEEDS)
 def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
     """A table with two bent legs and a load off its middle, by plain `mj_step` for half a second."""
@@ -476,7 +477,7 @@ def test_plans_keep_off_joint_limits(gear: float, turn: float) -> None:
     assert solution.cost == pytest.approx(squares / 2, rel=1e-9)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS)
 def test_limits_cost_nothing_where_start_and_goal_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -530,7 +531,7 @@ def test_what_it_cannot_touch_is_no_obstacle() -> None:
 PART = '<geom {name} size="0.1" pos="{number} 2 0"/><body pos="{number} 3 0"><joint/><geom size="0.1"/></body>'
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(parts=st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=8))
 def test_what_has_no_name_gets_one_in_all_sections_and_included_files(
     tmp_path_factory: pytest.TempPathFactory, parts: list[tuple[int, bool]]

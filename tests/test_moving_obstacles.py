@@ -8,6 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from point_mass import DT, MARGIN, RADIUS, Oracle, balls, check, problem
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
@@ -66,7 +67,7 @@ class TestPlans:
         still = ls.smooth(problem(balls((0.0, -2.0, 0.5)), weight=1.0))
         assert Oracle.distances(still.trajectory.states, ACROSS, stated.times).min() < 0
 
-    @settings(max_examples=15)
+    @settings(max_examples=examples(15))
     @given(
         place=st.tuples(st.floats(-1, 1), st.floats(-1.5, 1.5)), velocity=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
         begin=st.floats(-2, 2), after=st.integers(0, 10),

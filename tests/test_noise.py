@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 from stochastic_lq import CONTROLS, SIZE, STATES, affine, draw, parameters_of_noise, problem_of, riccati
 
 import lqrsim as ls
@@ -44,7 +45,7 @@ def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, 
 
 
 @pytest.mark.parametrize(("fixed", "form"), FORMS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3))
 def test_a_linear_quadratic_problem_with_multiplicative_noise(fixed, form, seed, strength):
     """The stochastic Riccati recursion to 1e-9: cost-to-go, policy, start, expected cost; in both forms."""
@@ -264,7 +265,7 @@ def test_what_is_refused(make, message):
         make()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(power=st.floats(-3, 306), solver=st.sampled_from([ls.smooth, ls.ilqr]))
 def test_noise_without_bounds_is_never_left_out_of_the_cost(power: float, solver: Any) -> None:
     """A linear-quadratic plan costs sum_t tr(S_t+1 M M') / 2 more with constant noise M, however large that is."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -116,6 +117,7 @@ def test_clearance_is_the_distance_to_the_nearest_of_all_kinds(peers: ModuleType
         np.testing.assert_allclose(distances, world.distances(place), atol=1e-12)
 
 
+@pytest.mark.long  # compiles C++
 @pytest.mark.parametrize("name", ROBOTS)
 def test_crocoddyl_is_told_the_same_problem(peers: ModuleType, name: str) -> None:
     problem = among_all_kinds(name)
@@ -180,8 +182,8 @@ def test_ipopt_keeps_bounds_and_clearance(peers: ModuleType) -> None:
     assert peers.clearance_of(problem, states)[1:].min() > clearance - 1e-6
 
 
-@pytest.mark.parametrize("solver", ["box-FDDP", "Fatrop"])
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("solver", ["Fatrop", *rarely("box-FDDP")])
+@pytest.mark.parametrize("name", ["differential_drive", *rarely("quadrotor")])
 def test_solvers_keep_limits_and_find_an_optimum(peers: ModuleType, name: str, solver: str) -> None:
     """From the controls of the plan without limits, cut off: iLQR has next to nothing to add to what they find."""
     problem = fixed(name)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
+from sampling import examples
 from scipy.spatial.transform import Rotation
 from tracking import track
 
@@ -100,7 +101,7 @@ def things(rng: np.random.Generator, count: int) -> list[ls.Obstacle]:
     return found
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(seed=st.integers(0, 2**32 - 1), plane=st.sampled_from(PLANES), offset=st.floats(-2, 2))
 def test_a_world_that_is_cut_is_as_far_as_mujoco_says(seed: int, plane: str, offset: float) -> None:
     """Of a ball of 1 cm at the place in the world, but for planes along the robot's; 1e-4 m is MuJoCo's solver's."""

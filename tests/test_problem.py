@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.solvers import compiled
@@ -162,7 +163,7 @@ def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
 
 
 @pytest.mark.parametrize("solve", [ls.smooth, ls.ilqr])
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(x=st.floats(-1.0, 1.0), y=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0), weighed=st.booleans())
 def test_a_goal_inside_an_obstacle_is_said_before_the_solve(
     solve: Callable[..., ls.Solution], x: float, y: float, speed: float, weighed: bool
@@ -270,7 +271,7 @@ def in_order(given: dict[str, float]) -> list[float]:
     return [given.get(name, given.get(unit, 0.0)) for name, unit in STATES.items()]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(weight=WEIGHTS, about=WEIGHTS, start=WEIGHTS, effort=st.floats(0.1, 10.0), unit=st.booleans(), push=WEIGHTS)
 def test_numbers_by_name_or_unit_are_those_in_order(
     weight: dict, about: dict, start: dict, effort: float, unit: bool, push: dict
@@ -339,7 +340,7 @@ def test_numbers_by_name_are_in_no_order_before_a_problem() -> None:
 SHUFFLED = st.permutations(["count", "index", "names", "v", "x"])  # attributes of tuples are names, too
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(states=SHUFFLED, controls=st.permutations(["turn", "push"]), seed=st.integers(0, 2**16))
 def test_formulas_know_states_and_controls_by_name(states: list[str], controls: list[str], seed: int) -> None:
     """The same system with its states in any order: its rates by name do not depend on the order, to the last bit."""

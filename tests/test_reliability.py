@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from linear_quadratic import LinearQuadratic, solve_dense
 from oracle import kkt
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -57,7 +58,7 @@ def problems() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def cases(problems: ModuleType) -> list[Case]:
-    drawn = list(problems.thousand(share=0.1, kinds=KINDS))
+    drawn = list(problems.thousand(share=examples(100) / 1000, kinds=KINDS))
     solutions = ls.smooth_many([problem for _, problem in drawn])
     seen: Counter[str] = Counter()
     made = []
@@ -173,7 +174,7 @@ class TestOracle:
         """Against a dense solver, with the Runge-Kutta step of a linear system written as a Taylor polynomial."""
         compared = 0
         for kind in (kind for kind in KINDS if problems.family(kind) == "linear"):
-            for index in range(16):
+            for index in range(examples(32)):
                 problem = problems.draw(kind, index)
                 if isinstance(problem.initial, ls.FixedState):
                     continue

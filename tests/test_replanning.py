@@ -11,6 +11,7 @@ from funnels_by_hand import funnel_by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_mass import RADIUS, Oracle, balls, problem
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
@@ -58,7 +59,7 @@ def price(stated: ls.Problem, states: Array, controls: Array) -> tuple[float, fl
 
 
 class TestPreparedSolver:
-    @settings(max_examples=40)
+    @settings(max_examples=examples(40))
     @given(
         away=st.lists(st.floats(-0.3, 0.3), min_size=4, max_size=4), limit=st.sampled_from([None, 1e-9, 5e-4, 2e-3]),
         shift=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), goal=st.floats(-1.0, 1.0),

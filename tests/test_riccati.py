@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic, random_problem, solve_dense
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -69,7 +70,7 @@ SIZES = [(1, 1), (3, 2), (2, 3), pytest.param(5, 2, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize(("n", "m"), SIZES)
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12))
 def test_both_forms_solve_the_kkt_system_and_agree(n: int, m: int, seed: int, steps: int) -> None:
     """With each other to 1e-10: the same numbers by two ways."""
@@ -91,7 +92,7 @@ def test_both_forms_solve_the_kkt_system_and_agree(n: int, m: int, seed: int, st
 
 
 @pytest.mark.parametrize(("n", "m"), SIZES)
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12), rank=st.integers(0, 4))
 def test_the_dual_form_takes_a_fixed_start_singular_steps_and_singular_costs(
     n: int, m: int, seed: int, steps: int, rank: int
@@ -114,7 +115,7 @@ def test_the_dual_form_takes_a_fixed_start_singular_steps_and_singular_costs(
     assert_solves(dataclasses.replace(problem, QT=final, qT=final @ rng.normal(size=n)), "dual")
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 8))
 def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: int) -> None:
     problem = random_problem(seed, 3, 2, steps)
@@ -181,7 +182,7 @@ def test_bad_problems_get_one_line(wrong, message: str) -> None:
         wrong()
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_projection_is_the_nearest_semidefinite_matrix(seed: int) -> None:
     """Jointly over states and control, against LAPACK: 1e-12 of the matrix's size, the accuracy of both."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.disturbances import Uncertainty
@@ -50,8 +51,9 @@ def refusal(call: Callable[[], object]) -> str:
 
 
 def test_a_sample_of_hostile_calls() -> None:
-    verdicts = list(api.calls(200, seed=1))
-    assert len(verdicts) == 200
+    count = examples(200)
+    verdicts = list(api.calls(count, seed=1))
+    assert len(verdicts) == count
     assert not [verdict for verdict in verdicts if verdict.failed]
     kinds = {verdict.kind for verdict in verdicts}
     assert {"accepted", "refused"} <= kinds

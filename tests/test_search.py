@@ -9,6 +9,7 @@ from comparing import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import kkt
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -226,7 +227,7 @@ def among_discs(seed: int) -> ls.Problem:
 
 class TestConstraintsInTheWay:
     @given(seed=st.integers(0, 10_000))
-    @settings(max_examples=10, deadline=None, derandomize=True)
+    @settings(max_examples=examples(10), deadline=None, derandomize=True)
     def test_a_plan_that_touches_one_costs_no_more_than_those_from_either_side(self, seed: int) -> None:
         problem = among_discs(seed)
         found = ls.smooth(problem)
@@ -392,6 +393,7 @@ class TestWhatContactsHold:
             ends = np.array([few.start, few.goal]) * (prior.weight > 0)
             np.testing.assert_allclose(one.about[[0, -1]], ends, atol=1e-12)  # the sine of pi
 
+    @pytest.mark.long
     def test_the_first_pass_is_not_lost(self, on_wheels) -> None:
         """Attracted by its position alone, the robot is tilted in the first pass, which is NOT_FINITE."""
         ((_, prior),) = guides(on_wheels, 1)

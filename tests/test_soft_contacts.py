@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -61,7 +62,7 @@ def stepped(xml: str, state: Array, control: Array, steps: int) -> Array:
 
 
 @pytest.mark.parametrize("kind", FILES)
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(mass=MASSES, speed=SPEEDS, begin=STARTS, depth=st.floats(1e-4, 0.02), which=st.sampled_from((0.1, 0.01)))
 def test_a_softer_model_is_mujocos_with_another_solimp(
     kind: str, mass: float, speed: float, begin: float, depth: float, which: float
@@ -77,7 +78,7 @@ def test_a_softer_model_is_mujocos_with_another_solimp(
 
 
 @pytest.mark.parametrize("kind", FILES)
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(mass=MASSES, speed=SPEEDS)
 def test_a_softer_step_is_continuous_where_a_contact_or_a_limit_is_just_reached(
     kind: str, mass: float, speed: float
@@ -96,7 +97,7 @@ def test_a_softer_step_is_continuous_where_a_contact_or_a_limit_is_just_reached(
 
 
 @pytest.mark.parametrize("kind", FILES)
-@settings(max_examples=8)
+@settings(max_examples=examples(8))
 @given(mass=MASSES, speed=SPEEDS)
 def test_derivatives_of_a_softer_step_are_its_differences(kind: str, mass: float, speed: float) -> None:
     robot, control = robot_of(kind, mass), np.array([0.2])

@@ -38,8 +38,8 @@ CAMPAIGN = ls.stress.Campaign(
     strengths=(2.0,),
     policies=POLICIES,
     replan_every=12.0,
-    trials=4,
-    shard=2,
+    trials=2,
+    shard=1,
     design_disturbances=LIGHT,
 )
 
@@ -83,14 +83,14 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
         "offset_free": ls.OffsetFree(problem, plan, stated),
     }
     for policy, law in made.items():
-        rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=4, contacts=False)
+        rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=2, contacts=False, frames=False)
         rows, own = results.outcomes(ls.stress.Cell(policy, "own", 2.0)), ls.stress.outcomes(rollout, problem)
         np.testing.assert_array_equal(rows.rms, own.rms)
         np.testing.assert_array_equal(rows.clearance, own.clearance)
         np.testing.assert_array_equal(rows.outcome, own.outcome)
     assert results.solution("track").policy.digest == made["track"].digest
-    again = ls.stress.replay(results, ls.stress.Cell("offset_free", "own", 2.0), 3)
-    wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=3)
+    again = ls.stress.replay(results, ls.stress.Cell("offset_free", "own", 2.0), 1)
+    wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=1)
     np.testing.assert_array_equal(again.states, wanted.states)
 
 
@@ -102,7 +102,7 @@ def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.stres
     }
     other = replace(CAMPAIGN, design_disturbances=(ControlNoise(0.1), MeasurementNoise(0.01)), trials=1)
     with pytest.raises(InputError, match=r"^design_disturbances: got .*want .* or another folder"):
-        ls.stress.run_campaign(replace(other, trials=4), results.folder, workers=0)
+        ls.stress.run_campaign(replace(other, trials=2), results.folder, workers=0)
     small = replace(other, policies=("track",), strengths=(1.0,))
     digests = []
     for number, stated in enumerate((None, LIGHT, other.design_disturbances)):
@@ -260,7 +260,7 @@ def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest
 
 
 def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2"
+    options = "--policies smooth track offset_free --design-disturbances calm --strengths 1 --trials 2 --workers 0"
     assert main(["stress", "differential_drive", *options.split(), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.splitlines()
     rows = [line for line in printed if line.startswith("light")]

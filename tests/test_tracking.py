@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, linear
+from sampling import examples
 from scipy.linalg import expm
 
 import lqrsim as ls
@@ -132,7 +133,7 @@ class Oracle:
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
-@hypothesis.settings(max_examples=25)
+@hypothesis.settings(max_examples=examples(25))
 def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int, unstable: bool) -> None:
     """Commands of a run that begins anywhere, within 1e-6 of their size: `undo` leaves 1e-9 of its matrix unsolved."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)
@@ -156,7 +157,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
 @hypothesis.given(
     st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans(), st.sampled_from([0.05, 0.5, 0.95])
 )
-@hypothesis.settings(max_examples=8)
+@hypothesis.settings(max_examples=examples(8))
 def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     structure: int, seed: int, unstable: bool, share: float
 ) -> None:
@@ -192,7 +193,7 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.0, 0.05, 0.5, 0.95]))
-@hypothesis.settings(max_examples=12)
+@hypothesis.settings(max_examples=examples(12))
 def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, seed: int, share: float) -> None:
     """What compares tolerances computes a part of the covariance, for several laws at once: to 1e-9 of the numbers."""
     system, uncertainty = drawn(structure, seed, unstable=False)
@@ -214,7 +215,7 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.05, 0.5, 0.95]))
-@hypothesis.settings(max_examples=12)
+@hypothesis.settings(max_examples=examples(12))
 def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: int, seed: int, share: float) -> None:
     """Mean and covariance at the end of a run with any law, from the oracle's run of each of 32 patterns: 1e-9."""
     steps = 5
@@ -248,7 +249,7 @@ def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: 
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
-@hypothesis.settings(max_examples=15)
+@hypothesis.settings(max_examples=examples(15))
 def test_the_linear_model_is_the_run(structure: int, seed: int, unstable: bool) -> None:
     """F, G and c against the oracle's run, which is stated as absolute numbers: 1e-9."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)

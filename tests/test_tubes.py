@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 from linear_plans import DT, Linear, by_hand, double_integrator, linear
+from sampling import examples
 from scipy.integrate import quad
 from scipy.stats import binomtest, multivariate_normal, norm
 
@@ -24,7 +25,7 @@ from lqrsim.errors import Array
 
 @hypothesis.given(st.floats(-5, 5), st.floats(-5, 5), st.floats(-1, 1))
 @hypothesis.example(0.0, 5e-324, 1.0)
-@hypothesis.settings(max_examples=150)
+@hypothesis.settings(max_examples=examples(150))
 def test_both_below_is_the_bivariate_normal(a: float, b: float, correlation: float) -> None:
     """To 1e-9 of quadrature; beyond a correlation of 0.9999 that has no more digits: the limit is at most 1e-2 off."""
     found = float(both_below(np.array([a]), np.array([b]), np.array([correlation]))[0])
@@ -64,7 +65,7 @@ def test_it_agrees_with_scipys_own() -> None:
 @hypothesis.given(
     st.floats(-3, 3), st.floats(1e-3, 3), st.floats(-3, 1), st.floats(0.1, 4), st.sampled_from(["both", "low", "high"])
 )
-@hypothesis.settings(max_examples=60)
+@hypothesis.settings(max_examples=examples(60))
 def test_limited_moments_are_those_of_quadrature(
     centre: float, std: float, low: float, width: float, sides: str
 ) -> None:

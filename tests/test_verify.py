@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -47,7 +48,7 @@ class Case:
         return dataclasses.replace(self.run, states=states, frames=frames, diverged_at=self.run.times[[HALF + 1]])
 
 
-@pytest.fixture(scope="module", params=ROBOTS)
+@pytest.fixture(scope="module", params=[ROBOTS[0], *rarely(ROBOTS[1])])
 def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
     """Overlays and shadows are on, and the robot's mark is five pixels wide or so."""
     name = request.param

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from oracle import planar_quadrotor
+from sampling import examples
 from whole_problems import draws, known
 from whole_problems.claims import contradictions
 
@@ -20,10 +21,10 @@ KINDS = ("linear", "pendulum", "parking", "planar", "drive", "quadrotor")
 
 
 @pytest.mark.parametrize(
-    ("kinds", "examples"), [(KINDS[-3:], 15), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
+    ("kinds", "count"), [(KINDS[-3:], 15), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
 )
-def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], examples: int) -> None:
-    @settings(max_examples=examples, suppress_health_check=[HealthCheck.too_slow])
+def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], count: int) -> None:
+    @settings(max_examples=count, suppress_health_check=[HealthCheck.too_slow])
     @given(kind=st.sampled_from(kinds), number=st.integers(0, 2**32 - 1))
     def holds(kind: str, number: int) -> None:
         drawn = draws.draw(kind, number)
@@ -55,7 +56,7 @@ def test_a_draw_does_not_depend_on_what_else_is_drawn() -> None:
 @pytest.mark.parametrize("kind", known.KINDS)
 def test_what_is_known_beforehand_is_found(kind: str) -> None:
     """A sample of what benchmark_claims.py draws: all that can be solved is, and nothing that is said is false."""
-    for number in range(4):
+    for number in range(examples(4)):
         drawn = known.draw(kind, number)
         solution = ls.smooth(drawn.problem, start=drawn.start)
         assert known.false(drawn, solution) == [], f"{kind} {number}"

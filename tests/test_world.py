@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
@@ -96,7 +97,7 @@ def test_inside_is_negative_and_continuous(kind: str) -> None:
     assert (np.abs(np.diff(distances)) <= steps * (1 + 1e-9)).all()
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_compiled_distances_are_the_plain_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
