@@ -1,6 +1,7 @@
 """A final time that is free: closed forms, differences in the duration, and other solves of the settled problem."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Status
+from lqrsim.solvers import budget, free_duration, strategy
 from lqrsim.solvers.free_duration import settled
+from lqrsim.solvers.settings import SmootherSettings
 
 
 def cart(x: Any, u: Any, p: Any) -> list[Any]:
@@ -116,6 +119,25 @@ def test_a_duration_that_is_not_the_best_is_not_dropped_for_the_stated_one() -> 
     assert "the best duration was not found" in solution.detail
     assert solution.violation <= 1e-6
     assert 2.0 <= solution.trajectory.horizon < 4.0 - 1e-3
+
+
+def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a clock that only runs while fixed durations are solved for, which is part of no iteration of the search."""
+    now = [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0])
+    monkeypatch.setattr(budget, "time", clock)
+    monkeypatch.setattr(free_duration, "time", clock, raising=False)
+
+    def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
+        now[0] += 100.0
+        return strategy.solve(fixed, settings)
+
+    solution = free_duration.solve_for_duration(
+        problem(), SmootherSettings(time_limit=1e6), solve, attentive=False, callback=None
+    )
+    assert solution.status is Status.CONVERGED
+    assert now[0] >= 300.0  # the stated duration, a shorter one, and the end
+    assert max(one.seconds for one in solution.iterations) < 50.0
 
 
 def test_a_duration_ends_at_its_bound() -> None:
