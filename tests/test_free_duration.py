@@ -78,6 +78,19 @@ def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
     np.testing.assert_array_equal(np.abs(solution.trajectory.controls), 1.0)
 
 
+@pytest.mark.parametrize(("weight", "way"), [(1e-12, 2.7), (1e-9, 1.0), (1e-6, 0.3), (1e-3, 1.0), (1.0, 2.7)])
+def test_a_cost_that_is_zero_where_the_goal_is_met_is_no_worse_than_zero(weight: float, way: float) -> None:
+    """Two plans that meet the goal differ by rounding alone, however small or large the weight is."""
+    free = dataclasses.replace(
+        problem(way=way), stage_cost=ls.SymbolicCost(lambda x, u, p: 0 * x[0], convex=True),
+        final_cost=ls.QuadraticCost([weight, weight], about=[way, 0.0]),
+    )  # fmt: skip
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(2 * np.sqrt(way), rel=1e-9)
+    np.testing.assert_allclose(np.abs(solution.trajectory.controls), 1.0, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("price", [5.0, 20.0])
 def test_no_other_duration_costs_less(price: float) -> None:
     """A pendulum, swung up: of neighbouring durations, each solved on its own, the costs are higher, as a square."""

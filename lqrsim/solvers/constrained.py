@@ -259,8 +259,14 @@ class Ladder:
         return found
 
     def _worse(self, found: RunResult) -> bool:
-        """Whether a plan costs more than the given one, which keeps the constraints."""
-        return self._given is not None and found.cost > self._given.cost + ROUNDING * abs(self._given.cost)
+        """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding.
+
+        Where both cost nothing but rounding, as a goal that is met, only the size of what cancels says what that is.
+        """
+        if self._given is None:
+            return False
+        rounding = ROUNDING * abs(self._given.cost) + float(self._run.work.memory["negligible"])
+        return found.cost > self._given.cost + rounding
 
     def _answer(self, start: RunResult) -> RunResult:
         """The best result, certified."""
