@@ -452,7 +452,9 @@ class MjcfRobot(Robot):
         if place is None:
             told = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
             raise InputError(f"MjcfRobot {self.name}: joints: got {told}, want positions at which all loops close")
-        return self.state(place, np.zeros(model.nv))[: model.nv]
+        found = self.state(place, np.zeros(model.nv))[: model.nv]
+        found[fixed] = state[: model.nv][fixed]  # to the last bit
+        return found
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
