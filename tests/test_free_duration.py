@@ -1,6 +1,7 @@
 """A final time that is free: closed forms, differences in the duration, and other solves of the settled problem."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Status
+from lqrsim.solvers import budget, free_duration, strategy
 from lqrsim.solvers.free_duration import settled
+from lqrsim.solvers.settings import SmootherSettings
 
 
 def cart(x: Any, u: Any, p: Any) -> list[Any]:
@@ -76,6 +79,19 @@ def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
     np.testing.assert_array_equal(np.abs(solution.trajectory.controls), 1.0)
 
 
+@pytest.mark.parametrize(("weight", "way"), [(1e-12, 2.7), (1e-9, 1.0), (1e-6, 0.3), (1e-3, 1.0), (1.0, 2.7)])
+def test_a_cost_that_is_zero_where_the_goal_is_met_is_no_worse_than_zero(weight: float, way: float) -> None:
+    """Two plans that meet the goal differ by rounding alone, however small or large the weight is."""
+    free = dataclasses.replace(
+        problem(way=way), stage_cost=ls.SymbolicCost(lambda x, u, p: 0 * x[0], convex=True),
+        final_cost=ls.QuadraticCost([weight, weight], about=[way, 0.0]),
+    )  # fmt: skip
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(2 * np.sqrt(way), rel=1e-9)
+    np.testing.assert_allclose(np.abs(solution.trajectory.controls), 1.0, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("price", [5.0, 20.0])
 def test_no_other_duration_costs_less(price: float) -> None:
     """A pendulum, swung up: of neighbouring durations, each solved on its own, the costs are higher, as a square."""
@@ -117,6 +133,25 @@ def test_a_duration_that_is_not_the_best_is_not_dropped_for_the_stated_one() -> 
     assert "the best duration was not found" in solution.detail
     assert solution.violation <= 1e-6
     assert 2.0 <= solution.trajectory.horizon < 4.0 - 1e-3
+
+
+def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a clock that only runs while fixed durations are solved for, which is part of no iteration of the search."""
+    now = [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0])
+    monkeypatch.setattr(budget, "time", clock)
+    monkeypatch.setattr(free_duration, "time", clock, raising=False)
+
+    def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
+        now[0] += 100.0
+        return strategy.solve(fixed, settings)
+
+    solution = free_duration.solve_for_duration(
+        problem(), SmootherSettings(time_limit=1e6), solve, attentive=False, callback=None
+    )
+    assert solution.status is Status.CONVERGED
+    assert now[0] >= 300.0  # the stated duration, a shorter one, and the end
+    assert max(one.seconds for one in solution.iterations) < 50.0
 
 
 def test_a_duration_ends_at_its_bound() -> None:

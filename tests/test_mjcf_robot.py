@@ -399,6 +399,122 @@ def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
     np.testing.assert_allclose(after[:2], state[:2], rtol=0, atol=1e-3)
 
 
+INTEGRATING = '<general name="drive" joint="hinge" dyntype="integrator" gainprm="{gain}" biastype="affine"'
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS, above=st.booleans())
+def test_an_integrator_whose_control_is_never_zero_rests_at_the_end_of_its_range_or_drifts(
+    seed: int, above: bool
+) -> None:
+    """By `mj_step` for half a second: with a range of activations it stays, and without one nothing is said to hold."""
+    rng = np.random.default_rng(seed)
+    low, high = np.sort(rng.uniform(0.1, 2.0, 2)) if above else -np.sort(-rng.uniform(-2.0, -0.1, 2))[::-1]
+    end, gain = rng.uniform(0.2, 0.8), rng.uniform(20, 60)
+    servo = INTEGRATING.format(gain=gain) + f' biasprm="0 -{gain} -2" ctrlrange="{low} {high}" '
+    xml = f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/><worldbody><body>
+      <joint name="hinge" axis="0 1 0" damping="0.5"/><geom size="0.05" pos="0 0 -0.3" mass="0.5"/></body></worldbody>
+      <actuator>{servo} {{}}/></actuator></mujoco>"""
+    drifting = ls.MjcfRobot(scene_from_xml(xml.format(""), "drift"))
+    state, model = drifting.at(hinge=0.3), drifting.scene.model
+    (control,) = drifting.hold(state)
+    assert control == pytest.approx(low if above else high)
+    said = f"the activation of drive drifts: its control is at {'least' if above else 'most'} {control:g}"
+    assert said in str(drifting)
+    with pytest.raises(InputError, match="got one at which the activation of drive drifts"):
+        drifting.settled(state)
+    # With the range of its activation, one angle can be held: where its end balances the weight.
+    reached = f'actrange="{-end if above else -0.9} {0.9 if above else end}"'
+    resting = ls.MjcfRobot(scene_from_xml(xml.format(reached), "rest"))
+    level = 0.9 if above else -0.9
+    angle = level
+    for _ in range(200):  # a contraction: the weight is less than the servo's stiffness
+        angle = level - 0.5 * 9.81 * 0.3 * np.sin(angle) / gain
+    state, model = resting.at(hinge=angle), resting.scene.model
+    assert "drifts" not in str(resting)
+    assert state[2] == level
+    data = mujoco.MjData(model)
+    data.qpos[:], data.act[:], data.ctrl[:] = angle, level, resting.hold(state)
+    mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
+    np.testing.assert_allclose([data.qpos[0], data.qvel[0], data.act[0]], [angle, 0, level], rtol=0, atol=1e-9)
+    assert low <= resting.hold(state)[0] <= high
+
+
+def five_bar(rng: np.random.Generator, tie: str = "connect") -> str:
+    """Two arms of two links in a vertical plane, whose tips are tied; motors at both shoulders."""
+    apart, upper, rise = rng.uniform(0.05, 0.12), rng.uniform(0.15, 0.25), rng.uniform(0.15, 0.25)
+    arms = "".join(
+        f'<body pos="{-side * apart} 0 0"><joint name="{name}" axis="0 1 0" damping="0.2" armature="0.01"/>'
+        f'<geom type="capsule" fromto="0 0 0 0 0 {upper}" size="0.01" mass="{rng.uniform(0.1, 0.4)}" {NO_CONTACT}/>'
+        f'<body name="{name}_link" pos="0 0 {upper}"><joint name="{name}_elbow" axis="0 1 0" damping="0.05"/>'
+        f'<geom type="capsule" fromto="0 0 0 {side * apart} 0 {rise}" size="0.01" mass="0.1" {NO_CONTACT}/>'
+        f'<site name="{name}_tip" pos="{side * apart} 0 {rise}"/></body></body>'
+        for name, side in (("left", 1.0), ("right", -1.0))
+    )
+    ties = {
+        "connect": f'<connect name="tie" body1="left_link" body2="right_link" anchor="{apart} 0 {rise}"/>',
+        "sites": '<connect name="tie" site1="left_tip" site2="right_tip"/>',
+    }
+    return f"""<mujoco><option integrator="implicitfast"/><worldbody>{arms}</worldbody><equality>{ties[tie]}</equality>
+      <actuator><motor name="m1" joint="left" ctrlrange="-3 3"/><motor name="m2" joint="right" ctrlrange="-3 3"/>
+      </actuator><compiler autolimits="true"/></mujoco>"""
+
+
+NO_CONTACT = 'contype="0" conaffinity="0"'
+
+
+@settings(max_examples=6, deadline=None)
+@given(seed=SEEDS, tie=st.sampled_from(["connect", "sites"]))
+def test_a_closed_loop_closes_is_held_and_is_moved_by_a_plan(seed: int, tie: str) -> None:
+    """Tips by MuJoCo's kinematics; torques by virtual work, of differences of the potential energy along the loop."""
+    rng = np.random.default_rng(seed)
+    robot = ls.MjcfRobot(scene_from_xml(five_bar(rng, tie), "five-bar"))
+    model, left, right = robot.scene.model, *rng.uniform(-0.3, 0.3, 2)
+    data = mujoco.MjData(model)
+
+    def energy(left: float, right: float) -> float:
+        """Potential energy where the loop is closed, in J."""
+        data.qpos[:] = robot.configuration(robot.at(left=left, right=right))[0]
+        mujoco.mj_kinematics(model, data)
+        tips = data.site("left_tip").xpos, data.site("right_tip").xpos
+        np.testing.assert_allclose(*tips, rtol=0, atol=1e-9)
+        return float(9.81 * model.body_mass @ data.xipos[:, 2])
+
+    state = robot.at(left=left, right=right)
+    assert (state[0], state[2]) == (left, right)
+    step = 1e-4
+    work = [
+        (energy(left + step, right) - energy(left - step, right)) / (2 * step),
+        (energy(left, right + step) - energy(left, right - step)) / (2 * step),
+    ]
+    np.testing.assert_allclose(robot.hold(state), work, rtol=0, atol=1e-6)
+    assert "falls short" not in str(robot)
+    goal = robot.at(left=right, right=left)
+    plan = ls.smooth(robot.problem(state, goal, steps=30), threads=1)
+    assert plan.success
+    np.testing.assert_allclose(plan.trajectory.states[-1, :4], goal[:4], rtol=0, atol=0.02)
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state[:4], 0.0, 0.0
+    for control in plan.trajectory.controls:
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data, round(plan.trajectory.dt / model.opt.timestep))
+    # The robot's physics solves the constraint to 1e-14, MuJoCo by default to 1e-8.
+    np.testing.assert_allclose(data.qpos, plan.trajectory.states[-1, :4], rtol=0, atol=1e-4)
+
+
+def test_loops_that_can_not_close_and_couplings_that_bend() -> None:
+    robot = ls.MjcfRobot(scene_from_xml(five_bar(np.random.default_rng(0)), "five-bar"))
+    with pytest.raises(InputError, match=r"joints: got left -1.5, right 1.5, want positions at which all loops close"):
+        robot.at(left=-1.5, right=1.5)
+    bodies = "".join(
+        f'<body pos="0 {k} 0"><joint name="{name}" axis="0 1 0"/><geom size="0.1"/></body>'
+        for k, name in enumerate("ab")
+    )
+    bent = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{bodies}</worldbody><equality>
+      <joint joint1="a" joint2="b" polycoef="0.1 1 2"/></equality><actuator><motor joint="a"/></actuator></mujoco>""",
+      "cam"))  # fmt: skip
+    np.testing.assert_allclose(bent.at(b=0.3)[:2], [0.1 + 0.3 + 2 * 0.3**2, 0.3], rtol=0, atol=1e-9)
+
+
 def test_a_camera_and_a_light_where_there_are_none() -> None:
     bare = mjcf_files.draw("cart", 0).xml
     assert "<camera" not in bare
@@ -608,17 +724,11 @@ def test_laws_that_track_and_estimate_take_it() -> None:
 BAD = {
     "no actuators": ('<worldbody><body><joint/><geom size="0.1"/></body></worldbody>', "actuators: got none, want at"),
     "nothing moves": ('<worldbody><geom size="0.1"/></worldbody>', "got no joints, want a robot that moves"),
-    "connect": (
-        '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><body name="b"><joint name="b"/>'
-        '<geom size="0.1"/></body></worldbody><equality><connect name="tie" body1="a" body2="b" anchor="0 0 0"/>'
-        '</equality><actuator><motor joint="a"/></actuator>',
-        "equality: got <connect> 'tie' of 'a' and 'b', want only <joint>",
-    ),
-    "equality": (
-        '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><body name="b"><joint name="b"/>'
-        '<geom size="0.1"/></body></worldbody><equality><joint joint1="a" joint2="b" polycoef="0 1 2"/></equality>'
+    "deformable": (
+        '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><flexcomp name="rope" type="grid" dim="1"'
+        ' count="3 1 1" spacing="0.1 0.1 0.1" mass="1" radius="0.01"/></worldbody>'
         '<actuator><motor joint="a"/></actuator>',
-        "equality: got <joint> of 'a' and 'b', want only <joint> with polycoef",
+        "deformable parts: got some, want rigid bodies",
     ),
 }
 

@@ -20,6 +20,21 @@ def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
     assert ((a + b) + c).terms == (a + (b + c)).terms == (a, b, c)
 
 
+@pytest.mark.parametrize("constant", [0, 3, -2, 0.5])
+def test_a_formula_that_is_a_constant_costs_that_at_each_step(constant: float) -> None:
+    """A whole number, too: what a simplified formula came to was garbage, for nothing made a float of it."""
+    dynamics = ls.Dynamics(lambda x, u, p: [u[0]], states={"x": "m"}, controls={"speed": "m/s"})
+    plain = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=7, initial=ls.FixedState([0.0]), stage_cost=ls.ControlCost([1.0]),
+        final_cost=ls.QuadraticCost([5.0], about=[1.0]),
+    )  # fmt: skip
+    dearer = dataclasses.replace(
+        plain, stage_cost=plain.stage_cost + ls.SymbolicCost(lambda x, u, p: 0 * x[0] + constant, convex=True)
+    )
+    for solve in (ls.smooth, ls.ilqr):
+        assert solve(dearer).cost == pytest.approx(solve(plain).cost + 7 * constant, rel=1e-9)
+
+
 @given(
     weights=st.lists(st.integers(1, 999), min_size=3, max_size=3), goal=st.integers(-99, 99), bound=st.integers(3, 9),
     margin=st.integers(1, 9), obstacles=st.integers(0, 5), free=st.booleans(),

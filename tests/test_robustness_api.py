@@ -422,6 +422,17 @@ class Biting:
         (lambda: ls.stress.FunnelCheck(0, DEEP, rate(1, 2), np.ones(2, dtype=bool)), "FunnelCheck: level: got "),
         (lambda: ls.stress.ComparedPlan("", DEEP, np.ones(2, dtype=bool)), "ComparedPlan: solution: got "),
         (lambda: ls.types.ReplanRecord(**RECORD | {"reason": DEEP}), "ReplanRecord: reason: got "),
+        *(
+            (lambda kind=kind, shapes=shapes: kind(*map(np.ones, shapes)), f"{kind.__name__}: {name}: got shape")
+            for kind, second in ((ls.types.Quadratic, "gradient"), (ls.types.Moments, "mean"))
+            for name, shapes in (
+                (second, ((5, 3, 3), (5, 3, 3), (5,))),
+                (second, ((5, 3, 3), (3,), (5,))),
+                (second, ((3, 3), (5, 3), (5,))),
+                ("constant", ((5, 3, 3), (5, 3), (5, 3))),
+                ("constant", ((3, 3), (3,), (5,))),
+            )
+        ),
         (lambda: lq.disturbances.Effect(factors=["mass"]), "Effect: factors: got ['mass'], want factors by name"),
         (lambda: lq.disturbances.Effect(factors=3), "Effect: factors: got 3, want factors by name"),
         (lambda: lq.disturbances.Effect(factors={"mas": 1}), "Effect: factors: got 'mas', want one of: mass"),

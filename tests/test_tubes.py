@@ -21,6 +21,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
+from lqrsim.problem.collision_shape import KeepsClear, each_once
 
 
 @hypothesis.given(st.floats(-5, 5), st.floats(-5, 5), st.floats(-1, 1))
@@ -113,6 +114,37 @@ def test_the_chance_of_collision_beside_a_plane_is_that_of_monte_carlo() -> None
     np.testing.assert_allclose(each, norm.cdf(-2.0), rtol=1e-9)
     assert -np.log1p(-total) == pytest.approx(entries, rel=0.02)
     assert hit.mean() < total < 1.35 * hit.mean()
+
+
+@hypothesis.given(
+    st.lists(st.tuples(st.sampled_from([0, 1]), st.booleans(), st.sampled_from([0.1, 0.2])), min_size=1, max_size=6)
+)
+@hypothesis.settings(max_examples=20, deadline=None)
+def test_the_same_obstacles_count_once_however_often_they_are_stated(stated: list[tuple[int, bool, float]]) -> None:
+    """By costs and clearances, with one World or with equal ones: the first of each kind, and its chance once."""
+    walls = [
+        lambda side=side: ls.World([ls.Obstacle("wall", "plane", np.array([0, side, 0]), _facing_y(), np.zeros(3))])
+        for side in (-0.2, -0.3)
+    ]
+    shared = [wall() for wall in walls]
+    worlds = [shared[which] if one else walls[which]() for which, one, _ in stated]
+    kept: list[KeepsClear] = [
+        ls.Clearance(world, radius=radius) if k % 2 else ls.ObstacleCost(world, radius=radius, sharpness=10.0)
+        for k, (world, (_, _, radius)) in enumerate(zip(worlds, stated, strict=True))
+    ]
+    firsts = {(which, radius): k for k, (which, _, radius) in reversed(list(enumerate(stated)))}
+    assert each_once(kept) == [kept[k] for k in sorted(firsts.values())]
+    alone = _among(worlds[0], radius=stated[0][2], std=0.1)
+    twice = ls.World(list(worlds[0].obstacles))
+    system = linear(
+        np.zeros((2, 2)), np.eye(2), np.eye(2), steps=2, position=("s0", "s1"),
+        costs=tuple(ls.ObstacleCost(one, radius=stated[0][2], sharpness=10.0) for one in (worlds[0], twice)),
+    )  # fmt: skip
+    still, spread = np.zeros((3, 2)), np.tile(np.diag([0.1, 0.1]) ** 2, (3, 1, 1))
+    found = [
+        collision_chance(still, spread, spread[1:], one)[1] for one in (alone, Surroundings.of(system.problem, 0.1))
+    ]
+    assert found[0] == found[1] > 0
 
 
 def _among(world: ls.World, *, radius: float, std: float) -> Surroundings:

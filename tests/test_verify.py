@@ -6,9 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
-from sampling import rarely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sampling import examples, rarely
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -311,6 +314,85 @@ def test_a_trial_that_diverged_is_verified_up_to_there(case: Case) -> None:
     found = ls.verify_run(case.beginning())
     assert found.passed
     assert found.times[-1] == pytest.approx(case.run.times[HALF])
+
+
+@pytest.fixture(scope="module")
+def short(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollout:
+    """Ten control periods of an undisturbed run, as if it had diverged then."""
+    run = ls.simulate(quadrotor.plant(), quadrotor_solution, seed=0)
+    frames, states = run.frames.copy(), run.states.copy()
+    frames[:, run.frame_times > run.times[10] + 1e-9], states[:, 11:] = np.nan, np.nan
+    return dataclasses.replace(run, states=states, frames=frames, diverged_at=run.times[[11]])
+
+
+def verified_as_rod(run: ls.Rollout, thickness: float, seed: int, changed: pytest.MonkeyPatch) -> ls.types.Verification:
+    """The verification of a quadrotor's run with its ball drawn as a rod of that many pixels of 640 x 480."""
+    model = checks.drawable_model(run, 0)
+    geom, pixel = checks._tracked_geom(model, model.body(run.body).id), 0.0
+    for view in (cameras.top(run), cameras.side(run)):
+        pixel = max(pixel, view.height / checks.SIZE[1])
+    turn = np.random.default_rng(seed).normal(size=4)
+    model.geom_type[geom], model.geom_quat[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE, turn / np.linalg.norm(turn)
+    model.geom_size[geom] = thickness * pixel / 2, run.radius, 0.0
+    changed.setattr(checks, "drawable_model", lambda *_: model)
+    return ls.verify_run(run)
+
+
+@pytest.mark.parametrize(("thickness", "seed"), [(0.3, 0), (0.6, 1), (1.5, 2), (5.0, 3), (12.0, 4)])
+def test_a_thin_rod_is_seen_as_well_as_a_ball(
+    thickness: float, seed: int, short: ls.Rollout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = verified_as_rod(short, thickness, seed, monkeypatch)
+    assert failed(found) == set()
+    (told,) = [one.detail for one in found.tests if one.name == "thickness"]
+    assert thickness <= float(told.split()[0]) <= 4.05 * thickness
+
+
+def test_a_rod_that_is_too_thin_is_said_to_be(short: ls.Rollout, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = verified_as_rod(short, 0.1, 0, monkeypatch)
+    assert "thickness" in failed(found)
+    assert "pixels where it is thinnest, want 1 or more" in str(found)
+    assert found.likely.startswith("the geom is too thin to be seen")
+
+
+@settings(max_examples=examples(200), deadline=None)
+@given(
+    thickness=st.floats(1.0, 16.0), length=st.floats(20.0, 90.0), angle=st.floats(0.0, np.pi),
+    centre=st.tuples(st.floats(95.0, 105.0), st.floats(95.0, 105.0)),
+)  # fmt: skip
+def test_the_middle_of_a_thin_mask_is_its_centre(
+    thickness: float, length: float, angle: float, centre: tuple[float, float]
+) -> None:
+    """Pixels whose middle is in a capsule of at least one pixel: to one pixel, where the mean is up to ten off."""
+    x, y = np.meshgrid(np.arange(200) + 0.5 - centre[0], np.arange(200) + 0.5 - centre[1])
+    along = np.clip(x * np.cos(angle) + y * np.sin(angle), -length, length)
+    mask = np.hypot(x - along * np.cos(angle), y - along * np.sin(angle)) <= thickness / 2
+    np.testing.assert_allclose(checks.mask_middle(mask), centre, rtol=0, atol=1.0)
+
+
+@settings(max_examples=examples(10), deadline=None)
+@given(
+    kind=st.sampled_from(["capsule", "cylinder", "box", "ellipsoid", "sphere"]),
+    size=st.tuples(*[st.floats(0.3, 1.0)] * 3), seed=st.integers(0, 1000),
+)  # fmt: skip
+def test_how_far_a_geom_reaches(kind: str, size: tuple[float, float, float], seed: int) -> None:
+    """The largest product with a direction, over points of its surface that are found by MuJoCo's rays."""
+    shape = " ".join(map(str, size[: {"sphere": 1, "capsule": 2, "cylinder": 2}.get(kind, 3)]))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="{kind}" size="{shape}"/></worldbody></mujoco>'
+    )
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    mujoco.mj_forward(model, data)
+    rays = rng.normal(size=(4000, 3))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    found = np.zeros(1, dtype=np.int32)
+    away = [mujoco.mj_ray(model, data, 5 * ray, -ray, None, 1, -1, found, None) for ray in rays]
+    surface = (5 - np.array(away))[:, None] * rays
+    directions = rays[:20]
+    reach = checks._reach(mujoco.mjtGeom(model.geom_type[0]), model.geom_size[0], directions)
+    sampled = (directions @ surface.T).max(axis=1)
+    assert (sampled <= reach + 1e-9).all()
+    np.testing.assert_allclose(sampled, reach, rtol=0.1, atol=0)  # of so many rays the nearest to a corner
 
 
 def test_views_that_disagree_are_told_apart() -> None:

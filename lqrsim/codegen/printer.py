@@ -133,10 +133,16 @@ class Program:
         return f"@{name}"
 
     def export(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> None:
-        """Add a C function of that name; records are passed as their parts."""
+        """Add a C function of that name; records are passed as their parts.
+
+        A whole number that it returns becomes a float, such as the value of a formula that is 0: callers take a float.
+        """
         given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(types))]
-        kind, call, _ = self._call_of(function, types)
+        kind, call, result = self._call_of(function, types)
         body = [f"  {call}", "  ret void"] if kind == "void" else [f"  %r = {call}", f"  ret {kind} %r"]
+        if result is INT or result is BOOL:
+            convert, whole, kind = "sitofp" if result is INT else "uitofp", kind, "double"
+            body = [f"  %n = {call}", f"  %r = {convert} {whole} %n to double", "  ret double %r"]
         self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(given)}) #0 {{", *body, "}"]))
 
     def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:

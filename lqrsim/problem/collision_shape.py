@@ -306,5 +306,24 @@ class KeepsClear:
 
 
 def each_once(kept: Sequence[KeepsClear]) -> list[KeepsClear]:
-    """Those with other obstacles, or another shape, than those before."""
-    return list({(id(one.world), *one.shape.items()): one for one in kept}.values())
+    """The first of each kind: those with other obstacles, or another shape, than all before."""
+    found: list[KeepsClear] = []
+    for one in kept:
+        if not any(one.shape == other.shape and _same(one.world, other.world) for other in found):
+            found.append(one)
+    return found
+
+
+def _same(one: World, other: World) -> bool:
+    """Whether two worlds have the same obstacles in the same order, such as those of one file that was read twice."""
+    return one is other or (
+        one.names == other.names
+        and all(
+            mine.kind == its.kind
+            and all(
+                np.array_equal(getattr(mine, name), getattr(its, name))
+                for name in ("position", "rotation", "size", "velocity")
+            )
+            for mine, its in zip(one.obstacles, other.obstacles, strict=True)
+        )
+    )

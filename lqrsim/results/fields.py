@@ -194,12 +194,13 @@ def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
 
 def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) -> None:
     """Raises InputError unless a shape fits these letters and the sizes so far; new letters get theirs."""
-    wanted = letters.split()
+    wanted, before, alike = letters.split(), dict(sizes), True
     if wanted[0] == "...":
         leading = len(shape) - len(wanted) + 1
+        # As many as the record's other arrays have; a single number may stand for all.
+        alike = (letters == "..." and not shape) or leading == sizes.setdefault("...", leading)
         wanted = [f"...{i}" for i in range(leading)] + wanted[1:]
-    before = dict(sizes)
-    fits = len(wanted) == len(shape)
+    fits = alike and len(wanted) == len(shape)
     for letter, length in zip(wanted, shape, strict=False):
         name, _, more = letter.partition("+")
         size = length - int(more or 0)

@@ -1,7 +1,7 @@
 """A robot from any MJCF: its dynamics are MuJoCo's own steps, and nothing is derived by hand."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,7 +93,7 @@ class MjcfRobot(Robot):
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: equality constraints except those that couple joints linearly, delays, plugins with states.
+        describe: deformable parts, delays, plugins with states.
     """
 
     def __init__(
@@ -222,7 +222,8 @@ class MjcfRobot(Robot):
           state: (n,), whose velocities do not count; nor do activations, which take the values that hold it, too.
 
         Returns:
-          (m,), within their limits; where nothing holds it, those with the least sum of squared forces left.
+          (m,), within their limits; where nothing holds it, those with the least sum of squared forces left. Nothing
+          does where an actuator integrates its control, which cannot be 0, and has no actrange: `print(robot)` says so.
 
         Raises:
           InputError: the state is not (n,) finite numbers.
@@ -254,7 +255,19 @@ class MjcfRobot(Robot):
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
-        found[2 * model.nv :] = self._held(found).activations
+        held = self._held(found)
+        for drifting in self._drifting(held)[:1]:
+            raise InputError(f"state: got one at which {drifting}, want activations that come to rest")
+        found[2 * model.nv :] = held.activations
+        return found
+
+    def _drifting(self, held: Holding) -> list[str]:
+        """Why each actuator that never rests does not, as text."""
+        model, found = self.dynamics.physics.model, []
+        for number in np.flatnonzero(held.drifting).tolist():
+            low, high = model.actuator_ctrlrange[number]
+            least = f"at least {low:g}" if low > 0 else f"at most {high:g}"
+            found.append(f"the activation of {model.actuator(number).name} drifts: its control is {least}")
         return found
 
     def _held(self, state: Array) -> Holding:
@@ -348,7 +361,9 @@ class MjcfRobot(Robot):
         told = [f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True)]
         worst = int(np.argmax(np.abs(held.missed)))
         unit = "N m" if space.units[worst] == "rad" else "N"
-        short = "" if held.held else f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {unit}"
+        short = "".join(f"; {drifting}" for drifting in self._drifting(held))
+        if not held.held and not short:
+            short = f"; {space.names[worst]} falls short by {abs(held.missed[worst]):.3g} {unit}"
         lines = [
             f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
             f"  states: {_listed(space.names)}",
@@ -387,8 +402,9 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        Joints that an equality constraint couples to others follow these, unless they are named. Activations of
-        actuators are those that hold the robot there, unless they are named or the keyframe's.
+        Joints that an equality constraint couples to others follow these, unless they are named; those of a closed loop
+        follow from the MJCF's rest, and as little as they must. Activations of actuators are those that hold the robot
+        there, unless they are named or the keyframe's.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -398,7 +414,7 @@ class MjcfRobot(Robot):
           (n,).
 
         Raises:
-          InputError: no such keyframe or state.
+          InputError: no such keyframe or state; or a loop does not close there.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
@@ -414,10 +430,31 @@ class MjcfRobot(Robot):
         for one in mjcf_joints.couplings_of(model) if keyframe is None or values else ():
             if names[one.dof] not in values:
                 state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
+        if (keyframe is None or values) and mjcf_joints.loops_of(model):
+            state[: model.nv] = self._closed(state, qpos, values)
         if self.activations and keyframe is None:
             unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
             state[unnamed] = self._held(state).activations[np.array(unnamed, dtype=np.intp) - 2 * model.nv]
         return state
+
+    def _closed(self, state: Array, qpos: Array, named: Iterable[str]) -> Array:
+        """The positions (nv,) of a state at which loops are closed and the named joints are where they are in it.
+
+        Args:
+          qpos: (nq,), with which to begin.
+        """
+        model, names = self.scene.model, self.dynamics.state_coordinates.names
+        fixed = np.zeros(model.nv, dtype=bool)
+        for one in self._joints:
+            fixed[one.dofs] = not set(names[one.dofs]).isdisjoint(named)
+        equalities = mjcf_joints.Equalities(model)
+        place = equalities.met(qpos, self.configuration(state)[0], fixed)
+        if place is None:
+            told = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
+            raise InputError(f"MjcfRobot {self.name}: joints: got {told}, want positions at which all loops close")
+        found = self.state(place, np.zeros(model.nv))[: model.nv]
+        found[fixed] = state[: model.nv][fixed]  # to the last bit
+        return found
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_joints import couplings_of
+from lqrsim.scenes.mjcf_joints import Equalities, couplings_of, loops_of
 
 _HELD = 1e-6  # share of the largest force that may be missing for a robot that counts as held
 _NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # steps at most, their halves, and m or rad of difference quotients
+_RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
 
 
@@ -24,43 +25,59 @@ class Holding:
       activations: (na,), the states of actuators with which they do: a filter's is its control, an integrator's what it
         has come to.
       missed: N or N m, (nv,), the force that each joint is short of; 0 for joints that follow others.
+      drifting: (nu,), the actuators whose activation never rests: integrators whose control cannot be 0.
       held: whether they hold it.
     """
 
     controls: Array
     activations: Array
     missed: Array
+    drifting: npt.NDArray[np.bool_]
     held: bool
 
 
 class _Levels:
     """What each actuator's force is affine in: its control or, where it has one, its activation.
 
-    A filter's and a muscle's activation comes to rest at the control, an integrator's anywhere, with a control of zero.
+    A filter's and a muscle's activation comes to rest at the control, or at the end of its own range that is nearest to
+    it. An integrator's rests anywhere with a control of zero. Where its control cannot be zero, it rests at the end of
+    its range, and without a range it drifts.
+
+    Attributes:
+      low, high: (nu,), of the levels at which it may rest. drifting: (nu,), whether it never does.
+      ranges: of the controls, two (nu,).
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         kinds, D = model.actuator_dyntype, mujoco.mjtDyn
-        self.integrates = kinds == D.mjDYN_INTEGRATOR.value
+        integrates = kinds == D.mjDYN_INTEGRATOR.value
         follows = np.isin(kinds, [one.value for one in (D.mjDYN_FILTER, D.mjDYN_FILTEREXACT, D.mjDYN_MUSCLE)])
-        self.activated = np.flatnonzero(follows | self.integrates)
+        self.activated = np.flatnonzero(follows | integrates)
         self.places = model.actuator_actadr[self.activated] + model.actuator_actnum[self.activated] - 1
-        self.low, self.high = np.full((2, model.nu), [[-np.inf], [np.inf]])
-        for limited, (low, high), which in (
-            (model.actuator_ctrllimited, model.actuator_ctrlrange.T, ~self.integrates),
-            (model.actuator_actlimited, model.actuator_actrange.T, follows | self.integrates),
-        ):
-            bounded = limited.astype(bool) & which
-            self.low = np.where(bounded, np.maximum(self.low, low), self.low)
-            self.high = np.where(bounded, np.minimum(self.high, high), self.high)
+        self.ranges = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange)
+        least, most = _ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
+        self.low, self.high = (np.clip(side, least, most) for side in self.ranges)
+        pushed = np.clip(0.0, *self.ranges)  # the control of an integrator that is nearest to rest
+        self.low = np.where(integrates, np.where(pushed > 0, most, least), self.low)
+        self.high = np.where(integrates, np.where(pushed < 0, least, most), self.high)
+        self.drifting = integrates & (((pushed > 0) & np.isinf(most)) | ((pushed < 0) & np.isinf(least)))
+        self.low[self.drifting], self.high[self.drifting] = -np.inf, np.inf
+        self._integrates, self._pushed = integrates, pushed
 
     def controls(self, levels: Array) -> Array:
-        return np.where(self.integrates, 0.0, levels)
+        """The controls (nu,) that go with levels (nu,), which need not be within the range."""
+        return np.where(self._integrates, self._pushed, levels)
 
     def act(self, levels: Array, data: mujoco.MjData) -> None:
         """Apply levels (nu,) to the model's data."""
         data.ctrl[:] = self.controls(levels)
         data.act[self.places] = levels[self.activated]
+
+
+def _ranges(limited: Array, ranges: Array) -> tuple[Array, Array]:
+    """The least and the largest numbers (nu,) of ranges (nu, 2), infinite where there is no limit."""
+    low, high = np.where(limited.astype(bool), ranges.T, [[-np.inf], [np.inf]])
+    return low, high
 
 
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
@@ -91,7 +108,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     rest = force(middle)
     columns = np.stack([force(middle + one) - rest for one in np.eye(model.nu)], axis=1)
     size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
-    kept, carried = _carried(model)
+    kept, carried = _carried(model, qpos, np.asarray(columns.any(axis=1)))
     columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
     scale = np.abs(columns).max(axis=0)
     scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
@@ -106,7 +123,9 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     missed = np.zeros(model.nv)
     missed[kept] = wanted - rest - columns @ (found - middle)
     levels.act(found, data)
-    return Holding(data.ctrl[actuators], data.act.copy(), missed, bool((np.abs(missed) <= _HELD * size).all()))
+    held = bool((np.abs(missed) <= _HELD * size).all()) and not levels.drifting.any()
+    controls = np.clip(data.ctrl, *levels.ranges)[actuators]
+    return Holding(controls, data.act.copy(), missed, levels.drifting, held)
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
@@ -153,8 +172,21 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     return place, float(np.abs(left).max(initial=0.0))
 
 
-def _carried(model: mujoco.MjModel) -> tuple[npt.NDArray[np.intp], Array]:
-    """The free joints, and the map from forces on all joints to those on them, (free, nv), through couplings."""
+def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], Array]:
+    """The free joints, and the map from forces on all joints to those on them, (free, nv), through equalities.
+
+    In a loop those follow that are not driven, as far as there are enough of them.
+    """
+    if loops_of(model):
+        from scipy.linalg import qr
+
+        _, slopes = Equalities(model).at(qpos)
+        _, corner, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
+        rank = int((np.abs(np.diagonal(corner)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
+        follow, kept = (np.sort(one).astype(np.intp) for one in (order[:rank], order[rank:]))
+        moves = np.eye(model.nv)[:, kept]
+        moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, kept], rcond=None)[0]
+        return kept, moves.T
     moves, coupled = np.eye(model.nv), couplings_of(model)
     for one in coupled:
         moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0

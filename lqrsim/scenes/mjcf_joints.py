@@ -1,11 +1,13 @@
 """Joints, actuators and keyframes of an MJCF, for a robot's states and controls."""
 
+import copy
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_name
 
@@ -65,6 +67,8 @@ class Coupling:
     ratio: float
 
 
+_MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
+_STRIDE = 0.05  # m or rad, of joints that others follow
 UNNAMED = "unnamed_"  # begins the names of bodies, joints, geoms and actuators without one in the MJCF
 
 
@@ -121,7 +125,8 @@ def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
         qpos, dofs = (slice(first, first + size) for first, size in zip(firsts, _SIZES[kind], strict=True))
         low, high = model.jnt_range[number].tolist()
         limits = (low, high) if model.jnt_limited[number] and kind in ("slide", "hinge") else None
-        found.append(Joint(model.joint(number).name, kind, qpos, dofs, limits))
+        name = model.joint(number).name or f"generated_joint_{number}"  # such as those of a flexcomp
+        found.append(Joint(name, kind, qpos, dofs, limits))
     return tuple(found)
 
 
@@ -181,9 +186,11 @@ def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
 
 
 def couplings_of(model: mujoco.MjModel) -> tuple[Coupling, ...]:
-    """The active equality constraints of joints, all of which must be linear: see `is_linear`."""
+    """The active equality constraints that couple joints linearly: see `is_linear`."""
     found = []
-    for number in np.flatnonzero(model.eq_active0):
+    for number in np.flatnonzero(model.eq_active0).tolist():
+        if not is_linear(model, number):
+            continue
         first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
         offset, ratio = (float(entry) for entry in model.eq_data[number, :2])
         rest = float(model.qpos0[model.jnt_qposadr[first]])
@@ -199,6 +206,56 @@ def is_linear(model: mujoco.MjModel, number: int) -> bool:
     """Whether an equality constraint couples a joint linearly to another one, or holds it."""
     joints = model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT
     return bool(joints and (int(model.eq_obj2id[number]) < 0 or not model.eq_data[number, 2:5].any()))
+
+
+def loops_of(model: mujoco.MjModel) -> list[int]:
+    """The numbers of the active equality constraints that are not linear in the joints, as those that close a loop."""
+    return [number for number in np.flatnonzero(model.eq_active0).tolist() if not is_linear(model, number)]
+
+
+class Equalities:
+    """All active equality constraints of a model, at given positions.
+
+    Args:
+      model: with at least one.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = copy.copy(model)
+        self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        self._data = mujoco.MjData(self.model)
+
+    def at(self, qpos: Array) -> tuple[Array, Array]:
+        """How far they are off at positions (nq,), (k,) in m or rad, and the derivatives by the velocities, (k, nv)."""
+        data = self._data
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        return data.efc_pos[rows].copy(), data.efc_J.reshape(-1, self.model.nv)[rows].copy()
+
+    def met(self, qpos: Array, aim: Array, fixed: npt.NDArray[np.bool_]) -> Array | None:
+        """Positions (nq,) at which they are met, as little away from those given as may be; None if none was found.
+
+        Args:
+          qpos: to begin with. aim: where the fixed degrees of freedom, (nv,), go. The others follow them in small
+            steps, so that a loop does not flip over.
+        """
+        place, move, model = qpos.copy(), np.zeros(self.model.nv), self.model
+        mujoco.mj_differentiatePos(model, move, 1.0, qpos, aim)
+        move[~fixed] = 0.0
+        steps = max(1, int(np.ceil(np.abs(move).max(initial=0.0) / _STRIDE)))
+        for _ in range(steps):
+            mujoco.mj_integratePos(model, place, move / steps, 1.0)
+            for _ in range(_NEWTON):
+                off, slopes = self.at(place)
+                if np.abs(off).max(initial=0.0) < _MET:
+                    break
+                step = np.zeros(model.nv)
+                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=1e-9)[0]
+                mujoco.mj_integratePos(model, place, step, 1.0)
+            else:
+                return None
+        return place
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:

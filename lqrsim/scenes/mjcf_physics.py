@@ -12,7 +12,6 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.scenes.mjcf_joints import is_linear
 from lqrsim.scenes.scene import model_from_xml
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
@@ -122,30 +121,15 @@ class MjcfPhysics:
 
 def _check(model: mujoco.MjModel, name: str) -> None:
     """Raises InputError for features with states of their own, or that make states depend on each other."""
-    bent = next((one for one in np.flatnonzero(model.eq_active0).tolist() if not is_linear(model, one)), None)
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
-        "equality": (
-            bent is not None,
-            f"got {'none' if bent is None else _equality(model, bent)}",
-            'only <joint> with polycoef="a b", which couples two joints linearly, or active="false"',
-        ),
+        "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
         "plugins": (model.npluginstate > 0, "got some with states of their own", "none"),
         "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),
     }
     for what, (found, got, wanted) in refused.items():
         if found:
             raise InputError(f"{name}: {what}: {got}, want {wanted}")
-
-
-def _equality(model: mujoco.MjModel, number: int) -> str:
-    """An equality constraint as text: its element, its name, and what it constrains."""
-    kind = mujoco.mjtEq(model.eq_type[number]).name.removeprefix("mjEQ_").lower()
-    couples = {"joint": mujoco.mjtObj.mjOBJ_JOINT, "tendon": mujoco.mjtObj.mjOBJ_TENDON}
-    objects = couples.get(kind, mujoco.mjtObj(model.eq_objtype[number]))
-    ends = (mujoco.mj_id2name(model, objects, int(ids[number])) for ids in (model.eq_obj1id, model.eq_obj2id))
-    name = model.equality(number).name
-    return f"<{kind}>{f' {name!r}' if name else ''} of {' and '.join(repr(end) for end in ends if end)}"
 
 
 def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:

@@ -1,12 +1,16 @@
 """The ways to a plan that keeps the constraints, tried in turn; the interior point finishes each.
 
+    the optimum of the search for a free duration, which is only finished;
     the plan of another solution, with its multipliers;
+    for a start that is to be kept to, with an ObstacleCost: that start, after damped iterations on the augmented
+      Lagrangian;
     a trajectory or a policy that the caller gave;
-    the plan of smoothing without the constraints, after a few iterations;
-    what the augmented Lagrangian makes of that plan, if there is an ObstacleCost;
-    the same, after a descent in which constraints may be violated at a price;
+    unless the start is to be kept to:
+      the plan of smoothing without the constraints, after a few iterations;
+      that plan, after the augmented Lagrangian, if there is an ObstacleCost;
+      the plan of smoothing, after a descent in which constraints may be violated at a price;
     the start itself;
-    the same, after such a descent.
+    the start, after such a descent.
 
 If none of these converges, the plan that violates the constraints least is the answer. It is INFEASIBLE if two starts
 lead to plans whose violation is stationary and equally large.
@@ -255,8 +259,14 @@ class Ladder:
         return found
 
     def _worse(self, found: RunResult) -> bool:
-        """Whether a plan costs more than the given one, which keeps the constraints."""
-        return self._given is not None and found.cost > self._given.cost + ROUNDING * abs(self._given.cost)
+        """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding.
+
+        Where both cost nothing but rounding, as a goal that is met, only the size of what cancels says what that is.
+        """
+        if self._given is None:
+            return False
+        rounding = ROUNDING * abs(self._given.cost) + float(self._run.work.memory["negligible"])
+        return found.cost > self._given.cost + rounding
 
     def _answer(self, start: RunResult) -> RunResult:
         """The best result, certified."""

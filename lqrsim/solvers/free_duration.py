@@ -6,6 +6,7 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 """
 
 import copy
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -46,13 +47,8 @@ def solve_for_duration(
     way round. `solve` is for problems with a fixed duration; for `attentive` see `Budget`.
     """
     budget = Budget(settings.max_iterations, callback=callback)
-    stop, log, laps = budget.stop, budget.log, Laps(budget)
+    stop, log = budget.stop, budget.log
     stop.begin(settings.time_limit)
-
-    def watch(measures: Measures) -> bool:
-        measures.record(laps)
-        return stop.due
-
     assert problem.duration is not None
     stated, first, best, near = problem.steps * problem.dt, None, None, None
     for attempt in range(SHORTENED + 1 if problem.time_weight > 0 and settings.start is None else 1):
@@ -64,7 +60,7 @@ def solve_for_duration(
         with stop.reporting("smooth", attentive):
             near = find_duration(
                 problem, begin.trajectory, tolerance=settings.final(problem),
-                violation=settings.violation_tolerance(problem), most=settings.max_iterations, watch=watch,
+                violation=settings.violation_tolerance(problem), most=settings.max_iterations, budget=budget,
             )  # fmt: skip
         cheaper = best is None or near[1].measures.cost < best[1].measures.cost
         if stop.due or not near[1].solved or not cheaper:
@@ -99,18 +95,25 @@ def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, floa
 
 
 def find_duration(
-    problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, most: int,
-    watch: Callable[[Measures], bool],
+    problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, most: int, budget: Budget,
 ) -> tuple[Problem, Found]:  # fmt: skip
     """Find the best duration near that of a plan. Return the problem with it, and the optimum, or how far it came.
 
-    `violation` is the tolerance of the constraints, `most` the number of iterations, up to `MOST`; `watch` is called
-    with the measures after each, and ends the search by returning True.
+    `violation` is the tolerance of the constraints, `most` the number of iterations, up to `MOST`; they join the log of
+    the budget, which may end the search earlier.
     """
     assert problem.duration is not None
+    clock = time.perf_counter()
     freed, n = with_duration(problem), len(problem.dynamics.state_coordinates)
     stages = Stages(freed)
+    budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
     stages.free[n] = 1.0
+    laps = Laps(budget)
+
+    def watch(measures: Measures) -> bool:
+        measures.record(laps)
+        return budget.stop.due
+
     states = np.column_stack([begin.states, np.full(len(begin.states), problem.steps * problem.dt)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
@@ -149,13 +152,13 @@ def with_duration(problem: Problem) -> Problem:
     stage, final = (
         tuple(_longer_cost(cost, n) for cost in terms_of(costs)) for costs in (problem.stage_cost, problem.final_cost)
     )
-    time = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": problem.time_weight}, convex=True)
+    priced = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": problem.time_weight}, convex=True)
     bounds = SymbolicConstraint(
         lambda x, u, p: [x[n] - p.low, p.high - x[n]], parameters={"low": low, "high": high}, at="final"
     )
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
-        stage_cost=CostSum(stage), final_cost=CostSum((*final, time)), control_limits=problem.control_limits,
+        stage_cost=CostSum(stage), final_cost=CostSum((*final, priced)), control_limits=problem.control_limits,
         constraints=(*(_longer(one, dynamics) for one in problem.constraints), bounds),
         begin=problem.begin,
     )  # fmt: skip

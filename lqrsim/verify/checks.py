@@ -107,6 +107,9 @@ def ran_policy_of(solution: Solution, rollout: Rollout) -> bool:
 
 
 SIZE = (640, 480)
+# Pixels: what is thinner is thin, and drawn finer, up to FINEST times, until it is FILLED. Along a rod that is THINNEST
+# every column or row of pixels has one of its own; along a thinner one some have none, and its ends can be missing.
+THIN, FILLED, THINNEST, FINEST = 16.0, 2.0, 1.0, 4
 DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged ones
 # Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
 SYMMETRIC_KINDS = (
@@ -147,10 +150,11 @@ def verify_run(
     times, rows = frames_at_states(rollout, trial)
     measured: list[Array] = []
     offsets: list[Array] = []
-    for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views):
-        measured.append(
-            np.array([view.measure(mask_centre(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
-        )
+    thickness = _thickness(model, geom, rollout.frames[trial, rows], views)
+    finer = 1 if thickness >= THIN else int(np.clip(np.ceil(FILLED / thickness), 1, FINEST))
+    size, centre = (finer * SIZE[0], finer * SIZE[1]), mask_centre if thickness >= THIN else mask_middle
+    for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views, size):
+        measured.append(np.array([view.measure(centre(mask), size) for view, mask in zip(views, masks, strict=True)]))
         offsets.append(offset)
         if progress:
             progress(len(measured), len(rows))
@@ -163,14 +167,18 @@ def verify_run(
         planned=planned_positions(rollout, times),
         apart=apart,
     )
+    others = [check_plan(rollout, solution)]
+    if thickness < THIN:
+        said = f"{finer * thickness:.2g} pixels where it is thinnest, want {THINNEST:g} or more"
+        others.append(Criterion("thickness", finer * thickness >= THINNEST, said))
     return compare(
         describe(rollout, trial),
-        f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
+        f"the silhouette of {name} in {size[0]} x {size[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
         positions,
         bound=DRAWN_BOUND * rollout.radius,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
-        others=(check_plan(rollout, solution),),
+        others=tuple(others),
     )
 
 
@@ -186,18 +194,44 @@ def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
     return int(np.argmax(np.where(fits, model.geom_rbound, -1)))
 
 
+def _thickness(model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[Camera]) -> float:
+    """The least width of the geom's silhouette in pictures of `SIZE`, in pixels, over frames (N, nq) and views."""
+    data, angles, least = mujoco.MjData(model), np.linspace(0, np.pi, 60, endpoint=False), np.inf
+    across = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for frame in frames:
+        data.qpos = frame
+        mujoco.mj_kinematics(model, data)
+        for view in views:
+            seen = across @ view.axes @ data.geom_xmat[geom].reshape(3, 3)  # unit vectors in the geom's axes
+            reach = _reach(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom], seen)
+            least = min(least, 2 * float(reach.min()) * SIZE[1] / view.height)
+    return least
+
+
+def _reach(kind: mujoco.mjtGeom, size: Array, directions: Array) -> Array:
+    """How far a geom reaches from its centre along unit vectors (N, 3) in its axes, (N,) in m."""
+    along = np.abs(directions)
+    if kind == Geom.mjGEOM_BOX:
+        return along @ size
+    if kind == Geom.mjGEOM_ELLIPSOID:
+        return np.linalg.norm(along * size, axis=1)
+    if kind == Geom.mjGEOM_CYLINDER:
+        return size[1] * along[:, 2] + size[0] * np.linalg.norm(along[:, :2], axis=1)
+    return size[0] + (size[1] * along[:, 2] if kind == Geom.mjGEOM_CAPSULE else np.zeros(len(along)))
+
+
 def _silhouettes(
-    model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera]
+    model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera], size: tuple[int, int]
 ) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
     """For each frame (nq,): masks (height, width) of the geom in each view, and its offset from the robot's place."""
     gl.bind()
     body = robot_body(model, rollout.body)
     model.geom_group[:], model.geom_group[geom] = 1, 0
     model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
-    model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
     data, options = mujoco.MjData(model), mujoco.MjvOption()
     options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
-    with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
         for frame in frames:
             data.qpos = frame
             mujoco.mj_kinematics(model, data)
@@ -205,7 +239,7 @@ def _silhouettes(
             masks = []
             for view in views:
                 renderer.update_scene(data, scene_option=options)
-                view.place(renderer.scene, SIZE[0] / SIZE[1])
+                view.place(renderer.scene, size[0] / size[1])
                 # The renderer's own segmentation, without looking up the only geom.
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
@@ -224,6 +258,22 @@ def mask_centre(mask: npt.NDArray[np.bool_]) -> Array:
     """The mean pixel (2,) of a mask (height, width), column and row; NaN if it has too few"""
     rows, columns = np.nonzero(mask)
     return np.array([columns.mean(), rows.mean()]) + 0.5 if len(rows) >= FEWEST_PIXELS else np.full(2, np.nan)
+
+
+def mask_middle(mask: npt.NDArray[np.bool_]) -> Array:
+    """The middle pixel (2,) of a mask of a shape that is symmetric about it, column and row; NaN if it is empty.
+
+    It fits the middles between the outermost pixels in several directions. A rod that is few pixels thick is one pixel
+    thicker in parts, which moves the mean along the rod, but not its ends.
+    """
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return np.full(2, np.nan)
+    angles = np.linspace(0, np.pi, 16, endpoint=False)
+    across = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    places = across @ np.stack([columns, rows])
+    # The directions are evenly spread: the sum of their squares is 8 times the identity.
+    return across.T @ (places.min(axis=1) + places.max(axis=1)) / 16 + 0.5
 
 
 def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:

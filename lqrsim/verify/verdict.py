@@ -266,6 +266,8 @@ def compare(
 def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: float, interval: float) -> str:
     """The likely cause of a failure, as a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
+    if "thickness" in failed:
+        return "the geom is too thin to be seen: give its body a thicker one that can collide, or plan a shorter way"
     if "mark" in failed:
         return "the panes are too small: render the video larger, or with fewer of them"
     if failed & {"position", "time", "scale", "views agree"}:
