@@ -335,16 +335,14 @@ def extent(plant: Plant) -> float:
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True
     reach = 0.0
     for geom in np.flatnonzero(collides):
-        path = [int(model.geom_bodyid[geom])]
-        while path[-1] not in (0, plant.body):
-            path.append(int(model.body_parentid[path[-1]]))
-        if path[-1] != plant.body:
+        path = mjcf_joints.path_to(model, geom, plant.body)
+        if path is None:
             continue
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
             size = float(model.geom_size[geom, 0])  # upright: its outline from above
         own, jointed = np.linalg.norm(model.geom_pos[geom]), False
-        for body in path[:-1]:
+        for body in path:
             first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
             jointed |= count > 0
             own += np.linalg.norm(model.body_pos[body])
