@@ -1,7 +1,8 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py` applies
-the disturbances, `physics.py` is MuJoCo's part, `collisions.py` detects collisions, and `recorder.py` records.
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `run_settings.py`
+checks the arguments, `effects.py` applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py`
+detects collisions, and `recorder.py` records.
 """
 
 import copy
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import ControllerLike, ControllerRun, Feedback
+from lqrsim.control.controllers import ControllerLike, ControllerRun
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
@@ -170,11 +171,11 @@ class ClosedLoop:
 
     def begin(self) -> None:
         """Measure the states at the first knot, after what came before."""
-        settings = self.settings
-        self.effects.follow(settings.whole, settings.knot)
-        if not isinstance(settings.law, Feedback):  # which has no memory
-            for step in range(settings.knot):
-                self.controller_run.control(step, np.tile(settings.whole.states[step], (settings.trials, 1)))
+        whole, trials = self.settings.whole, self.settings.trials
+        for step in range(self.settings.knot):
+            states, controls = (np.tile(one[step], (trials, 1)) for one in (whole.states, whole.controls))
+            self.effects.follow(step, states, controls)
+            self.controller_run.control(step, states)
         self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:

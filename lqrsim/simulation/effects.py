@@ -114,18 +114,16 @@ class Effects:
         if self.displaced.any():
             physics.displace(self.displaced)
 
-    def follow(self, plan: Trajectory, steps: int) -> None:
-        """Call all with the states and controls of a plan's first periods, for those that remember."""
-        for step in range(steps):
-            states, controls = (np.tile(one[step], (len(self.displaced), 1)) for one in (plan.states, plan.controls))
-            for _, measure in self._measures:
-                measure(step, states.copy())
-            for _, actuate in self._actuations:
-                actuate(step, controls.copy())
-            for one in self._pushes:
-                one.hook(step, states)
-            for _, kick in self._kicks:
-                kick(step, states, controls)
+    def follow(self, step: int, states: Array, controls: Array) -> None:
+        """Call all with the states (K, n) and controls (K, m) of a plan, for those that remember."""
+        for _, measure in self._measures:
+            measure(step, states.copy())
+        for _, actuate in self._actuations:
+            actuate(step, controls.copy())
+        for one in self._pushes:
+            one.hook(step, states)
+        for _, kick in self._kicks:
+            kick(step, states, controls)
 
     def measure(self, step: int, states: Array) -> Array:
         """The measured states (K, n), from the true ones."""
