@@ -91,9 +91,7 @@ def simulate(
     return _run(RunSettings(**locals()))  # all arguments, by name
 
 
-def simulate_from(
-    plant: Plant, plan: Plan, states: Array, *, knot: int = 0, controller: ControllerLike | None = None, **options: Any
-) -> Rollout:
+def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
     """Run the rest of a plan after `knot` periods, one trial from each of the states (K, n).
 
     Until the knot, states and measurements are taken to be those of the plan: disturbances and controller are called
@@ -101,7 +99,7 @@ def simulate_from(
     happens at that time. The physics begins at the knot.
 
     Args:
-      plant, plan, controller: as in `simulate`.
+      plant, plan: as in `simulate`.
       states: (K, n), where the trials begin.
       knot: number of the knot.
       options: other options of `simulate`, except `trials`. Disturbances that change the start, such as
@@ -111,8 +109,7 @@ def simulate_from(
       InputError: as `simulate`; a disturbance changes the start; or the knot is not before the plan's end.
     """
     states = check_array("states", states, (None, None))
-    given = {"controller": controller, "starts": states, "knot": knot, "trials": len(states)}
-    return _run(RunSettings(plant=plant, plan=plan, **given, **options))
+    return _run(RunSettings(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
 
 
 def _run(settings: RunSettings) -> Rollout:
