@@ -29,13 +29,17 @@ def changed(was: Mapping[str, str]) -> str:
 
 
 @cache
-def outdated() -> str:
-    """A line on the packages that are older than lqrsim needs, as another package may have asked for; else empty."""
+def outdated(extra: str = "") -> str:
+    """A line on the packages that are older than lqrsim, or an extra of it, needs; else empty.
+
+    Another package may have asked for them, or they were installed by themselves.
+    """
     try:
         needs = requires("lqrsim") or []
     except PackageNotFoundError:  # a copy of the source that is not installed
         return ""
-    bounds = [re.fullmatch(r"([\w.-]+)>=([\d.]+)", need) for need in needs]  # not those of extras
+    of = f"; extra == [\"']{extra}[\"']" if extra else ""
+    bounds = [re.fullmatch(rf"([\w.-]+)>=([\d.]+){of}", need) for need in needs]
     least = {bound[1]: bound[2] for bound in bounds if bound}
     older = {
         name: found for name, found in versions_of(*least).items()

@@ -129,10 +129,10 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
     good = json.loads(metadata(rollout).as_json())
     for change, message in [
         ({"version": 99}, "got version 99"),
-        ({"frames": 0}, "metadata.frames: got 0"),
+        ({"frames": 0}, "metadata: VideoMetadata: frames: got 0"),
         ({"rate": "30/0"}, "damaged"),
         ({"markers": []}, "whose parts do not fit together"),
-        ({"panes": [{"left": 0}]}, "damaged"),
+        ({"panes": [{"left": 0}]}, r"metadata\.panes\.0\.top: got none"),
     ]:
         with pytest.raises(ls.InputError, match=message):
             VideoMetadata.from_json(json.dumps(good | change))

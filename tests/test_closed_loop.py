@@ -1,8 +1,9 @@
 """Running policies in MuJoCo: tracking, repeatability, what is recorded, and what bad input is told."""
 
+import inspect
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.run_settings import RunSettings
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
 RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
@@ -121,6 +123,12 @@ def test_a_wall_stops_the_robot_and_is_counted_as_contact(arena):
     assert rollout.outcome == ("collided",)
     # Held by the wall: contacts give way by millimetres, not by the 1.7 m that the plan goes on.
     assert 2 - 0.17 - 0.01 < rollout.states[0, -1, 0] < 2 - 0.17 + 0.01
+
+
+def test_settings_have_the_arguments_of_simulate_with_their_defaults():
+    given = {name: one.default for name, one in inspect.signature(simulate).parameters.items() if name != "plant"}
+    own = {one.name: one.default for one in fields(RunSettings) if one.init and one.name != "plant"}
+    assert own == given | {"starts": None, "knot": 0}
 
 
 def test_progress_counts_the_control_periods(cage):
@@ -388,7 +396,7 @@ def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
 
 
 def test_a_policy_for_another_robot_is_refused(cage):
-    with pytest.raises(InputError, match=r"^controller: got a policy with states x, y, heading, want those of robot"):
+    with pytest.raises(InputError, match=r"^controller: got one with the states x, y, heading, want .*, as robot"):
         simulate(cage, weave(5))
 
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
+from sympy import cos, sin
 from tracking import hover, track
 
 import lqrsim as ls
@@ -158,6 +159,35 @@ def test_an_arm_that_is_stuck_on_a_post_has_collided_with_it(arm: Plant, swing: 
     assert not arm.enclosed
 
 
+@dataclass(frozen=True)
+class Handed(Arm):
+    """The same with a ball, which goes over the middle of the post."""
+
+    @cached_property
+    def balls(self) -> ls.CollisionSpheres:  # pyright: ignore[reportIncompatibleVariableOverride]
+        def hand(x, p):
+            return [[np.sqrt(0.5) * cos(x[0]), np.sqrt(0.5) * sin(x[0]), 0]]
+
+        return ls.CollisionSpheres(hand, (0.03,))
+
+
+@pytest.mark.parametrize("kind", [Arm, Handed])
+def test_what_an_exclude_keeps_apart_never_collides(swing: ls.Solution, kind: Callable[[], Robot]) -> None:
+    """As in MuJoCo: its arm goes through the post, and no clearance is measured to it."""
+    exclude = '<contact><exclude body1="arm" body2="world"/></contact>'
+    scene = scene_from_xml(ARM.replace("<actuator>", f"{exclude}<actuator>"), "bench")
+    plant = Plant(kind(), scene)
+    data = mujoco.MjData(scene.model)
+    data.qpos[0] = np.pi / 4
+    mujoco.mj_forward(scene.model, data)
+    assert data.ncon == 0
+    assert plant.obstacles == plant.world.names == ()
+    rollout = ls.simulate(plant, swing)
+    assert rollout.outcome == ("reached",)
+    assert rollout.states[0, -1, 0] > np.pi / 2
+    assert rollout.clearance.min() == np.inf
+
+
 def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant, swing: ls.Solution) -> None:
     problem = ls.Problem(
         dynamics=arm.robot.dynamics, dt=0.05, steps=40, initial=ls.FixedState((0.0, 0.0)),
@@ -255,6 +285,9 @@ def test_what_can_sink_to_the_floor_stands_on_it() -> None:
             return qpos, qvel
 
     assert Plant(Lifted(), scene_from_xml(lifted, "rail")).obstacles == ()
+    ceiling = '<geom name="ceiling" type="plane" size="9 9 0.1" pos="0 0 2" euler="180 0 0"/>'
+    between = lifted.replace("<worldbody>", f"<worldbody>{ceiling}")
+    assert Plant(Lifted(), scene_from_xml(between, "rail")).obstacles == ("ceiling",)
 
 
 # Judged by the goal.

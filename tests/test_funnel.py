@@ -31,7 +31,7 @@ from lqrsim.disturbances import (
     Saturation,
 )
 from lqrsim.errors import InputError
-from lqrsim.simulation.start_at import simulate_from
+from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress.funnels import points_of
 from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
 

@@ -128,7 +128,7 @@ def test_bad_input_gets_one_line(
         plot_run(drive_solution, drive_runs, tmp_path / "figure.jpg", world=world)
     with pytest.raises(ls.InputError, match="rollouts: got 0, want 1 to 4"):
         plot_run(drive_solution, {}, tmp_path / "figure.png", world=world)
-    with pytest.raises(ls.InputError, match=r"rollouts\['calm'\]: got a run of another system"):
+    with pytest.raises(ls.InputError, match=r"rollouts\['calm'\]: got a run with the states"):
         plot_run(drive_solution, flight_runs, tmp_path / "figure.png", world=world)
     with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
         plot_run(drive_solution, drive_runs, tmp_path / "figure.png", world=world, trial=1)

@@ -315,6 +315,19 @@ print(*simulator.states(simulation)[0])
 """
 
 
+@pytest.mark.parametrize(("name", "first"), [("crazyflow", "Crazyflow().weight"), ("rotorpy", "RotorPy()")])
+def test_a_simulator_that_is_too_old_is_named(name: str, first: str, tmp_path: Path) -> None:
+    """Before anything of it is imported, which may fail in other words."""
+    folder = tmp_path / f"{name}-0.3.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.3\n")
+    code = f"import lqrsim as ls; from lqrsim.simulators import *; {first}"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    line = f"lqrsim.errors.InputError: {name}: got {name} 0.3, want newer: pip install '{name}>="
+    assert done.stderr.splitlines()[-1].startswith(line)
+
+
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("crazyflow") is None, reason="needs the `crazyflow` extra")
 def test_a_crazyflie_hovers_and_falls() -> None:

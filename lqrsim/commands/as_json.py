@@ -32,38 +32,21 @@ def of_scenario(name: str, scenario: "Scenario") -> Object:
     """A scenario, as in `lqrsim list`."""
     problem = scenario.problem
     return {
-        "name": name,
-        "summary": scenario.summary,
-        "robot": scenario.robot.name,
-        "scene": scenario.scene.name,
-        "steps": problem.steps,
-        "dt": problem.dt,
-        "states": _named(problem.dynamics.state_coordinates),
+        "name": name, "summary": scenario.summary, "robot": scenario.robot.name, "scene": scenario.scene.name,
+        **_fields(problem, "steps dt"), "states": _named(problem.dynamics.state_coordinates),
         "controls": _named(problem.dynamics.control_coordinates),
-    }
+    }  # fmt: skip
 
 
 def of_funnel(funnel: "Funnel") -> Object:
     """Settings and levels of a funnel; the ellipsoids are in its file."""
-    columns = zip(funnel.knots, funnel.levels, funnel.trials, funnel.successes, funnel.reasons, strict=True)
-    return {
-        "rate": funnel.rate,
-        "confidence": funnel.confidence,
-        "states": funnel.states,
-        "family": funnel.family,
-        "goal_radius": funnel.goal_radius,
-        "disturbances": funnel.disturbances,
-        "seed": funnel.seed,
-        "options": funnel.options,
-        "simulated": funnel.simulated,
-        "knots": [
-            {"knot": knot, "time": knot * funnel.plan.dt, "level": level, "trials": trials, "successes": successes,
-             "reason": reason}
-            for knot, level, trials, successes, reason in columns
-        ],
-        "policy_digest": funnel.policy_digest,
-        "versions": funnel.versions,
+    times = [knot * funnel.plan.dt for knot in funnel.knots]
+    columns = {
+        "knot": funnel.knots, "time": times, "level": funnel.levels, "trials": funnel.trials,
+        "successes": funnel.successes, "reason": funnel.reasons,
     }  # fmt: skip
+    names = "rate confidence states family goal_radius disturbances seed options simulated policy_digest versions"
+    return {**_fields(funnel, names), "knots": _rows(columns)}
 
 
 def of_solution(solution: "Solution") -> Object:
@@ -73,35 +56,17 @@ def of_solution(solution: "Solution") -> Object:
     if solution.clearance is not None:
         knot = int(np.argmin(solution.clearance))
         clearance = {"least": solution.clearance[knot], "time": plan.times[knot]}
+    away = target.distance(plan.states[-1])
+    names = (
+        "scenario solver options status success detail remedy cost gap optimality violation certificate iterations"
+        " problem_digest versions"
+    )
     return {
-        "scenario": solution.scenario,
-        "solver": solution.solver,
-        "options": solution.options,
-        "status": solution.status.name,
-        "success": solution.success,
-        "detail": solution.detail,
-        "remedy": solution.remedy,
-        "steps": plan.steps,
-        "dt": plan.dt,
-        "cost": solution.cost,
-        "gap": solution.gap,
-        "optimality": solution.optimality,
-        "violation": solution.violation,
-        "certificate": solution.certificate,
+        **_fields(solution, names),
+        **_fields(plan, "steps dt"),
         "clearance": clearance,
-        "goal": {
-            "is": target.name,
-            "distance": target.distance(plan.states[-1]),
-            "radius": solution.goal_radius,
-            "unit": target.unit,
-        },
-        "iterations": solution.iterations,
-        "candidates": [
-            {"start": one.start, "cost": one.cost, "iterations": one.iterations, "status": one.status}
-            for one in solution.candidates
-        ],
-        "problem_digest": solution.problem_digest,
-        "versions": solution.versions,
+        "goal": {"is": target.name, "distance": away, "radius": solution.goal_radius, "unit": target.unit},
+        "candidates": [_fields(one, "start cost iterations status") for one in solution.candidates],
     }
 
 
@@ -118,23 +83,18 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     columns: Mapping[str, Any] = {**outcomes(rollout, problem).columns(), "reason": rollout.reasons}
     target, chance = rollout.target, rollout.collision_chance
     return {
-        "robot": rollout.robot,
-        "scene": rollout.scene,
-        "disturbances": rollout.disturbances,
-        "seed": rollout.seed,
-        "tracking_unit": rollout.tracking_unit,
+        **_fields(rollout, "robot scene disturbances seed tracking_unit versions"),
         "goal": {"is": target.name, "radius": rollout.goal_radius, "unit": target.unit},
         "tube": rollout.tube is not None,
         "collision_chance": None if chance is None else chance.max(),
         "reached": rollout.reached.sum(),
-        "trials": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
-        "versions": rollout.versions,
+        "trials": _rows(columns),
     }
 
 
 def of_verification(found: "Verification") -> Object:
     """All fields of a verification, the positions in every frame included."""
-    return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)} | {"passed": found.passed}
+    return {**{one.name: getattr(found, one.name) for one in dataclasses.fields(found)}, "passed": found.passed}
 
 
 def of_campaign(results: "Results") -> Object:
@@ -143,20 +103,29 @@ def of_campaign(results: "Results") -> Object:
 
     cells = []
     for cell, ends, found in results.cell_successes():
-        row: Object = {"policy": cell.policy, "sweep": cell.sweep, "strength": cell.strength, "trials": ends.total()}
+        row = {**_fields(cell, "policy sweep strength"), "trials": ends.total()}
         if found is not None:
             outcomes = {name: ends[name] for name in OUTCOMES}
             row |= {"outcomes": outcomes, "reached": found.exact, "deterministic": found.alike}
         cells.append(row)
     return {
-        "folder": results.folder,
-        "complete": results.complete,
+        **_fields(results, "folder complete"),
         "cells": cells,
         "left_out": results.manifest["left_out"],
         "plans": results.plans(),
         "came_to_nothing": results.came_to_nothing(),
         "versions": results.manifest["versions"],
     }
+
+
+def _fields(record: object, names: str) -> Object:
+    """These attributes of a record."""
+    return {name: getattr(record, name) for name in names.split()}
+
+
+def _rows(columns: Mapping[str, Any]) -> list[Object]:
+    """Columns of equal length as a list of rows."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _named(space: "Coordinates") -> list[Object]:

@@ -6,6 +6,7 @@ has the same law in NumPy, for a robot; its module's docstring says why there ar
 
 import abc
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from lqrsim.kernels import policy_evaluation
 from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
@@ -118,7 +119,7 @@ class Controller(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> Spaces:
         """Coordinates of the states that it needs, and of its controls."""
 
     @property
@@ -165,27 +166,34 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
             return FunctionController(given, dynamics, plan.trajectory.dt), plan
 
 
-class Feedback(Controller):
-    """A policy of the measured state."""
+@dataclass(frozen=True, eq=False)
+class _OfPolicy(Controller):
+    """Base of controllers that are a policy."""
 
-    def __init__(self, policy: AffinePolicy) -> None:
-        self.policy = policy
-
-    def start(self, trials: int) -> ControllerRun:
-        return _FeedbackRun(self.policy)
+    policy: AffinePolicy | OutputFeedbackPolicy
 
     @property
     def digest(self) -> str:
         return self.policy.digest
 
     @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        return self.policy.state_coordinates, self.policy.control_coordinates
+    def coordinates(self) -> Spaces:
+        return spaces_of(self.policy)
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback(_OfPolicy):
+    """A policy of the measured state."""
+
+    policy: AffinePolicy
+
+    def start(self, trials: int) -> ControllerRun:
+        return _FeedbackRun(self.policy)
 
 
 class _FeedbackRun(ControllerRun):
     def __init__(self, policy: AffinePolicy) -> None:
-        self._policy, self._evaluate = policy, evaluator(policy.state_coordinates, policy.control_coordinates)
+        self._policy, self._evaluate = policy, evaluator(*spaces_of(policy))
 
     def control(self, step: int, measured: Array) -> Array:
         policy = self._policy
@@ -193,35 +201,30 @@ class _FeedbackRun(ControllerRun):
         return self._evaluate(measured, policy.gain[t], policy.offset[t], policy.nominal[t])
 
 
-class OutputFeedback(Controller):
+@dataclass(frozen=True, eq=False)
+class OutputFeedback(_OfPolicy):
     """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost."""
 
-    def __init__(self, policy: OutputFeedbackPolicy) -> None:
-        states, names = policy.state_coordinates.names, policy.measured_coordinates.names
+    policy: OutputFeedbackPolicy
+
+    def __post_init__(self) -> None:
+        states, names = self.policy.state_coordinates.names, self.policy.measured_coordinates.names
         if not set(names) <= set(states):
             raise InputError(
                 f"controller: got an OutputFeedbackPolicy that measures {', '.join(names)}, want one that measures"
                 f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
             )
-        self.policy, self.measures = policy, [states.index(name) for name in names]
 
     def start(self, trials: int) -> ControllerRun:
-        return _OutputFeedbackRun(self, trials)
-
-    @property
-    def digest(self) -> str:
-        return self.policy.digest
-
-    @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        return self.policy.state_coordinates, self.policy.control_coordinates
+        return _OutputFeedbackRun(self.policy, trials)
 
 
 class _OutputFeedbackRun(ControllerRun):
-    def __init__(self, law: OutputFeedback, trials: int) -> None:
-        self._policy, self._measures = law.policy, law.measures
-        self._z = np.tile(law.policy.start(), (trials, 1))
-        self._last = np.full((trials, len(law.policy.state_coordinates)), np.nan)
+    def __init__(self, policy: OutputFeedbackPolicy, trials: int) -> None:
+        states = policy.state_coordinates.names
+        self._policy, self._measures = policy, [states.index(name) for name in policy.measured_coordinates.names]
+        self._z = np.tile(policy.start(), (trials, 1))
+        self._last = np.full((trials, len(states)), np.nan)
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
@@ -237,7 +240,7 @@ class FunctionController(Controller):
 
     def __init__(self, function: ControlFunction, dynamics: Dynamics, dt: float) -> None:
         self.function, self.dt = function, dt
-        self._coordinates = dynamics.state_coordinates, dynamics.control_coordinates
+        self._coordinates = spaces_of(dynamics)
 
     def start(self, trials: int) -> ControllerRun:
         return _FunctionRun(self)
@@ -249,7 +252,7 @@ class FunctionController(Controller):
         return sha256(f"{known} {self.dt!r}")[:16]
 
     @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> Spaces:
         return self._coordinates
 
 

@@ -16,7 +16,7 @@ from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.errors import Array
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Measurements, Policy
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 
@@ -57,9 +57,9 @@ class FilterLaw:
         return cls(plan, model, kalman, weights, gain, offset, nominal)
 
     @property
-    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> Spaces:
         """Coordinates of the states and of the controls."""
-        return self.plan.policy.state_coordinates, self.plan.policy.control_coordinates
+        return spaces_of(self.plan.policy)
 
     @property
     def limits(self) -> tuple[Array, Array]:

@@ -69,7 +69,7 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     return KalmanFilter(gain, before @ before.transpose(0, 2, 1), after @ after.transpose(0, 2, 1), after, innovation)
 
 
-def check_observable(who: str, model: PlanModel) -> None:
+def check_observable(model: PlanModel) -> None:
     """Raise InputError, which names it, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
     effect = np.eye(model.size)[:, first:]
@@ -83,6 +83,6 @@ def check_observable(who: str, model: PlanModel) -> None:
         if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
-                f"{who}: unknowns: got {unknown.name}, which no measurement sees ({measured}),"
+                f"OffsetFree: unknowns: got {unknown.name}, which no measurement sees ({measured}),"
                 " want sensors that see its effect"
             )

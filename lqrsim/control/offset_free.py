@@ -115,7 +115,7 @@ class OffsetFree(Controller):
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         self.model = for_filter(PlanModel.of(problem.dynamics, plan, uncertainty, sensor), memory, efforts)
-        check_observable("OffsetFree", self.model)
+        check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
         self.weights = self._weights(tolerate, efforts, at_end)

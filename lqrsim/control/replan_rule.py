@@ -23,6 +23,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.fields import LINE, Line, check_fields
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
@@ -224,10 +225,8 @@ class ReplanRule:
     ) -> None:
         check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
         check_kind(f"{who}: solution", solution, Plan, "its Solution, or another Plan")
-        dynamics, plan = problem.dynamics, solution.trajectory
-        spaces = solution.policy.state_coordinates.names, solution.policy.control_coordinates.names
-        if spaces != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
-            raise InputError(f"{who}: solution: got one of another system, want the problem's")
+        plan, want = solution.trajectory, spaces_of(problem.dynamics)
+        check_same_system(f"{who}: solution", "one", spaces_of(solution.policy), want, "the problem")
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
             raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")
@@ -266,10 +265,10 @@ class ReplanRule:
                 raise InputError(f"{who}: {field}: got {got}, want {want}: it cannot change while a re-planner runs")
         return self.solver.check(problem)
 
-    def due(self, step: int) -> bool:
-        """Whether a solve begins at a step."""
+    def due(self, step: int, before: int) -> bool:
+        """Whether a solve is due at a step, and was not yet at the step `before`; -1 is before the first of all."""
         left = self.horizon == "moving" or step + self.delay < self.problem.steps
-        return step > 0 and step % self.periods == 0 and left
+        return left and step // self.periods > before // self.periods
 
     def outside(self, active: ActivePlan, step: int, state: Array, *, late: float = 0.0) -> bool:
         """Whether a state (n,), measured `late` seconds after a control period began, is outside the funnel.

@@ -62,7 +62,7 @@ class ReplannedRun(ControllerRun):
         commands: list[Array] = []
         for k, run in enumerate(self._runs):
             run.take_in(step, measured[k : k + 1])
-            if self._rule.due(step) and not run.estimator_diverged():
+            if self._rule.due(step, max(step - 1, 0)) and not run.estimator_diverged():
                 self._replan(run, k, step)
             commands.append(run.command(step))
         return np.concatenate(commands)
@@ -79,10 +79,8 @@ class ReplannedRun(ControllerRun):
         if not np.isfinite(states).all():
             return False
         clearance, solution = clearance_of(problem, states), self._rule.solution
-        target, radius = solution.target, solution.goal_radius
-        if radius is None and not target.places:
-            radius = target.radius(None, None, None)
-        near = radius is None or bool(target.distance(states[-1]) <= radius)
+        radius = solution.target.radius_of_plan(solution.goal_radius)
+        near = radius is None or bool(solution.target.distance(states[-1]) <= radius)
         return near and (clearance is None or bool(clearance.min() >= 0))
 
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:

@@ -27,7 +27,7 @@ from lqrsim.errors import (
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.solvers.parallel import workers
@@ -143,16 +143,10 @@ class LiveReplanner:
         dt = self.problem.dt
         step = int(t / dt + 1e-9)
         self._take(step)
-        if self._solve is None and step > self._asked and self._due(step):
+        if self._solve is None and self._rule.due(step, self._asked):
             self._ask(state, t, step)
         policy = self.active.plan.policy
         return policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
-
-    def _due(self, step: int) -> bool:
-        """Whether a solve begins in a control period: also in the first, and in the next one after periods left out."""
-        rule = self._rule
-        left = rule.horizon == "moving" or step + rule.delay < rule.problem.steps
-        return left and step // rule.periods > self._asked // rule.periods
 
     def _ask(self, state: Array, t: float, step: int) -> None:
         """Begin a solve, of a state that is measured within a control period, unless that is in the funnel."""
@@ -299,7 +293,7 @@ class Replanner(Controller):
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        return self.solution.policy.state_coordinates, self.solution.policy.control_coordinates
+        return spaces_of(self.solution.policy)
 
 
 class ReplannerRun(ControllerRun):
@@ -318,7 +312,7 @@ class ReplannerRun(ControllerRun):
 
     def control(self, step: int, measured: Array) -> Array:
         self._activate(step)
-        if self._rule.due(step):
+        if self._rule.due(step, max(step - 1, 0)):
             self._replan(step, measured)
             self._activate(step)
         commands = np.empty((len(measured), len(self._of.coordinates[1])))

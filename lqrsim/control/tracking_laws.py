@@ -21,7 +21,7 @@ from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
-from lqrsim.results.coordinates import PerEntry
+from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
 from lqrsim.results.solution import Solution
 
 CONTROL_SHARE = 0.25  # of the range between its limits that a control may be changed by, by default
@@ -149,10 +149,8 @@ def check_plan(who: str, problem: Problem, solution: Solution) -> None:
     """Raise InputError unless the solution has a finite plan of the problem's system and control period."""
     check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
     check_kind(f"{who}: solution", solution, Solution, "a Solution of it")
-    dynamics, policy, plan = problem.dynamics, solution.policy, solution.trajectory
-    names = policy.state_coordinates.names, policy.control_coordinates.names
-    if names != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
-        raise InputError(f"{who}: solution: got one of another system, want the problem's")
+    plan, want = solution.trajectory, spaces_of(problem.dynamics)
+    check_same_system(f"{who}: solution", "one", spaces_of(solution.policy), want, "the problem")
     if plan.dt != problem.dt:
         raise InputError(
             f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"

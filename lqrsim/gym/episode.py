@@ -23,7 +23,7 @@ from lqrsim.errors import (
     excerpt,
     shaped,
 )
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
@@ -158,11 +158,10 @@ def reset_options(options: Any) -> dict[str, Any]:
 
 
 def _plant_of(scenario: Scenario) -> Plant:
-    """The scenario's plant. Raises InputError if its problem has other states."""
+    """The scenario's plant. Raises InputError if its problem has other states or controls."""
     plant = scenario.plant()
-    robot, problem = plant.robot.dynamics.state_coordinates, scenario.problem.dynamics.state_coordinates
-    if robot.names != problem.names:
-        raise InputError(f"scenario: got a problem of states {', '.join(problem.names)}, want {', '.join(robot.names)}")
+    own, robot = spaces_of(scenario.problem.dynamics), plant.robot
+    check_same_system("scenario", "a problem", own, spaces_of(robot.dynamics), f"robot {robot.name}")
     return plant
 
 
@@ -260,11 +259,11 @@ class Episode:
     ) -> None:  # fmt: skip
         self.task, self.seed, self.first = task, seed, first_trial
         dynamics = task.plant.robot.dynamics
-        commanded = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
+        commanded = Commanded(spaces_of(dynamics))
         settings = RunSettings(
             plant=task.plant, plan=task.solution, disturbances=disturbances, controller=commanded,
-            seed=seed, trials=count, first_trial=first_trial, frames=frames, contacts=True, threads=threads,
-            generators=None, progress=None, watch=None, **task.scenario.near_enough(),
+            seed=seed, trials=count, first_trial=first_trial, frames=frames, threads=threads,
+            **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, settings.trajectory
         self._loop = ClosedLoop(settings)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -324,6 +324,38 @@ class Coordinates:
           vector: (..., n).
         """
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
+
+
+Spaces = tuple[Coordinates, Coordinates]  # of states and of controls
+
+
+class _Spaced(Protocol):
+    @property
+    def state_coordinates(self) -> Coordinates: ...
+    @property
+    def control_coordinates(self) -> Coordinates: ...
+
+
+def spaces_of(one: _Spaced) -> Spaces:
+    """The coordinates of the states and of the controls of dynamics, a policy or a rollout."""
+    return one.state_coordinates, one.control_coordinates
+
+
+def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose: str) -> None:
+    """Check that states and controls have the same names.
+
+    Args:
+      field: for messages. what: it was given. whose: the wanted coordinates are.
+
+    Raises:
+      InputError: they have not.
+    """
+    for kind, one, other in zip(("states", "controls"), got, want, strict=True):
+        if one.names != other.names:
+            raise InputError(
+                f"{field}: got {what} with the {kind} {', '.join(one.names)}, want {', '.join(other.names)}, as"
+                f" {whose} has them"
+            )
 
 
 def _pair(field: str, given: object) -> tuple[float, float]:

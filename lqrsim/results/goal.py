@@ -126,6 +126,10 @@ class Target:
             return check_number("goal_tolerance", goal_tolerance, above=0.0)
         return self.on_the_way(TOLERANCE)
 
+    def radius_of_plan(self, radius: float | None) -> float | None:
+        """A known radius; else the default one, which in metres only a robot has."""
+        return self.on_the_way(TOLERANCE) if radius is None and not self.places else radius
+
     def on_the_way(self, radius: float) -> float:
         """A radius; where the plan starts within it, a tenth of the way, so that the start has not reached the target.
 

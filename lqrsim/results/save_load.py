@@ -28,6 +28,7 @@ from lqrsim.results.solution_parts import Certificate
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel | FailureCertificate
 _Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel, FailureCertificate)
+_Record = TypeVar("_Record")
 
 # The name in the file, and the version.
 FORMATS: dict[type, tuple[str, int]] = {
@@ -116,6 +117,16 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         if arrays:
             raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
         return record
+
+
+def tree_of(record: Any) -> dict[str, Any]:
+    """A record without arrays as JSON has it, for `record_from`."""
+    return _tree(record, "", {})
+
+
+def record_from(kind: type[_Record], tree: Any, path: str) -> _Record:
+    """The record of `tree_of`. Raises InputError for anything else; messages call it `path`."""
+    return _record(kind, tree, path, {})
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:

@@ -167,10 +167,7 @@ class Solution(Plan):
         """Distance from the goal to the end of the plan, and whether the plan misses the goal."""
         if not np.isfinite(self.trajectory.states).all():
             return []
-        target, radius = self.target, self.goal_radius
-        if radius is None and not target.places:
-            radius = target.radius(None, None, None)
-        lines = target.of_plan(radius)
+        lines = self.target.of_plan(self.target.radius_of_plan(self.goal_radius))
         return lines if self.success else lines[:1]  # the remedy of a failure follows
 
     def _beyond_limits(self) -> list[str]:

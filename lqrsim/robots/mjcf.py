@@ -26,9 +26,8 @@ from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, Qua
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
-from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.robots.mjcf_geoms import MjcfGeoms
+from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
 from lqrsim.scenes.mjcf_obstacles import in_the_way

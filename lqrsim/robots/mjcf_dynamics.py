@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lqrsim import process
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
@@ -231,3 +232,26 @@ class MjcfDynamics(Dynamics):
                     for helper in helpers:
                         helper.join()
                     team[kernel.STOP] = team[kernel.HELPERS] = 0
+
+
+class MjcfMemory(UserFunction):
+    """The address that kernels call p, in the place of a function's: they find MuJoCo's memory of dynamics there."""
+
+    @classmethod
+    def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":
+        """That of these dynamics."""
+        memory = cls(
+            function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
+            offset=1, values=1, with_control=False, is_memory=True,
+        )  # fmt: skip
+        memory.held.append((dynamics.physics, dynamics.physics.numbers.ctypes.data))
+        vars(memory).update(identity=dynamics.fixed, of_what=dynamics)
+        return memory
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """That of the dynamics in the other process."""
+        return MjcfMemory.of, (vars(self)["of_what"],)
+
+
+def _nothing(x: Array, p: Any) -> float:
+    return 0.0

@@ -9,8 +9,7 @@ from lqrsim.kernels import distance_constraint, mjcf_sites, residual_cost
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.robots.mjcf_memory import MjcfMemory
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes.mjcf_joints import axes_of, site_frame
 
 _AXES = "xyz"

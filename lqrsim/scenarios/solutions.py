@@ -9,7 +9,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_kind
 from lqrsim.results.certificate import FailureCertificate
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.save_load import load
@@ -65,10 +65,10 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
         )
     if isinstance(found, Solution | AffinePolicy):
         policy = found if isinstance(found, AffinePolicy) else found.policy
-        _check_fits("start", path, scenario, policy.state_coordinates, policy.control_coordinates, len(policy.gain))
+        _check_fits("start", path, scenario, spaces_of(policy), len(policy.gain))
         return found
     plan = found.plan
-    _check_fits("start", path, scenario, found.state_coordinates, found.control_coordinates, plan.steps)
+    _check_fits("start", path, scenario, spaces_of(found), plan.steps)
     return plan
 
 
@@ -90,7 +90,7 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     found = load(solution, Solution) if stored else solution
     check_kind("solution", found, Solution, "a Solution, or the path of one")
     law, plan, problem = found.policy, found.trajectory, scenario.problem
-    _check_fits("solution", what, scenario, law.state_coordinates, law.control_coordinates, plan.steps)
+    _check_fits("solution", what, scenario, spaces_of(law), plan.steps)
     if plan.dt != problem.dt and problem.duration is None:
         raise InputError(f"solution: got {what} with a control period of {plan.dt:g} s, want {problem.dt:g} s")
     names = law.state_coordinates.names
@@ -121,18 +121,10 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
     return lines
 
 
-def _check_fits(
-    field: str, what: object, scenario: Scenario, states: Coordinates, controls: Coordinates, steps: int
-) -> None:
+def _check_fits(field: str, what: object, scenario: Scenario, spaces: Spaces, steps: int) -> None:
     """Raise InputError unless states, controls and number of steps are those of the scenario's problem."""
     problem = scenario.problem
-    wanted = problem.dynamics.state_coordinates, problem.dynamics.control_coordinates
-    for kind, got, want in zip(("states", "controls"), (states, controls), wanted, strict=True):
-        if got.names != want.names:
-            raise InputError(
-                f"{field}: got {what} with the {kind} {', '.join(got.names)}, want {', '.join(want.names)}, as"
-                f" {scenario.name} has them"
-            )
+    check_same_system(field, what, spaces, spaces_of(problem.dynamics), scenario.name)
     if steps != problem.steps:
         raise InputError(f"{field}: got {what} of {steps} steps, want {problem.steps}, as {scenario.name} has them")
 

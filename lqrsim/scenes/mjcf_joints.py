@@ -346,10 +346,15 @@ def reach_of(model: mujoco.MjModel, body: int) -> float:
     collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
     reach = 0.0
     for geom in np.flatnonzero(collides) if collides.any() else range(model.ngeom):
-        path = [int(model.geom_bodyid[geom])]
-        while path[-1] not in (0, body):
-            path.append(int(model.body_parentid[path[-1]]))
-        if path[-1] == body:
-            offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path[:-1])]
+        if (path := path_to(model, geom, body)) is not None:
+            offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path)]
             reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(one) for one in offsets)))
     return reach
+
+
+def path_to(model: mujoco.MjModel, geom: int, body: int) -> list[int] | None:
+    """The bodies from a geom's own up to `body`, without it; None if that one does not carry the geom."""
+    path = [int(model.geom_bodyid[geom])]
+    while path[-1] not in (0, body):
+        path.append(int(model.body_parentid[path[-1]]))
+    return path[:-1] if path[-1] == body else None

@@ -15,20 +15,29 @@ _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is le
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
     """The candidates (ids of geoms fixed to the world) that are obstacles to the robot.
 
-    They can touch it, are not its own base, and not the floor that it stands on.
+    They are those of `touchable`, except its own base, and a floor that it touches at rest.
 
     Args:
-      body: the robot's first that moves. floors: whether level planes and height fields are for standing on, if a free
-        joint, or a slide that is not level, lets the robot sink to them, or it touches them at rest.
+      body: the robot's first that moves. floors: whether level planes and height fields may be for standing on.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)  # at rest
-    base, touched = _base(model), set(touching_pairs(model, candidates)[:, 1].tolist())
+    data, base, bodies = _at_rest(model), _base(model), model.geom_bodyid.tolist()
     ground = _ground(model, data) if floors else set[int]()
-    if not sinks(model, data, body):
-        ground = {geom for geom in ground if _touches(model, data, geom)}
-    bodies = model.geom_bodyid.tolist()
-    return [geom for geom in candidates if geom in touched and geom not in ground and bodies[geom] not in base]
+    return [
+        geom
+        for geom in touchable(model, candidates, body, floors=floors)
+        if bodies[geom] not in base and not (geom in ground and _touches(model, data, geom))
+    ]
+
+
+def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
+    """The candidates that MuJoCo lets the robot touch, except a floor that it can sink to.
+
+    Args:
+      body, floors: as of `in_the_way`. A free joint, or a slide that is not level, lets it sink.
+    """
+    data, touched = _at_rest(model), set(touching_pairs(model, candidates)[:, 1].tolist())
+    ground = _ground(model, data) if floors and _sinks(model, data, body) else set[int]()
+    return [geom for geom in candidates if geom in touched and geom not in ground]
 
 
 def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
@@ -127,13 +136,19 @@ def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
     return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
 
 
+def _at_rest(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
 def _touches(model: mujoco.MjModel, data: mujoco.MjData, ground: int) -> bool:
     """Whether something that moves touches a geom, or is in it."""
     pairs = touching_pairs(model, [ground])[:, 0].tolist()
     return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
 
 
-def sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
+def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     while body:
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])

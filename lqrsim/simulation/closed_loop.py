@@ -1,7 +1,8 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py` applies
-the disturbances, `physics.py` is MuJoCo's part, `collisions.py` detects collisions, and `recorder.py` records.
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `run_settings.py`
+checks the arguments, `effects.py` applies the disturbances, `mujoco_physics.py` advances MuJoCo, `collisions.py`
+detects collisions, and `recorder.py` records.
 """
 
 import copy
@@ -12,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.control.controllers import ControllerLike, ControllerRun
-from lqrsim.errors import Array, InputError, check_kind, excerpt, format_error
+from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
-from lqrsim.simulation.disturbances import Disturbance, as_disturbances
+from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.mujoco_physics import MujocoPhysics
 from lqrsim.simulation.physics import Physics, SimulatorPhysics
@@ -87,12 +88,31 @@ def simulate(
       InputError: there is no plan, or it is not finite; plan or policy are for another robot; the control period is not
         a multiple of the physics step; a disturbance does not fit; or an option is out of range.
     """
-    given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
-    settings = RunSettings(
-        plant=plant, plan=plan, disturbances=given, controller=controller, seed=seed, trials=trials,
-        first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
-        contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
-    )  # fmt: skip
+    return _run(RunSettings(**locals()))  # all arguments, by name
+
+
+def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
+    """Run the rest of a plan after `knot` periods, one trial from each of the states (K, n).
+
+    Until the knot, states and measurements are taken to be those of the plan: disturbances and controller are called
+    with them, period by period, so that a delay has its past, a filter its estimate, and what happens at a given time
+    happens at that time. The physics begins at the knot.
+
+    Args:
+      plant, plan: as in `simulate`.
+      states: (K, n), where the trials begin.
+      knot: number of the knot.
+      options: other options of `simulate`, except `trials`. Disturbances that change the start, such as
+        `InitialStateError`, are refused. Times of the rollout count from the knot.
+
+    Raises:
+      InputError: as `simulate`; a disturbance changes the start; or the knot is not before the plan's end.
+    """
+    states = check_array("states", states, (None, None))
+    return _run(RunSettings(plant=plant, plan=plan, starts=states, knot=knot, trials=len(states), **options))
+
+
+def _run(settings: RunSettings) -> Rollout:
     loop = ClosedLoop(settings)
     with unlogged():
         loop.run()
@@ -102,7 +122,8 @@ def simulate(
 class ClosedLoop:
     """The closed loop of K trials, with a method for each phase of a control period.
 
-    All trials are advanced together. `run` runs the whole loop; `begin` and `period` run it step by step.
+    All trials are advanced together. `run` runs the whole loop; `begin` and `period` run it step by step. Steps count
+    from the knot at which the run begins; disturbances and controller are given those of the whole plan.
 
     Attributes:
       step: number of the next control period. measured: (K, n), the measured states at its beginning.
@@ -112,9 +133,10 @@ class ClosedLoop:
     def __init__(self, settings: RunSettings) -> None:
         self.settings = settings
         plant, plan, trials = settings.plant, settings.trajectory, settings.trials
-        self.effects = Effects(plant, plan, settings.disturbances, settings.numbers, settings.random_streams)
+        self.effects = Effects(plant, settings.whole, settings.acting, settings.numbers, settings.random_streams)
         self.physics = self._physics()
-        self.physics.place(self.effects.initial_states(np.tile(plan.states[0], (trials, 1))))
+        first = self.effects.initial_states(np.tile(settings.whole.states[0], (trials, 1)), settings.starts)
+        self.physics.place(first)
         self.effects.alter_models(self.physics)
         with unlogged():
             self.physics.prepare(altered=self.effects.alters_models)
@@ -126,7 +148,7 @@ class ClosedLoop:
         self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
-        self.step, self.measured = 0, self.states
+        self.step, self.measured, self._knot = 0, self.states, settings.knot
 
     def _physics(self) -> Physics:
         plant, trials, substeps = self.settings.plant, self.settings.trials, self.settings.substeps
@@ -145,7 +167,12 @@ class ClosedLoop:
         self.detect_contacts_at_end()
 
     def begin(self) -> None:
-        """Measure the states at the first knot."""
+        """Measure the states at the first knot, after what came before."""
+        whole, trials = self.settings.whole, self.settings.trials
+        for step in range(self.settings.knot):
+            states, controls = (np.tile(one[step], (trials, 1)) for one in (whole.states, whole.controls))
+            self.effects.follow(step, states, controls)
+            self.controller_run.control(step, states)
         self.step, self.measured = 0, self.measure(0)
 
     def period(self) -> bool:
@@ -162,7 +189,7 @@ class ClosedLoop:
 
     def measure(self, step: int) -> Array:
         """Measure the states, (K, n)."""
-        measured = self.effects.measure(step, self.states)
+        measured = self.effects.measure(self._knot + step, self.states)
         self.records.knot(step, self.states, measured, self.collisions.clearance)
         self.records.lose(step, self.physics.unstable | _not_finite(measured))
         over = self.records.over(step)
@@ -174,7 +201,7 @@ class ClosedLoop:
         """The controller's commands (K, m); if it fails, the plan's controls."""
         shape = self.settings.trials, len(self._names)
         try:
-            commands = _checked_commands(self.controller_run.control(step, measured), shape)
+            commands = _checked_commands(self.controller_run.control(self._knot + step, measured), shape)
             failed = _not_finite(commands)
             reasons = [_not_a_number(row, self._names) for row in commands[failed]]
         except Exception as error:  # a controller may raise anything; its trials have failed
@@ -187,20 +214,26 @@ class ClosedLoop:
 
     def actuate(self, step: int, commands: Array) -> Array:
         """Disturb the commands and clip them to the robot's limits. Returns the applied controls (K, m)."""
-        controls = np.clip(self.effects.actuate(step, commands), self._low, self._high)
+        controls = np.clip(self.effects.actuate(self._knot + step, commands), self._low, self._high)
         self.records.applied[:, step] = controls
         return controls
 
     def push(self, step: int) -> tuple[Array, Array]:
         """The disturbing forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3)."""
-        wrench, wind = self.effects.push(step, self.states)
+        wrench, wind = self.effects.push(self._knot + step, self.states)
         self.records.wrench[:, step] = wrench
         return wrench, wind
 
     def advance(self, step: int, controls: Array, wrench: Array, wind: Array) -> None:
-        """Advance the physics to the next knot. Obstacles stop a trial from the period of its first collision on."""
+        """Advance the physics to the next knot. Obstacles stop a trial from the period of its first collision on.
+
+        Controls, forces and wind are held over the period; a kick is of the states at its beginning, and acts at its
+        end. MuJoCo computes contacts at the beginning of a physics step, so those at the end of a period, after a kick,
+        too, are detected in the next one; at the last knot by `detect_contacts_at_end`.
+        """
         physics, over = self.physics, self.records.over(step)
-        period, kick = physics.advance(controls, wrench, wind), self.effects.kick(step, self.states, controls)
+        period = physics.advance(controls, wrench, wind)
+        kick = self.effects.kick(self._knot + step, self.states, controls)
         if kick is not None:
             physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
@@ -246,6 +279,7 @@ class ClosedLoop:
         """A Rollout of all records."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
+        begun = () if settings.starts is None else ("given first states",)
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -277,7 +311,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=tuple(disturbance.describe(plant) for disturbance in settings.disturbances),
+            disturbances=(*(one.describe(plant) for one in settings.acting), *begun),
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},

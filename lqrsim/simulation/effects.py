@@ -1,17 +1,31 @@
 """The effects of a run's disturbances, applied one after the other, with checks of the values they return."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
 
 MakeGenerator = Callable[[int, int], np.random.Generator]
+
+
+class _ForceHook(NamedTuple):
+    """A hook for a force, a torque or a wind.
+
+    Attributes:
+      label: for messages. part: which of force, torque and wind, (9,) together, it adds to. factor: times this.
+    """
+
+    label: str
+    hook: Hook
+    part: slice
+    factor: float
 
 
 class Effects:
@@ -49,13 +63,13 @@ class Effects:
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._kicks = self._hooks("kick")
-        # To which of force, torque and wind each adds, and times what. Without a wind of a simulator it is a force.
+        # Without a wind of a simulator it is a force.
         blown = plant.simulator is not None and plant.simulator.wind
         wind = (slice(6, 9), 1.0) if blown else (slice(0, 3), plant.robot.drag)
-        self._pushes = [(slice(3, 6), 1.0, *hook) for hook in self._hooks("torque")]
+        self._pushes = [_ForceHook(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
         for one in self._effects:
-            self._pushes += [(slice(0, 3), 1.0, *hook) for hook in self._hooks("force", [one])]
-            self._pushes += [(*wind, *hook) for hook in self._hooks("wind", [one])]
+            self._pushes += [_ForceHook(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [one])]
+            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [one])]
 
     def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
         """The hooks of one kind, of all effects or these, each with its label for messages."""
@@ -67,12 +81,23 @@ class Effects:
         """Whether a trial has a model of its own."""
         return bool(self.displaced.any()) or any(effect.alter or effect.factors for _, effect in self._effects)
 
-    def initial_states(self, states: Array) -> Array:
-        """The first states of the trials (K, n), from those of the plan. Raises InputError unless they are finite."""
-        shape = states.shape
+    def initial_states(self, planned: Array, given: Array | None = None) -> Array:
+        """The first states of the trials (K, n), from the plan's; or the given ones, which no disturbance may change.
+
+        Raises:
+          InputError: one does, or they are not finite.
+        """
+        states = planned
         for name, effect in self._effects:
-            if effect.initial_states is not None:
-                states = shaped(f"{name}: initial_states: returned", effect.initial_states(states), shape)
+            if effect.initial_states is None:
+                continue
+            states = shaped(f"{name}: initial_states: returned", effect.initial_states(states.copy()), planned.shape)
+            if given is not None and not np.array_equal(states, planned):
+                raise InputError(
+                    f"disturbances: got {name}, which changes the start of a run, want others: the runs begin in given"
+                    " states"
+                )
+        states = states if given is None else given
         if not np.isfinite(states).all():
             raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
@@ -88,6 +113,17 @@ class Effects:
                 physics.alter(name, effect.alter)
         if self.displaced.any():
             physics.displace(self.displaced)
+
+    def follow(self, step: int, states: Array, controls: Array) -> None:
+        """Call all with the states (K, n) and controls (K, m) of a plan, for those that remember."""
+        for _, measure in self._measures:
+            measure(step, states.copy())
+        for _, actuate in self._actuations:
+            actuate(step, controls.copy())
+        for one in self._pushes:
+            one.hook(step, states)
+        for _, kick in self._kicks:
+            kick(step, states, controls)
 
     def measure(self, step: int, states: Array) -> Array:
         """The measured states (K, n), from the true ones."""
@@ -108,8 +144,8 @@ class Effects:
         All are along the world's axes.
         """
         pushed = np.zeros((len(states), 9))
-        for which, factor, name, push in self._pushes:
-            pushed[:, which] += factor * shaped(name, push(step, states), (len(states), 3))
+        for one in self._pushes:
+            pushed[:, one.part] += one.factor * shaped(one.label, one.hook(step, states), (len(states), 3))
         return pushed[:, :6], pushed[:, 6:]
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:

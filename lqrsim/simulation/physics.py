@@ -22,7 +22,8 @@ class Period:
     Attributes:
       states: S arrays (K, n), at the end of each part; angles in any representative.
       frames: S arrays (K, nq), MuJoCo's qpos at these times.
-      touching: S arrays (K, obstacles), whether MuJoCo detected a contact; empty arrays if contacts are not sensed.
+      touching: S arrays (K, obstacles), whether MuJoCo detected a contact at the beginning of the last physics step of
+        the part; empty arrays if contacts are not sensed.
       stable: (K,) number of parts, from the first on, in which the simulation was stable.
     """
 

@@ -19,7 +19,7 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_joints
-from lqrsim.scenes.mjcf_obstacles import sinks
+from lqrsim.scenes.mjcf_obstacles import touchable
 from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
@@ -41,8 +41,8 @@ class Plant:
       shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
       world: the obstacles for it; none for a robot that has neither geoms nor balls nor a position.
       obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
-        balls in space, all that the MJCF lets it touch, except level planes on which a free joint, or a slide that is
-        not level, lets it stand.
+        balls in space, all that the MJCF lets it touch, except what a free joint, or a slide that is not level, lets it
+        stand on: level planes that face up, and height fields.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body.
       qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
@@ -69,12 +69,13 @@ class Plant:
                 f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles"
             )
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
-        if self.shape.centers is not None and not self.shape.in_plane:
-            near = _in_the_way(robot, scene)
-            self.shape = replace(self.shape, world=World([one for one in scene.world.obstacles if one.name in near]))
-        self.world = self.shape.world
+        in_space = self.shape.centers is not None and not self.shape.in_plane
         bounded = "radius" not in robot.shape or robot.dynamics.state_coordinates.position
-        self.obstacles = self.world.names if bounded else _in_the_way(robot, scene)
+        near = _near(robot, scene) if in_space or not bounded else scene.world
+        if in_space:
+            self.shape = replace(self.shape, world=near)
+        self.world = self.shape.world
+        self.obstacles = self.world.names if bounded else near.names
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
@@ -334,16 +335,14 @@ def extent(plant: Plant) -> float:
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True
     reach = 0.0
     for geom in np.flatnonzero(collides):
-        path = [int(model.geom_bodyid[geom])]
-        while path[-1] not in (0, plant.body):
-            path.append(int(model.body_parentid[path[-1]]))
-        if path[-1] != plant.body:
+        path = mjcf_joints.path_to(model, geom, plant.body)
+        if path is None:
             continue
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
             size = float(model.geom_size[geom, 0])  # upright: its outline from above
         own, jointed = np.linalg.norm(model.geom_pos[geom]), False
-        for body in path[:-1]:
+        for body in path:
             first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
             jointed |= count > 0
             own += np.linalg.norm(model.body_pos[body])
@@ -356,26 +355,10 @@ def extent(plant: Plant) -> float:
     return off + reach + float(thickest)
 
 
-def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
-    """Names of the obstacles of a robot without a position: all that it can touch, except its floor.
-
-    Level planes are its floor if a joint lets it sink to them.
-    """
-    model, data = scene.model, mujoco.MjData(scene.model)
-    mujoco.mj_kinematics(model, data)
-    floored = sinks(model, data, int(model.body(robot.body).id))
-    level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in scene.world.obstacles]
-    touched = [_can_be_touched(model, geom) for geom in scene.geoms]
-    found = zip(scene.world.names, level, touched, strict=True)
-    return tuple(name for name, lies, near in found if near and not (floored and lies))
-
-
-def _can_be_touched(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether MuJoCo lets a moving geom collide with this one, by their contact bits or as a pair."""
-    moves = model.body_weldid[model.geom_bodyid] != 0
-    bits = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_conaffinity & model.geom_contype[geom])
-    pairs = np.concatenate([model.pair_geom2[model.pair_geom1 == geom], model.pair_geom1[model.pair_geom2 == geom]])
-    return bool((moves & (bits != 0)).any() or moves[pairs].any())
+def _near(robot: Robot, scene: Scene) -> World:
+    """The obstacles that MuJoCo lets a robot touch, except what it stands on."""
+    ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id), floors=True))
+    return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

@@ -12,6 +12,7 @@ from scipy import special
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed, excerpt
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
@@ -192,10 +193,7 @@ class _Sample(NamedTuple):
 def _checked(problem: Problem, robot: Robot) -> Problem:
     """The problem. Raises InputError unless it is one of the robot's states and controls."""
     check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
-    for what in ("state_coordinates", "control_coordinates"):
-        found, own = getattr(problem.dynamics, what).names, getattr(robot.dynamics, what).names
-        if found != own:
-            raise InputError(f"problem: got one of {excerpt(found)}, want one of the robot's {excerpt(own)}")
+    check_same_system("problem", "one", spaces_of(problem.dynamics), spaces_of(robot.dynamics), "the robot")
     return problem
 
 

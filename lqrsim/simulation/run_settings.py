@@ -10,6 +10,7 @@ from lqrsim.control.controllers import Controller, ControllerLike, as_controller
 from lqrsim.errors import (
     Array,
     InputError,
+    check_array,
     check_count,
     check_flag,
     check_function,
@@ -19,11 +20,12 @@ from lqrsim.errors import (
     check_seed,
     check_text,
 )
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.problem.noise import Noise
+from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import MakeGenerator, seeded
 from lqrsim.simulation.physics import part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
@@ -35,11 +37,15 @@ Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]
 
 @dataclass(kw_only=True)
 class RunSettings:
-    """The arguments of `simulate`, and what follows from them.
+    """The arguments of `simulate`, with the same names, meanings and defaults, and what follows from them.
 
     Attributes:
+      starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
+        which they begin. Both are for `simulate_from`.
+      acting: the disturbances, each `Noise` as a StateNoise.
       law: the controller; by default the plan's policy.
-      followed: the plan of the run: the given one, or else the controller's own.
+      whole: the plan's trajectory from its own first knot on.
+      followed: the plan of the run: the given one, or else the controller's own; from the knot on.
       states, controls: coordinates of the controller, with limits that are within the robot's.
       radius: distance from the goal within which it counts as reached, in `Target.unit`.
       substeps: physics steps per control period.
@@ -49,21 +55,25 @@ class RunSettings:
     """
 
     plant: Plant
-    plan: Plan | None
-    disturbances: Sequence[Disturbance]
-    controller: ControllerLike | None
-    seed: int
-    trials: int
-    first_trial: int
-    goal_radius: float | None
-    goal_tolerance: float | None
-    frames: bool
-    contacts: bool
-    threads: int | None
-    generators: MakeGenerator | None
-    progress: Progress | None
-    watch: Watch | None
+    plan: Plan | None = None
+    controller: ControllerLike | None = None
+    disturbances: Sequence[Disturbance | Noise] = ()
+    seed: int = 0
+    trials: int = 1
+    first_trial: int = 0
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
+    frames: bool = True
+    contacts: bool = True
+    threads: int | None = None
+    generators: MakeGenerator | None = None
+    progress: Progress | None = None
+    watch: Watch | None = None
+    starts: Array | None = None
+    knot: int = 0
+    acting: tuple[Disturbance, ...] = field(init=False)
     law: Controller = field(init=False)
+    whole: Trajectory = field(init=False)
     followed: Plan = field(init=False)
     states: Coordinates = field(init=False)
     controls: Coordinates = field(init=False)
@@ -72,6 +82,7 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         check_kind("plant", self.plant, Plant, "a Plant, such as scenario.plant()")
+        self.acting = as_disturbances(self.disturbances, "disturbances, such as ControlNoise(0.05)")
         self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
         self.trials, self.threads = check_count("trials", self.trials), check_threads(self.threads)
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
@@ -81,9 +92,15 @@ class RunSettings:
         check_function("progress", self.progress, wanted, arguments=2)
         wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
         check_function("watch", self.watch, wanted, arguments=3)
-        self.law, self.followed = as_controller(self.controller, self.plan, self.plant.robot.dynamics)
+        self.law, plan = as_controller(self.controller, self.plan, self.plant.robot.dynamics)
         self.states, self.controls = _check_coordinates(self.law, self.plant)
-        _check_plan(self.followed, self.plant)
+        _check_plan(plan, self.plant)
+        self.whole = plan.trajectory
+        if check_count("knot", self.knot, at_least=0) >= self.whole.steps:
+            raise InputError(f"knot: got {self.knot}, want one from 0 to {self.whole.steps - 1}, before the plan's end")
+        self.followed = plan.shifted(self.knot, horizon="shrinking") if self.knot else plan
+        if self.starts is not None:
+            self.starts = check_array("states", self.starts, (self.trials, self.whole.states.shape[1]))
         target = Target(self.states, self.followed.goal, self.trajectory.states)
         self.radius = target.radius(self.plant.robot.radius, self.goal_radius, self.goal_tolerance)
         self.substeps = self.plant.substeps(self.trajectory.dt)
@@ -91,7 +108,7 @@ class RunSettings:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The plan's trajectory."""
+        """The trajectory of the plan, from the knot on."""
         return self.followed.trajectory
 
     @property
@@ -108,19 +125,13 @@ class RunSettings:
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
     """The coordinates of the controller's states and controls. Raises InputError unless they are the plant's."""
     dynamics = plant.robot.dynamics
-    wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     kind = type(controller).__name__
     check_text(f"{kind}.digest", controller.digest, "a hash as text")
     wanted_kind = "Coordinates of states and of controls"
     spaces = check_items(f"{kind}.coordinates", controller.coordinates, Coordinates, wanted_kind)
     if len(spaces) != 2:
         raise InputError(f"{kind}.coordinates: got {len(spaces)}, want two: of the states, of the controls")
-    for what, space, want in zip(("states", "controls"), spaces, wanted, strict=True):
-        if space.names != want:
-            raise InputError(
-                f"controller: got a policy with {what} {', '.join(space.names)}, want those of robot"
-                f" {plant.robot.name}: {', '.join(want)}"
-            )
+    check_same_system("controller", "one", (spaces[0], spaces[1]), spaces_of(dynamics), f"robot {plant.robot.name}")
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
         raise InputError(

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.versions import outdated
 
 TWIST = 1e-6  # m, by which rotors may be off the corners of a square
 
@@ -79,8 +80,10 @@ def check_quadrotor(name: str, robot: Robot) -> None:
 
 
 def package(module: str, extra: str) -> Any:
-    """A module of a package that an extra installs. Raises InputError with that extra if it is not there."""
+    """A module of a package that an extra installs. Raises InputError if it is not there, or a part is too old."""
     name = module.partition(".")[0]
+    if line := outdated(extra):
+        raise InputError(f"{extra}: {line}")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx says there what it can do without
             return importlib.import_module(module)

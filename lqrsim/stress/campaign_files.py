@@ -7,9 +7,7 @@ not at all. Its metadata names the campaign, the cell and the trials, and has a 
 refused. `digest` covers everything that the rows depend on. Each shard has it, too, so that a manifest with new
 settings and a renewed hash does not fit the shards.
 
-The system releases the lock when the process dies, however it dies. The package filelock 4.2 passes the same tests with
-the same system calls, but it would replace only two functions. On a file system without locks its `FileLock` falls back
-to a file whose existence is the lock, which a killed process leaves behind; here such file systems are refused.
+The system releases the lock when the process dies, however it dies. File systems without locks are refused.
 """
 
 import contextlib

@@ -28,7 +28,6 @@ from lqrsim.errors import (
     check_count,
     check_function,
     check_memory,
-    check_number,
     check_seed,
 )
 from lqrsim.process import keeping
@@ -39,6 +38,8 @@ from lqrsim.stress.trial_score import normal_tail
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from 0 to 98 %
 DISCOUNT = 0.95  # factor of the gradient of earlier rounds, after each round that comes nearer by more than MOVED
 MOVED = 0.01  # share of the distance
+SPREAD = 0.5  # the length s of the steps of the pairs; each number of e is standard normal, over the root of the size
+TOLERANCE = 0.01  # share of the distance that may be left to gain
 GRID, REFINED = 16, 3  # points on a ray, and how often the grid is refined
 
 
@@ -72,8 +73,6 @@ def smallest_failure(
     failures: Array | None = None,
     rounds: int = 40,
     pairs: int | None = None,
-    spread: float = 0.5,
-    tolerance: float = 0.01,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DesignPoint:
@@ -83,13 +82,10 @@ def smallest_failure(
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
       failures: (k, size) to begin with; by default those of a small splitting.
-      rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than `tolerance` of
-        the distance, and five rounds together gain less than a tenth of that.
+      rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than 1 % of the
+        distance, and five rounds together gain less than a tenth of that.
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer the gradient is
         mostly noise.
-      spread: the length s of the steps of the pairs; each number of e is standard normal, divided by the root of
-        `size`.
-      tolerance: share of the distance that may be left to gain.
       seed: seed of all random numbers.
       progress: called with the number of finished rounds, that of all, and the distance so far as text.
 
@@ -105,8 +101,6 @@ def smallest_failure(
     pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs, at_least=2)
     check_memory("pairs", pairs, 8 * 5 * size, "whose vectors")
     check_memory("size", size, 8 * 16 * 12, "whose vectors")  # along the rays
-    spread = check_number("spread", spread, above=0.0, at_most=1e6)
-    tolerance = check_number("tolerance", tolerance, above=0.0)
     rng, counted = np.random.default_rng(check_seed("seed", seed)), CountedScore(score)
     if failures is None:
         failures = failure_probability(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures
@@ -129,15 +123,15 @@ def smallest_failure(
         for number in range(rounds):
             # The oldest rounds were around another point.
             discount = DISCOUNT if history[-1] < (1 - MOVED) * history[-2:][0] else 1.0
-            halves = discount * halves + _gradients(counted, best, pairs, spread, rng)
+            halves = discount * halves + _gradients(counted, best, pairs, rng)
             remaining = _remaining(halves)
             nearer = _nearer(counted, best, halves.sum(axis=0))
             best = best if nearer is None else nearer
             history.append(float(np.linalg.norm(best)))
             if progress is not None:
                 progress(number + 1, rounds, f"distance {history[-1]:.3g}")
-            settled = number >= 5 and history[-1] > (1 - tolerance / 10) * history[-6]
-            converged = settled and remaining < tolerance
+            settled = number >= 5 and history[-1] > (1 - TOLERANCE / 10) * history[-6]
+            converged = settled and remaining < TOLERANCE
             if converged:
                 break
     return so_far()
@@ -189,9 +183,9 @@ def _ray_search(score: Score, directions: Array, lengths: Array) -> Array | None
     return failing[row] * directions[row]
 
 
-def _gradients(score: Score, best: Array, pairs: int, spread: float, rng: np.random.Generator) -> Array:
+def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) -> Array:
     """Estimate the gradient of the score at the best failure from each half of the pairs, (2, d)."""
-    steps = spread * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
+    steps = SPREAD * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
     scores = score(np.concatenate([best + steps, best - steps]))
     # Trials that diverge have an infinite score: count it as a little worse than the worst finite one.
     highest = scores[np.isfinite(scores)].max(initial=0.0)
@@ -199,7 +193,7 @@ def _gradients(score: Score, best: Array, pairs: int, spread: float, rng: np.ran
     difference = scores[:pairs] - scores[pairs:]
     half = pairs // 2
     parts = [difference[:half] @ steps[:half], difference[half:] @ steps[half:]]
-    return np.array(parts) / (pairs * spread**2) * len(best)
+    return np.array(parts) / (pairs * SPREAD**2) * len(best)
 
 
 def _remaining(halves: Array) -> float:

@@ -1,21 +1,10 @@
 """Worker processes for a campaign, on this machine or a dask cluster. They may die or hang; the campaign continues.
 
-Weighed against libraries, for this machine:
-
-- `ProcessPoolExecutor`: when one process is killed, all unfinished tasks are lost, without a hint which one was at
-  fault. A task that hangs cannot be stopped before Python 3.14.
-- pebble 5.2 has time limits and names the task of a killed worker. But its workers share one pipe and its lock: a
-  worker that is killed while it sends a result keeps the lock, and after two minutes all other tasks are lost, too.
-  A worker that dies before it has read its arguments leaves the pool waiting forever if they are larger than a pipe.
-- A `LocalCluster` of dask repeats the work of dead workers, but it has no time limits either, does not say by which
-  signal a worker ended, takes seconds to start, and is an extra to install.
-
-Here each worker has a pipe of its own.
-
-On a cluster dask starts workers, distributes tasks, and repeats those of dead workers, up to its `allowed-failures`.
-Tables come back as bytes, so no folder needs to be shared. Added here are: a time limit that counts from the moment
-when a worker begins a task; restarting a worker that hangs, since `cancel()` does not stop a running task; one task at
-a time per worker; and at most two queued tasks per worker, so that the scheduler never holds a whole campaign.
+On this machine each worker has a pipe of its own. On a cluster dask starts workers, distributes tasks, and repeats
+those of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no folder needs to be shared. Added
+here are: a time limit that counts from the moment when a worker begins a task; restarting a worker that hangs, since
+`cancel()` does not stop a running task; one task at a time per worker; and at most two queued tasks per worker, so that
+the scheduler never holds a whole campaign. CONTRIBUTING.md says why no library does it all.
 """
 
 import asyncio

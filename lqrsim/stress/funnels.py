@@ -30,10 +30,10 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel, flat, inverse_of
 from lqrsim.results.goal import Target, endings
 from lqrsim.results.solution import Solution
+from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.disturbances import Disturbance, InitialStateError, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.start_at import simulate_from
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, LevelTest, find_level, smallest_test
 from lqrsim.stress.multilevel_splitting import Progress

@@ -76,7 +76,6 @@ def failure_probability(
     moves: int = 5,
     repetitions: int = 10,
     seed: int = 0,
-    confidence: float = CONFIDENCE,
     most_levels: int = 40,
     level: Callable[[float], object] | None = None,
     progress: Progress | None = None,
@@ -91,7 +90,6 @@ def failure_probability(
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       seed: seed of all random numbers.
-      confidence: confidence of the interval.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds.
       progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
@@ -110,7 +108,6 @@ def failure_probability(
     repetitions = check_count("repetitions", repetitions, at_least=2, at_most=MOST)
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
     most_levels = check_count("most_levels", most_levels, at_most=MOST)
-    confidence = check_number("confidence", confidence, above=0.0, below=1.0)
     check_function("level", level, "a function of a level", arguments=1)
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     counted = CountedScore(score)
@@ -127,7 +124,7 @@ def failure_probability(
         estimates = shares.prod(axis=1)
         error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
         failures, scores = (np.concatenate([one[i] for one in done]) for i in (1, 2))
-        interval = _estimate(shares, particles, confidence)
+        interval = _estimate(shares, particles)
         return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
 
     with keeping(lambda _: so_far()):
@@ -144,11 +141,11 @@ def failure_probability(
     return found
 
 
-def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
+def _estimate(shares: Array, particles: int) -> Estimate:
     """The mean of the estimates with its interval, from the shares (R, levels) above each level."""
     count, levels = shares.shape
     if levels == 1:
-        return rate(round(float(shares.sum()) * particles), count * particles, confidence=confidence)
+        return rate(round(float(shares.sum()) * particles), count * particles)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
     # Repetitions may agree by chance. Their spread is at least that of independent particles at each level.
@@ -156,9 +153,9 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
     typical = shares.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical) / particles)
     deviation = max(estimates.std(ddof=1) / mean, least)
-    half_width = float(stats.t.ppf(0.5 + confidence / 2, count - 1) * deviation / np.sqrt(count))
+    half_width = float(stats.t.ppf(0.5 + CONFIDENCE / 2, count - 1) * deviation / np.sqrt(count))
     high = mean / (1 - half_width) if half_width < 1 - mean else 1.0
-    return Estimate(mean, mean / (1 + half_width), high, confidence)
+    return Estimate(mean, mean / (1 + half_width), high, CONFIDENCE)
 
 
 class CountedScore:

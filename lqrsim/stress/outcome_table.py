@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, keep, numbers_of, shaped
 from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES as OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.solvers import compiled
@@ -93,10 +94,8 @@ def outcomes(
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
-    if problem is not None and problem.dynamics.state_coordinates.names != rollout.state_coordinates.names:
-        raise InputError(
-            f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}"
-        )
+    if problem is not None:
+        check_same_system("problem", "one", spaces_of(problem.dynamics), spaces_of(rollout), "the rollout")
     if goal_radius is not None or goal_tolerance is not None:
         rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))
     plan, ended, counts = rollout.plan, rollout.ended, rollout.counts

@@ -22,7 +22,7 @@ from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
-from lqrsim.stress.statistics import CONFIDENCE, rate
+from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.trials import Trials
 
 MOST_REASONS = 5  # that a summary lists
@@ -154,7 +154,7 @@ class Results:
         for cell, ends, found in self.cell_successes():
             share, interval = "-", "-"
             if found is not None:
-                sure = rate(found.reached, found.trials)
+                sure = found.exact
                 share, interval = f"{100 * sure.value:.1f}", f"{100 * sure.low:.1f} to {100 * sure.high:.1f}"
                 interval = "deterministic: 1 run" if found.alike else interval
             counts = [str(ends[name]) for name in others]

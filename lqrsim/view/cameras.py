@@ -5,20 +5,22 @@ metre has the same number of pixels everywhere. The centre of a ball's pixels is
 any distance and anywhere in the picture, and the place of a camera along its line of sight does not matter.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_name
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.options import CALIBRATED, VIEWS
 from lqrsim.view.recorded_trial import RecordedTrial
 
-Vector = tuple[float, float, float]
+_Number = Annotated[float, Bounds()]
+Vector = tuple[_Number, _Number, _Number]
 
 NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so that a wide range is no loss
 
@@ -31,13 +33,22 @@ class Camera:
       position: in metres; the line from here along `forward` meets the middle of the picture.
       forward, up: orthogonal unit vectors.
       height: height of the picture, in metres of the world.
+
+    Raises:
+      InputError: a number is not finite, the vectors are no orthogonal unit vectors, or the height is not positive.
     """
 
-    name: str
+    name: Line
     position: Vector
     forward: Vector
     up: Vector
-    height: float
+    height: Annotated[float, Bounds(above=0.0)]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        directions = np.array([self.forward, self.up])
+        if not np.allclose(directions @ directions.T, np.eye(2), rtol=0, atol=1e-6):
+            raise InputError(f"camera: got forward and up {directions.tolist()}, want orthogonal unit vectors")
 
     @property
     def axes(self) -> Array:
@@ -62,24 +73,6 @@ class Camera:
         """Coordinates (..., 2) along `axes`, in metres from the world's origin, of pixels (..., 2)."""
         off = (np.asarray(pixels, dtype=np.float64) - 0.5 * np.array(size)) * [1, -1]
         return self.axes @ self.position + off * (self.height / size[1])
-
-    def as_json(self) -> dict[str, Any]:
-        """The camera as JSON, for `from_json`."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, parts: Mapping[str, Any]) -> "Camera":
-        """The camera of `as_json`. Raises InputError for anything else."""
-        try:
-            name, height = str(parts["name"]), parts["height"]
-            vectors = {key: check_array(f"camera.{key}", parts[key], (3,)) for key in ("position", "forward", "up")}
-        except (KeyError, TypeError) as error:
-            raise InputError(f"camera: got {excerpt(parts)}, want the parts of a camera ({error})") from None
-        directions = np.array([vectors["forward"], vectors["up"]])
-        if not np.allclose(directions @ directions.T, np.eye(2), rtol=0, atol=1e-6):
-            raise InputError(f"camera: got forward and up {directions.tolist()}, want orthogonal unit vectors")
-        position, forward, up = (tuple(vector.tolist()) for vector in vectors.values())
-        return cls(name, position, forward, up, check_number("camera.height", height, above=0))
 
 
 def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:

@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
@@ -96,13 +96,10 @@ def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, worl
     check_count("trial", trial, at_least=0)
     if not 1 <= len(rollouts) <= len(RUNS):
         raise InputError(f"rollouts: got {len(rollouts)}, want 1 to {len(RUNS)}")
-    spaces = solution.policy.state_coordinates, solution.policy.control_coordinates
     for name, run in rollouts.items():
         check_text("rollouts: label", name, "a label", at_most=100)
         check_kind(f"rollouts[{name!r}]", run, Rollout, "a Rollout, such as simulate(...) returns")
-        if (run.state_coordinates, run.control_coordinates) != spaces:
-            want = ", ".join(spaces[0].names)
-            raise InputError(f"rollouts[{name!r}]: got a run of another system, want states {want}")
+        check_same_system(f"rollouts[{name!r}]", "a run", spaces_of(run), spaces_of(solution.policy), "the solution")
         if not 0 <= trial < run.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {run.trials - 1} of rollouts[{name!r}]")
         if not run.plane:

@@ -2,24 +2,26 @@
 
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import av
 import numpy as np
 from av.error import FFmpegError
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_path, excerpt
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, excerpt
 from lqrsim.results.archive import sha256
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.save_load import record_from, tree_of
 from lqrsim.view.cameras import Camera
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
 
 FORMAT, VERSION = "lqrsim footage", 1
+Positive = Annotated[float, Bounds(above=0.0)]
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,9 @@ class Pane:
     trial: int = 0
     camera: Camera | None = None
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
 class VideoMetadata:
@@ -51,21 +56,28 @@ class VideoMetadata:
       rate: frames a second.
       speed: seconds of the run in a second of the video.
       frames: number of frames.
+
+    Raises:
+      InputError: a field is out of range, or the fields do not fit together.
     """
 
-    runs: tuple[str, ...]
-    markers: tuple[float, ...]
+    runs: tuple[Line, ...]
+    markers: tuple[Positive, ...]
     rate: Fraction
-    speed: float
+    speed: Positive
     frames: int
     panes: tuple[Pane, ...]
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_count("VideoMetadata: frames", self.frames)
+        fits = self.rate > 0 and len(self.markers) == len(self.runs)
+        if not (fits and all(pane.run < len(self.runs) for pane in self.panes)):
+            raise InputError(f"VideoMetadata: got {excerpt(vars(self))}, whose parts do not fit together")
+
     def as_json(self) -> str:
         """The metadata as JSON, for `from_json`."""
-        panes = [vars(pane) | {"camera": pane.camera and pane.camera.as_json()} for pane in self.panes]
-        parts = {"format": FORMAT, "version": VERSION, "runs": self.runs, "rate": str(self.rate), "speed": self.speed}
-        parts |= {"frames": self.frames, "markers": self.markers, "panes": panes}
-        return json.dumps(parts)
+        return json.dumps({"format": FORMAT, "version": VERSION, **tree_of(self), "rate": str(self.rate)})
 
     @classmethod
     def from_json(cls, text: str) -> "VideoMetadata":
@@ -80,21 +92,11 @@ class VideoMetadata:
             got = parts.get("version")
             raise InputError(f"video metadata: got version {got}, want version {VERSION}: render the video again")
         try:
-            metadata = cls(
-                runs=tuple(str(run) for run in parts["runs"]),
-                markers=tuple(check_number("metadata.markers", one, above=0) for one in parts["markers"]),
-                rate=Fraction(parts["rate"]),
-                speed=check_number("metadata.speed", parts["speed"], above=0),
-                frames=check_count("metadata.frames", parts["frames"]),
-                panes=tuple(_pane(one) for one in parts["panes"]),
-            )
-            good = metadata.rate > 0 and len(metadata.markers) == len(metadata.runs)
-            good = good and all(pane.run < len(metadata.runs) for pane in metadata.panes)
+            rate = Fraction(parts["rate"])
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise InputError(f"video metadata: got {excerpt(text)}, which is damaged ({error})") from None
-        if not good:
-            raise InputError(f"video metadata: got {excerpt(text)}, whose parts do not fit together")
-        return metadata
+        tree = {name: one for name, one in parts.items() if name not in ("format", "version")}
+        return record_from(cls, tree | {"rate": rate}, "metadata")
 
     def times(self) -> np.ndarray:
         """Times of the frames in seconds after the start of a run, (frames,)."""
@@ -125,10 +127,3 @@ def digest(rollout: Rollout) -> str:
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):
         parts += [f"{array.shape}", np.asarray(array, dtype=np.float64)]
     return sha256(*parts)[:16]
-
-
-def _pane(parts: Mapping[str, Any]) -> Pane:
-    places = {key: check_count(f"pane.{key}", parts[key], at_least=0) for key in ("left", "top", "run", "trial")}
-    sizes = {key: check_count(f"pane.{key}", parts[key]) for key in ("width", "height")}
-    camera = parts["camera"]
-    return Pane(**places, **sizes, camera=None if camera is None else Camera.from_json(camera))

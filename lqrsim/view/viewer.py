@@ -20,7 +20,7 @@ from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
@@ -118,8 +118,7 @@ class ViewedReplanner(Controller):
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        policy = self.live.active.plan.policy
-        return policy.state_coordinates, policy.control_coordinates
+        return spaces_of(self.live.active.plan.policy)
 
 
 class _ViewedRun(ControllerRun):

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
+from lqrsim.control.plan_model import Lag
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_name, check_number, excerpt, keep
 from lqrsim.results.solution_parts import Trajectory
@@ -50,17 +51,14 @@ class MotorLag(Disturbance):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         if self.time_constant == 0:
             return Effect()
-        step_in_constants = plan.dt / self.time_constant
-        # Share of the distance to the command that is left at the end of the period, and in the mean over it.
-        left = np.exp(-step_in_constants)
-        mean = -np.expm1(-step_in_constants) / step_in_constants
+        lag = Lag.of(self.time_constant, plan.dt)
         space, reached = plant.robot.dynamics.control_coordinates, np.tile(plan.controls[0], (len(generators), 1))
 
         def actuate(step: int, controls: Array) -> Array:
             controls = space.clip(controls)
             behind = reached - controls
-            reached[:] = controls + left * behind
-            return controls + mean * behind
+            reached[:] = controls + lag.left * behind
+            return controls + lag.mean * behind
 
         return Effect(actuate=actuate)
 

@@ -234,11 +234,11 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "collision_score": ({"rollout": place.rollout},),
         "miss_score": ({"rollout": place.rollout},),
         "failure_probability": (searching | {
-            "particles": 20, "keep": 0.25, "moves": 1, "repetitions": 2, "confidence": 0.9, "most_levels": 5,
+            "particles": 20, "keep": 0.25, "moves": 1, "repetitions": 2, "most_levels": 5,
             "level": print_nothing, "progress": print_nothing,
         },),
         "smallest_failure": (searching | {
-            "failures": [[2.0, 0.0, 0.0]], "rounds": 1, "pairs": 4, "spread": 0.5, "tolerance": 1e-3,
+            "failures": [[2.0, 0.0, 0.0]], "rounds": 1, "pairs": 4,
             "progress": print_nothing,
         },),
         "ReliabilityProblem": ({

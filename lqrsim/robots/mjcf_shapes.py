@@ -1,5 +1,6 @@
-"""The colliding geoms of a robot from an MJCF, with MuJoCo's own distances."""
+"""What of a robot from an MJCF collides: its geoms, with MuJoCo's own distances, or balls along them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,13 @@ import numpy.typing as npt
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_number, vectors_of
-from lqrsim.kernels import mjcf_distances
+from lqrsim.kernels import mjcf_distances, mjcf_places
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
+from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.robots.mjcf_memory import MjcfMemory
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes import mjcf_obstacles
+from lqrsim.scenes.mjcf_outline import Outline
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import Obstacle, World
 
@@ -136,6 +138,31 @@ class MjcfGeoms(CollisionGeoms):
     def _module(self, dynamics: MjcfDynamics) -> Any:
         n = len(dynamics.state_coordinates)
         return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({n} states)", N=n)
+
+
+class MjcfBalls(CollisionSpheres):
+    """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
+
+    Args:
+      outline: bodies, places and radii. place: where they are, plainly, at a state (n,): (K, 3).
+    """
+
+    def __init__(self, outline: Outline, place: Callable[[Array], Array]) -> None:
+        self.outline, self.place, self.level = outline, place, "compiled"
+        self.function, self.jacobian, self.depends_on = place, None, None
+        self._set_balls(outline.radii, outline.names, outline.sites)
+
+    @property
+    def name(self) -> str:
+        return "MuJoCo's kinematics"
+
+    def bind(self, dynamics: Dynamics) -> SphereCenters:
+        if not isinstance(dynamics, MjcfDynamics):
+            raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+        memory = MjcfMemory.of(dynamics)
+        positions = dynamics.physics.model.nv
+        data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
+        return SphereCenters(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:
