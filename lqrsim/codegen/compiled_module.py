@@ -40,7 +40,7 @@ from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
-from lqrsim.kernels import records
+from lqrsim.kernels.model_functions import SIGNATURES
 from lqrsim.machine import instruction_set
 from lqrsim.results.archive import sha256
 
@@ -52,26 +52,6 @@ compiling = threading.RLock()
 
 # Functions that take long to compile, which is announced.
 LONG = ("smoother", "ilqr")
-
-# The arguments of the C functions of a model. A letter is the size of an array's rows, N states or W states and
-# controls; "" is a vector, and a name a record, which is passed field by field.
-_SIGNATURES: dict[str, tuple[str | Scalar, ...]] = {
-    "advance": ("", "", "", FLOAT, ""),  # x, u, p, h, out
-    "step_jacobian": ("", "", "", FLOAT, "", "W"),  # x, u, p, h, out, jacobian
-    "step_curvature": ("", "", "", FLOAT, "", "", "W", "W"),  # x, u, p, h, weights, out, jacobian, hessian
-    "value": ("", "", INT, ""),  # x, u, t, data
-    "derivatives": ("", "", INT, "", "W", ""),  # x, u, t, data, hessian, gradient
-    "project": ("W",),  # hessian
-    "augment": ("", "", INT, "", "", "W", ""),  # x, u, t, data, multipliers, hessian, gradient
-    "augmentation": ("", "", INT, "", ""),  # x, u, t, data, multipliers
-    "constraint_values": ("", "", INT, INT, "", "", ""),  # x, u, t, acts, data, multipliers, values
-    "add_slope": ("", "", INT, INT, "", ""),  # x, u, t, row, data, gradient
-    "noise_value": ("", "", "", "", "NextStep"),  # x, u, data, risk, ahead
-    "noise_quadratic": ("", "", "", "", "NextStep", INT, "QuadraticStage"),  # x, u, data, risk, ahead, convex, stage
-    "measure": ("", "", ""),  # x, data, out
-    "measure_slope": ("", "", "N"),  # x, data, out
-}
-_RECORDS = {"NextStep": ("W", "", "N", ""), "QuadraticStage": ("W", "")}
 
 
 class CompiledModule:
@@ -130,18 +110,10 @@ class CompiledModule:
     def _make_functions(self, names: tuple[str, ...]) -> tuple[float, ...]:
         def write(program: Program, scope: Scope) -> None:
             for name in names:
-                program.export(scope.function(name), self._signature(name), name)
+                program.export(scope.function(name), _signature(name, scope.sizes).members, name)
 
         loaded, _ = self._load(f"{' and '.join(names[:2])} of {self.what}", repr(names), write, False)
         return tuple(float(loaded.address(name)) for name in names)
-
-    def _signature(self, name: str) -> tuple[Type, ...]:
-        kinds: dict[str | Scalar, Type] = {"": VECTOR, INT: INT, FLOAT: FLOAT}
-        kinds |= {letter: Pointer((self._sizes.get(letter, 0),)) for letter in "NW"}
-        for record, parts in _RECORDS.items():
-            fields = getattr(records, record)._fields
-            kinds[record] = Group(tuple(kinds[part] for part in parts), record, fields)
-        return tuple(kinds[one] for one in _SIGNATURES[name])
 
     def _load(
         self, what: str, functions: str, write: Callable[[Program, Scope], Type | None], long: bool
@@ -190,6 +162,15 @@ def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
     """
     with compiling:  # also because Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)
+
+
+def _signature(name: str, sizes: Mapping[str, int]) -> Group:
+    """The types of the arguments of a C function, or of the fields of a record."""
+    kinds: dict[str, Type] = {"": VECTOR, "int": INT, "float": FLOAT}
+    kinds |= {size: Pointer((sizes.get(size, 0),)) for size in "NW"}
+    parts = [part.partition(":") for part in SIGNATURES[name].split()]
+    members = tuple(kinds[kind] if kind in kinds else _signature(kind, sizes) for _, _, kind in parts)
+    return Group(members, name, tuple(part for part, _, _ in parts))
 
 
 class Entry:

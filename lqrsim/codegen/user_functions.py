@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -177,7 +177,7 @@ def parameters_class(names: tuple[str, ...]) -> Any:
     def unknown(self: Any, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(names) or '(there are none)'}")
+        check_name("parameter", name, names)
 
     return type("Parameters", (collections.namedtuple("Parameters", names),), {"__slots__": (), "__getattr__": unknown})
 
@@ -367,6 +367,30 @@ class UserFunction:
         return f"[{i}]" if self.entries else ""
 
 
+def with_derivatives(
+    function: Callable[..., Any], returned: Mapping[str, Any],
+    derivatives: Callable[..., Any] | None, writes: tuple[tuple[int, ...], ...], **both: Any,
+) -> tuple[UserFunction, ...]:  # fmt: skip
+    """A function that returns values, and that of its derivatives, if there is one; their parameters come after them.
+
+    Args:
+      function, derivatives: as a `UserFunction` has them. returned: what it says of the first. writes: of the second.
+      **both: of both.
+    """
+    both["offset"] = 1 if derivatives is None else 2
+    first = UserFunction(function=function, **returned, **both)
+    return (first,) if derivatives is None else (first, UserFunction(function=derivatives, writes=writes, **both))
+
+
+class Part(Protocol):
+    """What compiled code reads: functions, whose addresses come first, and numbers."""
+
+    @property
+    def functions(self) -> tuple[UserFunction, ...]: ...
+    @property
+    def data(self) -> Array: ...
+
+
 @dataclass(frozen=True)
 class Term:
     """A part of a problem, made for one system: what gets compiled, and the numbers it reads.
@@ -420,9 +444,11 @@ def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[
     return rows
 
 
-def numbers_of(term: Term) -> Array:
+def numbers_of(part: Part) -> Array:
     """The data of its source: the addresses of its functions, then its own numbers."""
-    return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
+    if not part.functions:
+        return part.data
+    return np.concatenate([[address_of(function) for function in part.functions], part.data])
 
 
 def raise_again(functions: Sequence[UserFunction]) -> None:

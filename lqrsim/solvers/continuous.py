@@ -20,6 +20,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.continuous_solution import ContinuousSolution
+from lqrsim.solvers.engine import interrupt_of, raised_by
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.riccati_ode import (
     NO_MINIMUM,
@@ -187,10 +188,11 @@ def smooth_continuous(
         function.forget()
     solver = _Smoother(problem, state, control, prior, tolerances)
     iterations, status, detail = _iterate(solver, limits, functions, callback)
-    _raise_interrupts(functions)
-    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    if (error := interrupt_of(functions)) is not None:
+        raise error
+    raised = raised_by(functions)
     return ContinuousSolution(
-        status=status, detail="; ".join([detail, *raised]) if detail else "", horizon=solver.system.horizon,
+        status=status, detail=f"{detail}; {raised}" if detail and raised else detail, horizon=solver.system.horizon,
         iterations=tuple(iterations), _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip
 
@@ -236,7 +238,8 @@ def _iterate(
         iterations.append(row)
         if callback is not None:
             callback(row)
-        _raise_interrupts(functions)
+        if (error := interrupt_of(functions)) is not None:
+            raise error
         if settled and row.optimality < limits.tolerance:
             return iterations, Status.CONVERGED, ""
         if last and escape is not None:
@@ -320,10 +323,3 @@ class _Smoother:
 
 def _at(where: str, failure: IntegrationFailure) -> str:
     return f"{where}, at {failure.time:.4g} s: {failure}"
-
-
-def _raise_interrupts(functions: list[UserFunction]) -> None:
-    """Raise Ctrl-C and the like, if one of the functions that compiled code called got it."""
-    for function in functions:
-        if function.raised is not None and not isinstance(function.raised, Exception):
-            raise function.raised

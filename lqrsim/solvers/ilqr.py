@@ -150,7 +150,7 @@ def _solve(
     states, controls = plan
     go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
     work = IlqrArrays(
-        start=start, policy=policy, to_go=go, plan=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
+        start=start, policy=policy, to_go=go, best=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
         certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
     most = settings.max_iterations

@@ -43,7 +43,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
         raise InputError(f"solution: got a plan of {got} steps, controls and states, want {wanted}")
     settings = SmootherSettings(tolerance=1e-4, max_iterations=1, start=plan, constraint_tolerance=1e-3)
     run = SolveRun(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Budget(1))
-    run.work.plan.states[:], run.work.plan.controls[:] = plan.states, plan.controls
+    run.work.take(plan.states, plan.controls)
     if run.fails_at(0.0) >= 0:
         raise InputError("solution: got a plan about which no backward pass succeeds, want one that converged")
     high = 1e-6 / max(abs(solution.cost), 1e-100) if np.isfinite(solution.cost) else 1.0
@@ -66,9 +66,9 @@ def named(fails: Fails, risk: float, steps: int) -> str:
 def name_risk(run: SolveRun, found: RunResult) -> str:
     """The detail of an answer whose risk was too high."""
     problem, work = run.problem, run.work
-    if not np.isfinite(work.memory["plan_cost"]):
-        work.plan.states[:], work.plan.controls[:] = work.states, work.controls
-    if not np.isfinite(work.plan.states).all():
+    if not np.isfinite(work.cost):
+        work.take(*work.last)
+    if not np.isfinite(work.best.states).all():
         return found.detail
     return "; ".join(part for part in (named(run.fails_at, problem.risk, problem.steps), found.detail) if part)
 

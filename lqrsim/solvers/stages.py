@@ -11,14 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import active_set as active_kernel
-from lqrsim.kernels import interior_point as kernel
+from lqrsim.kernels import stages as kernel
 from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Motion, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
+
+FIRMNESS = 8.0  # penalty that makes a policy keep the constraints, in cost per squared row size
 
 
 class Sizes(NamedTuple):
@@ -44,9 +45,7 @@ class Stages:
     def __init__(self, problem: Problem) -> None:
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
-        what, sizes = f"{n} states and {m} controls", {"N": n, "M": m, "W": n + m}
-        self._module = module_of(source_of(kernel), f"interior point, {what}", **sizes)
-        self._active = module_of(source_of(active_kernel), f"active set, {what}", **sizes)
+        self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
         self._take(problem)
         counts = [term.rows for term in problem.constraint_terms]
@@ -75,7 +74,6 @@ class Stages:
         terms = problem.constraint_terms
         own = [compiled.ConstraintMultipliers(problem, term) for term in terms]
         self._model = compiled.arguments(problem, multipliers=own, second_order=True)
-        self._costs = compiled.costs_module(problem)
         limits = self._model.limits
         self.low, self.high = limits.low, limits.high
         self.limits = [
@@ -101,19 +99,18 @@ class Stages:
         self._rows.support[...] = 0.0
         return self
 
-    def _call(self, name: str, *arguments: Any, module: CompiledModule | None = None) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         """Call a compiled function, reusing the layout of its arguments."""
         call = self._calls.get(name)
         if call is None:
-            call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
+            call = self._calls[name] = self._module.lay_out(name, *arguments)
         return call(*arguments)
 
     def values(self, plan: Motion) -> Array:
         """The rows' values (T+1, R); undefined where they do not act."""
         numbers = np.empty(self.live.shape)
         if self._values:
-            constraints, costs = self._model.stage.constraints, self._costs
-            self._call("evaluate_constraints", self.steps, *plan, constraints, self._values, module=costs)
+            self._call("evaluate_constraints", self.steps, *plan, self._model.stage.constraints, self._values)
         begin = 0
         for one in self._values:
             end = begin + len(one) // (self.steps + 1)
@@ -233,13 +230,13 @@ class Stages:
     ) -> float:
         return self._call(
             "linearize_plan", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows,
-            self.models, active, module=self._active,
+            self.models, active,
         )  # fmt: skip
 
     def measure(self, plan: Motion, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
         """Residuals of the plan of the current models; writes its gaps. See the kernel."""
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
-        return self._call("optimality_measures", self.steps, *of, module=self._active)
+        return self._call("optimality_measures", self.steps, *of)
 
     def pivot(
         self, gaps: Array, models: StageModels | None = None, rows: ActiveRows | None = None, *,
@@ -249,13 +246,13 @@ class Stages:
         models, rows = self.models if models is None else models, self.active if rows is None else rows
         failed, wrong = self._call(
             "pivot", self.steps, self.free, share, scale, weight, price, models, gaps, rows, self.policy, self.to_go,
-            self.changes, module=self._active,
+            self.changes,
         )  # fmt: skip
         return failed == -1, wrong
 
     def change(self, *, worst: bool) -> None:
         """Change which rows are held; see the kernel."""
-        self._call("update_active_set", self.steps, int(worst), self.active, module=self._active)
+        self._call("update_active_set", self.steps, int(worst), self.active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
         """Roll out a plan with gains (T, m, n) about it; return the motion, its cost and the constraints' values.
@@ -267,7 +264,7 @@ class Stages:
         policy = self.policy._replace(gain=gain)
         cost = self._call(
             "rollout_of_active_set", self.steps, self._soft, plan, policy, limits, self.active, self._model,
-            self._values, out, module=self._active,
+            self._values, out,
         )  # fmt: skip
         return out, cost, [one.reshape(self.steps + 1, -1) for one in self._values]
 
