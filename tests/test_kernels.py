@@ -113,7 +113,7 @@ DIVIDED = {
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
     "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
-    "newton_iterations", "newton_pass", "pass_of_order", "finish_at_plan", "convex_value_functions", "optimality",
+    "newton_iterations", "newton_pass", "finish_at_plan", "convex_value_functions", "optimality",
     "roll_out_and_keep",
 )  # fmt: skip
 

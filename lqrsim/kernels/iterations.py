@@ -89,9 +89,8 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         if settings.guided and not fixed:
             copy(work.given.states[0], N, x_hat)
     for done in range(first, last):
-        for i in range(N):
-            if fixed and x_hat[i] != work.start[i]:  # whatever ran before, each pass begins at the given start
-                x_hat[i] = work.start[i]
+        if fixed:  # whatever ran before, each pass begins at the given start
+            copy(work.start, N, x_hat)
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
         about = Linearization(work.given, guided, 1.0, 0.0, Prior(weight, work.prior.about))

@@ -106,10 +106,10 @@ def newton_pass(settings, model, work, memory):
     Returns:
       Whether all numbers were finite.
     """
-    begin, failed, good, left = memory.share, -1, True, nan
+    begin, failed, good, left, plan, shift = memory.share, -1, True, nan, work.best, stack(N)
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
-        failed, good, _ = ilqr_pass(settings.steps, work.best, model, 0.0, work.last_policy, work.to_go)
+        failed, good, _ = ilqr_pass(settings.steps, plan, model, 0.0, work.last_policy, work.to_go)
         memory.failed = failed
         if failed >= 0:
             return good
@@ -121,7 +121,15 @@ def newton_pass(settings, model, work, memory):
         else:
             damping = SMALL * max(abs(memory.merit), SMALL) * 1e3 ** (k - len(SHARES))
         if share <= begin:
-            failed, good, left = pass_of_order(settings, model, work, share, damping, second)
+            order = ModelOrder(damping, share, work.to_go)
+            failed, good, left = differential_pass(settings.steps, plan, model, order, 1, work.policy, second)
+            copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+            if failed < 0 and not settings.fixed:
+                left += initial_step(plan.states[0], model, share, second, shift)
+                for i in range(N):
+                    work.x_hat[i] += shift[i]
+                if isnan(left):
+                    failed = 0
             memory.failed, memory.share, memory.damping = failed, share, damping
             if failed < 0 or not good:
                 break
@@ -132,20 +140,6 @@ def newton_pass(settings, model, work, memory):
     memory.decrease = 2 * left
     memory.promised = relative_optimality(failed, left, memory.merit, memory.negligible)
     return good
-
-
-def pass_of_order(settings, model, work, share, damping, second):
-    """One pass with that share of the second order and that damping; returns as `differential_pass` does."""
-    plan, shift, order = work.best, stack(N), ModelOrder(damping, share, work.to_go)
-    failed, good, left = differential_pass(settings.steps, plan, model, order, 1, work.policy, second)
-    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
-    if failed < 0 and not settings.fixed:
-        left += initial_step(plan.states[0], model, share, second, shift)
-        for i in range(N):
-            work.x_hat[i] += shift[i]
-        if isnan(left):
-            failed = 0
-    return failed, good, left
 
 
 def finish_at_plan(settings, model, work, memory, row):

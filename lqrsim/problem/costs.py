@@ -389,13 +389,15 @@ class ObstacleCost(KeepsClear, Cost):
             sizes = self.sharpness, self.weight, len(shape.world), len(tables)
             own = np.concatenate([sizes, shape.radii, tables.ravel()])
             if found is None:
-                return CostTerm(source_of(obstacle_cost, AXES=axes), own, nonconvex_in=axes, factor=1)
+                return CostTerm(
+                    source_of(obstacle_cost, AXES=axes), own, nonconvex_in=axes, factor=obstacle_cost.WEIGHT
+                )
             kernel = source_of(obstacle_cost, AT=found.numbers, BALLS=len(shape.radii), AXES=axes)
         return CostTerm(
             found.filling(kernel),
             np.concatenate([found.data, own]),
             nonconvex_in=axes or None,
-            factor=len(found.data) + 1,
+            factor=len(found.data) + obstacle_cost.WEIGHT,
             functions=found.functions,
             exact_hessian=False,
         )

@@ -18,9 +18,9 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
-from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures
+from lqrsim.solvers.interior_point import AT_LIMIT, REGULARISATION, Measures
 from lqrsim.solvers.settings import INSIDE
-from lqrsim.solvers.stages import FIRMNESS, Stages
+from lqrsim.solvers.stages import FIRMNESS, MIXES, Stages
 
 STEPS = 12  # at most: a solve that needs more does not converge
 PIVOTS, FEW = 15, 4  # most pivots of a convex problem, and of one that need not be convex

@@ -23,7 +23,7 @@ from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, damped_from_rollout, meet_constraints
 from lqrsim.solvers.budget import Laps
-from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
@@ -39,7 +39,6 @@ RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
-ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 @dataclass

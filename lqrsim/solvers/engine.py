@@ -73,6 +73,7 @@ MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the
 # smoothing has then found the valley, and what is left is the way along it. Damped iterations, which come there slowly,
 # end where the cost falls by less than NEARLY, twice, with a gap below NEAR.
 VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
+ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 _idle: "list[SolveRun]" = []
 _lending = threading.Lock()
 

@@ -20,7 +20,7 @@ from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.engine import RunResult, SolveRun, raised_by
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, raised_by
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
@@ -29,7 +29,6 @@ from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
 BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
-ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 def prepare(

@@ -5,7 +5,7 @@ plan need not satisfy the dynamics; a step closes the gaps between its states. W
 of those who use the stages: the interior point, the active set, and the restoration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits,
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # fractions of the projected Hessian, tried in turn
 FIRMNESS = 8.0  # penalty that makes a policy keep the constraints, in cost per squared row size
 
 
@@ -215,6 +216,20 @@ class Stages:
         """Compute the step to the minimum of the models, and the costates there; return whether there is a minimum."""
         models = self.models._replace(hessian=in_c_order(hessian), gradient=in_c_order(gradient))
         return self.pivot(in_c_order(gaps), models, self.active._replace(size=0))[0]
+
+    def hessians(self, barrier: Array, weights: Iterable[Array]) -> Iterator[Array]:
+        """Hessians (T+1, n+m, n+m) of the Lagrangian with a barrier, to be tried in turn until one has a minimum.
+
+        First mixed with those of the projected cost, by `MIXES`; then these with weights (m,) on changes of controls.
+        """
+        exact, convex = self.models.hessian, self.models.convex
+        for mix in MIXES:
+            yield (exact if mix == 0 else (1 - mix) * exact + mix * convex) + barrier
+        diagonal = np.arange(self.n, self.n + self.m)
+        for weight in weights:
+            heavier = convex + barrier
+            heavier[:, diagonal, diagonal] += weight
+            yield heavier
 
     def moved(self) -> Array:
         """The changes of the live rows' values, (K,)."""
