@@ -8,7 +8,6 @@ signatures below, called by their addresses.
 import ctypes
 import functools
 import importlib
-import json
 import logging
 import operator
 import threading
@@ -42,7 +41,6 @@ from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
 from lqrsim.kernels.model_functions import SIGNATURES
 from lqrsim.machine import instruction_set
-from lqrsim.results.archive import sha256
 
 logger = logging.getLogger("lqrsim")
 
@@ -122,7 +120,7 @@ class CompiledModule:
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
-        found = None if kept is None else _unpacked(kept)
+        found = None if kept is None else _unpacked(*kept)
         if found is None:
             found = self._compiled(what, write, long, key)
         self._loaded.append(found[0])
@@ -144,8 +142,7 @@ class CompiledModule:
         loaded = Loaded(code, libraries)
         if long:
             disk.note(timed, time.perf_counter() - clock)
-        header = {"libraries": libraries, "returns": _encoded(returns), "code": sha256(code)}
-        disk.save(key, json.dumps(header).encode() + b"\n" + code, what)
+        disk.save(key, code, what, libraries=libraries, returns=_encoded(returns))
         return loaded, returns
 
 
@@ -316,18 +313,14 @@ def _encoded(returns: Type | None) -> Any:
     return [one.name for one in scalars(returns) if isinstance(one, Scalar)], isinstance(returns, Group)
 
 
-def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, Type | None] | None:
     """Load a cached function; None if it cannot be used, and must be compiled again."""
-    header, _, code = kept.partition(b"\n")
     try:
-        known = json.loads(header)
         returns = None
         if known["returns"] is not None:
             names, several = known["returns"]
             kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
             returns = Group(kinds) if several else kinds[0]
-        if known["code"] != sha256(code):  # LLVM would end the process if this is no object file
-            raise ValueError("its checksum does not fit")
         return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a cached compiled function cannot be used ({error})")

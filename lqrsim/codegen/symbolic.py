@@ -86,7 +86,7 @@ def kept(
     stored = disk_cache.load(key)
     if stored is not None:
         with contextlib.suppress(ValueError, RecursionError):
-            found = json.loads(stored)
+            found = json.loads(stored[0])
             if isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items()):
                 return found
     made = make()

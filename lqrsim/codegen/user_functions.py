@@ -10,7 +10,6 @@ different functions of the same name.
 import collections
 import ctypes
 import inspect
-import json
 import logging
 import re
 import threading
@@ -29,7 +28,6 @@ from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
 from lqrsim.machine import instruction_set
-from lqrsim.results.archive import sha256
 
 logger = logging.getLogger("lqrsim")
 
@@ -70,7 +68,7 @@ def compiled(
     if key in _loaded:
         return _loaded[key]
     kept = disk.load(key) if key else None
-    found = _unpacked(kept) if kept is not None else None
+    found = _unpacked(*kept) if kept is not None else None
     if found is None:
         note_helpers(function)
         # numba compiled helpers with the globals of that time: if these have changed, the result is not cached.
@@ -91,25 +89,21 @@ def compiled(
         text = made.inspect_llvm()
         if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
             code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
-            header = {"needed": needed, "code": sha256(code)}
-            packed = json.dumps(header).encode() + b"\n" + code
-            disk.save(key, packed, what)
-            found = _unpacked(packed) or found
+            disk.save(key, code, what, needed=needed)
+            found = _unpacked(code, {"needed": needed}) or found
     if key:
         _loaded[key] = found
     return found
 
 
-def _unpacked(kept: bytes) -> tuple[Any, int] | None:
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int] | None:
     """Load a cached function; None if it cannot be used."""
     from numba.core import registry
 
-    header, _, code = kept.partition(b"\n")
     try:
-        known = json.loads(header)
         # Creating numba's target registers the functions of its runtime.
-        if known["code"] != sha256(code) or not (registry.cpu_target.target_context and are_there(known["needed"])):
-            raise ValueError("its checksum does not fit, or it needs a function that is missing")
+        if not (registry.cpu_target.target_context and are_there(known["needed"])):
+            raise ValueError("it needs a function that is missing")
         loaded = Loaded(code, ())
         return loaded, loaded.address(_SYMBOL)
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
@@ -371,12 +365,7 @@ def with_derivatives(
     function: Callable[..., Any], returned: Mapping[str, Any],
     derivatives: Callable[..., Any] | None, writes: tuple[tuple[int, ...], ...], **both: Any,
 ) -> tuple[UserFunction, ...]:  # fmt: skip
-    """A function that returns values, and that of its derivatives, if there is one; their parameters come after them.
-
-    Args:
-      function, derivatives: as a `UserFunction` has them. returned: what it says of the first. writes: of the second.
-      **both: of both.
-    """
+    """A function that returns values, and one that writes its derivatives, unless that is None: `**both` is of both."""
     both["offset"] = 1 if derivatives is None else 2
     first = UserFunction(function=function, **returned, **both)
     return (first,) if derivatives is None else (first, UserFunction(function=derivatives, writes=writes, **both))

@@ -306,7 +306,6 @@ class SolveRun:
         self.initial_guess, self.budget = initial_guess, budget
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # of smoothing, and which comes next
         self._last: Iteration | None = None  # of smoothing
-        self.work.watch_costs(self.settings.safeguard)
         self.ending = Ending(declarations.RUNNING)
         settings, problem = self.settings, self.problem
         self.second_order = settings.second_order(problem)
@@ -672,6 +671,7 @@ class Workspace:
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # Everything else is written before it is read.
         self.memory_rows[...] = 0.0
+        self.memory["watched"] = float(settings.safeguard)
         arrays.start[...] = arrays.x_hat[...] = start
         arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
         value = initial_guess.cost_to_go
@@ -693,10 +693,6 @@ class Workspace:
         """Take a plan for the best one; its cost is infinite where it is not known."""
         self.best.states[...], self.best.controls[...] = states, controls
         self.memory["plan_cost"] = cost
-
-    def watch_costs(self, watched: bool) -> None:
-        """Whether smoothing ends where the least cost no longer falls, because the safeguard can take over."""
-        self.memory["watched"] = float(watched)
 
     def disregard_costs(self) -> None:
         """With constraints the least cost is no measure, and a rollout of lower cost is no better plan."""
