@@ -86,14 +86,14 @@ def noted(name: str) -> float | None:
     return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
 
 
-def _durations() -> dict[str, object]:
+def _durations() -> dict[str, Any]:
     try:
         return _object_of((folder() / _DURATIONS).read_bytes())
     except OSError:
         return {}
 
 
-def _object_of(text: bytes) -> dict[str, object]:
+def _object_of(text: bytes) -> dict[str, Any]:
     """The object of a JSON text, such as the header in an item's first line; empty if it is damaged."""
     try:
         found = json.loads(text[:_LONGEST])
