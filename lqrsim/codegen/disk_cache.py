@@ -58,7 +58,8 @@ def load(name: str) -> tuple[bytes, dict[str, Any]] | None:
     except OSError:
         return None
     found = _object_of(header)
-    if found.get("sha256") != sha256(json.dumps(said := found.get("said")), contents):
+    said = found.get("said", {})
+    if found.get("sha256") != sha256(json.dumps(said), contents):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used now
