@@ -44,7 +44,6 @@ from lqrsim.kernels import (
     linear_algebra,
     mjcf_distances,
     mjcf_dynamics,
-    mjcf_places,
     model_functions,
     policy_evaluation,
     projection,
@@ -941,9 +940,7 @@ class TestParts:
         x = robot.at() + 0.1 * np.random.default_rng(0).normal(size=n)
         self.steps(dynamics, x, 0.3 * np.ones(m), 0.005 * drawn.substeps)
         if robot.balls is not None:
-            places = robot.balls.bind(dynamics)
-            assert places.code == source_of(mjcf_places)
-            self.places(places, 3 * len(robot.balls), x)
+            self.places(robot.balls.bind(dynamics), 3 * len(robot.balls), x)
 
     @pytest.mark.parametrize("touching", [False, True])
     def test_distances_and_sites_of_mujoco(self, touching: bool) -> None:

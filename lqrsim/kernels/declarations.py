@@ -172,7 +172,8 @@ def places(x, data, out) -> None:
 def places_jacobian(x, data, out, slopes) -> None:
     """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N).
 
-    The same files, and `differences.py`.
+    `differences.py`, `user_functions.py`; `distances_jacobian` of `mjcf_distances.py`, `errors_jacobian` of
+    `mjcf_sites.py`.
     """
 
 
