@@ -1,7 +1,7 @@
 """The names that kernels are written against, and that mean something only when they are compiled.
 
-Sizes become constants, and words of the language what `codegen/language.py` says. Open functions, which are
-empty here, are filled in. They are declared so that each kernel can be read, linted and type-checked on its own.
+Sizes become constants, and words of the language what `codegen/language.py` says. Open functions, which are empty here,
+are filled in. So each kernel can be read, linted and type-checked on its own.
 """
 
 from collections.abc import Callable
@@ -125,8 +125,8 @@ def fetch_add(words, index, value: int) -> int:
     return 0
 
 
-# Open functions: a kernel that imports one of these is compiled with what `Source.filled` puts in its place. A formula
-# of symbols or a text defines functions of the same names; the files that also do are named here, of `kernels/`.
+# Open functions: a kernel that imports one is compiled with what `Source.filled` of `codegen/sources.py` puts in its
+# place: a formula's or a text's function of the same name, or that of a file in `kernels/`, which is named here.
 
 
 def rate(x, u, p, out) -> None:
