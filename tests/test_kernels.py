@@ -471,10 +471,10 @@ class Begun:
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
-    def damped(self, first: int, last: int, **memory: float) -> tuple[Any, ...]:
+    def damped(self, first: int, last: int, task: int = declarations.DAMP, **memory: float) -> tuple[Any, ...]:
         for name, number in memory.items():
             self.work.memory[name] = number
-        given = self.run._plan_arguments(declarations.DAMP, first, last, self.log)
+        given = self.run._plan_arguments(task, first, last, self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
@@ -603,9 +603,9 @@ class TestRareEnds:
         one.damped(0, 1, merit=1e9, reach=1.0, since_ilqr=float(declarations.PATIENCE))
         assert one.work.memory["reach"] == 0.0
         # Only policy and value functions; of a plan that is no number there are none.
-        assert one.damped(1, 1)[2:] == (False, -1)
+        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (False, -1)
         one.work.arrays.best.states[2] = np.nan
-        assert one.damped(1, 1)[2:] == (True, 2)
+        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (True, 2)
 
     @pytest.mark.parametrize("noise", [False, True])
     def test_ends_of_ilqr(self, noise: bool) -> None:
@@ -620,12 +620,12 @@ class TestRareEnds:
         )  # fmt: skip
         options = IterationSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
 
-        def iterate(first: int, last: int) -> Any:
-            given = declarations.ITERATE, first, last, options, model, work, log
+        def iterate(first: int, last: int, task: int = declarations.ITERATE) -> Any:
+            given = task, first, last, options, model, work, log
             return replay(source, sizes, "ilqr", *with_rows(given))
 
         assert iterate(0, 2) == (2, declarations.RUNNING, False, -1)
-        assert iterate(2, 2) == (2, declarations.RUNNING, False, -1)
+        assert iterate(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
         log["cost"][1] = -np.inf  # lower than any
         assert iterate(2, 3)[1] == (declarations.RUNNING if noise else declarations.STALLED)
         if noise:

@@ -54,12 +54,8 @@ def damped_iterations(first, last, settings, model, work, memory, log):
     the plan measures its optimality, and computes the policy and the value functions of the answer. Where the
     merit falls by nothing but rounding in IDLE steps in a row, as at a kink of the dynamics, it has stalled.
 
-    With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
-    `smoother_iterations`.
+    Arguments and results are as for `smoother_iterations`.
     """
-    if first == last:
-        _, failed = relinearize(settings, False, 0.0, model, work, memory, log[first])
-        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         reach = memory.reach
         merit, cost, fraction, negligible = damped_step(settings, model, work, memory)

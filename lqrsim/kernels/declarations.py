@@ -31,7 +31,7 @@ ROW = 16  # numbers of an obstacle in `World.table`: kind, position (3), rotatio
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
-ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4
+ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE = 0, 1, 2, 3, 4, 5
 
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4

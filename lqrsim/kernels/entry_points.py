@@ -7,12 +7,14 @@ from math import inf
 
 from lqrsim.kernels.certificate import certify
 from lqrsim.kernels.control_limits import riccati_backward
-from lqrsim.kernels.damped_iterations import damped_iterations
+from lqrsim.kernels.damped_iterations import damped_iterations, relinearize
 from lqrsim.kernels.declarations import (
     CERTIFY,
     DAMP,
     EVALUATE,
     FINISH,
+    LINEARIZE,
+    RUNNING,
     M,
     N,
     W,
@@ -26,15 +28,17 @@ from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.newton_iterations import newton_iterations
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
+from lqrsim.kernels.rollouts import ilqr_pass
 from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
-    """Run undamped, damped or Newton iterations; or certify the rollout and the policy kept.
+    """Run undamped, damped or Newton iterations; or do something else with a plan.
 
     Args:
-      task: one of ITERATE, DAMP, FINISH; CERTIFY, with the Hessians of the cost-to-go; or EVALUATE, with Hessians of
-        the policy itself, which overwrite them.
+      task: one of ITERATE, DAMP, FINISH; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
+        to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
+        of the policy itself, which overwrite them.
       first, last: iterations to run, `last` excluded. The rest are records.
 
     Returns:
@@ -43,6 +47,9 @@ def smoother(task, first, last, settings, model, work, memory, log):
     if task >= CERTIFY:
         certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
+    if task == LINEARIZE:
+        _, failed = relinearize(settings, False, 0.0, model, work, memory[0], log[0])
+        return 0, RUNNING, failed >= 0, failed
     if task == DAMP:
         return damped_iterations(first, last, settings, model, work, memory[0], log)
     if task == FINISH:
@@ -51,10 +58,13 @@ def smoother(task, first, last, settings, model, work, memory, log):
 
 
 def ilqr(task, first, last, settings, model, work, log):
-    """Run iterations of iLQR; or certify the plan and the policy. As `smoother`."""
+    """Run iterations of iLQR; or linearise about the plan, or certify it, as `smoother` does."""
     if task >= CERTIFY:
         certify(settings, task == EVALUATE, work.best, work.policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
+    if task == LINEARIZE:
+        failed, _, _ = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        return 0, RUNNING, failed >= 0, failed
     return ilqr_iterations(first, last, settings, model, work, log)
 
 

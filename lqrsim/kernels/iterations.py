@@ -232,8 +232,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
       work: IlqrArrays. The policy makes the first trajectory; afterwards the plan is the best trajectory, and policy
         (relative to it) and cost-to-go are about it.
       log: rows of LOG; the last one has the cost that the first iteration improves on.
-
-    With `first` equal to `last`, only policy and cost-to-go are computed, about the plan as it is.
     """
     steps, policy, plan, to_go, damping = settings.steps, work.policy, work.best, work.to_go, work.damping
     no_shift = zeros(N)
@@ -243,9 +241,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if not abs(cost) < inf:
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else settings.max_iterations].cost
-    if first == last:
-        failed, _, _ = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
-        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
         failed, good, _ = ilqr_pass(steps, plan, model, damping[0], policy, to_go)

@@ -461,7 +461,7 @@ class SolveRun:
         """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
         rows = np.full(1, np.nan, LOG)
         self.work.begin_damped()
-        self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, rows))
+        self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, rows))
         return float(rows["optimality"][0])
 
     def fails_at(self, risk: float) -> int:
@@ -470,7 +470,7 @@ class SolveRun:
         Overwrites the arrays of the passes.
         """
         self.work.model.noise.risk[0] = risk
-        *_, failed = self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, np.full(1, np.nan, LOG)))
+        *_, failed = self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, np.full(1, np.nan, LOG)))
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
