@@ -448,6 +448,18 @@ def raise_again(functions: Sequence[UserFunction]) -> None:
             raise error
 
 
+def interrupt_of(functions: Sequence[UserFunction]) -> BaseException | None:
+    """Ctrl-C, or the like, if one of the functions that compiled code called got it."""
+    raised = (function.raised for function in functions)
+    return next((error for error in raised if error is not None and not isinstance(error, Exception)), None)
+
+
+def raised_by(functions: Sequence[UserFunction]) -> str:
+    """The exceptions of the functions, as text."""
+    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    return "; ".join(raised)
+
+
 def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None:
     """The names that a user's function depends on; None for all. Raises InputError for anything else."""
     if names is None:

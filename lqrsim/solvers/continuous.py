@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
-from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
 from lqrsim.errors import (
     Array,
     InputError,
@@ -31,7 +31,6 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
-from lqrsim.solvers.engine import interrupt_of, raised_by
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.riccati_ode import (
     NO_MINIMUM,

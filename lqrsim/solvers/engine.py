@@ -3,14 +3,14 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
 from lqrsim.kernels.records import (
@@ -181,18 +181,6 @@ def iterate(
         if stop.error is not None:
             outcome = declarations.TIMED_OUT
     return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
-
-
-def interrupt_of(functions: Iterable[UserFunction]) -> BaseException | None:
-    """Ctrl-C, or the like, if one of the functions that compiled code called got it."""
-    raised = (function.raised for function in functions)
-    return next((error for error in raised if error is not None and not isinstance(error, Exception)), None)
-
-
-def raised_by(functions: Iterable[UserFunction]) -> str:
-    """The exceptions of the functions, as text."""
-    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
-    return "; ".join(raised)
 
 
 def check_finite_at_start(

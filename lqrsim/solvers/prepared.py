@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
@@ -20,7 +21,7 @@ from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, raised_by
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
