@@ -63,7 +63,7 @@ from .solvers.ilqr import ilqr_many as ilqr_many
 from .solvers.initial_guess import InitialPrior as InitialPrior
 from .solvers.prepared import prepare as prepare
 from .solvers.risk import largest_risk as largest_risk
-from .solvers.sampling import sample_costs as sample_costs
+from .solvers.risk import sample_costs as sample_costs
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.funnels import funnel as funnel

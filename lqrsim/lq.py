@@ -1,8 +1,7 @@
 """Linear-quadratic smoothing, and the paper's continuous-time part."""
 
 from lqrsim.problem.linear_quadratic import Stage
-from lqrsim.solvers.continuous import smooth_continuous, smooth_lq_continuous
-from lqrsim.solvers.continuous_solution import ContinuousSolution
+from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
 from lqrsim.solvers.linear_quadratic import smooth_lq
 
 __all__ = [

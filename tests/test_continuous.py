@@ -13,8 +13,7 @@ from lqrsim.problem.linear_quadratic import Stage
 from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import riccati_ode
-from lqrsim.solvers.continuous import smooth_continuous, smooth_lq_continuous
-from lqrsim.solvers.continuous_solution import ContinuousSolution
+from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
 
 
 def measured_orders(errors: list[Any]) -> Array:

@@ -29,10 +29,10 @@ from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source
+from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.control.controllers import turning_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
-    active_set,
     augmented_lagrangian,
     certificate,
     cost_to_come_dual,
@@ -41,12 +41,10 @@ from lqrsim.kernels import (
     declarations,
     estimation,
     exponential,
-    interior_point,
     iterations,
     linear_algebra,
     mjcf_distances,
     mjcf_dynamics,
-    mjcf_places,
     model_functions,
     policy_evaluation,
     projection,
@@ -56,6 +54,7 @@ from lqrsim.kernels import (
     sphere_centers,
     state_bound,
 )
+from lqrsim.kernels import stages as stage_kernels
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
@@ -78,7 +77,6 @@ from lqrsim.kernels.records import (
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.costs import LimitCost
-from lqrsim.problem.noise import numbers_of
 from lqrsim.results.archive import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
@@ -115,7 +113,7 @@ DIVIDED = {
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
     "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
-    "newton_iterations", "newton_pass", "pass_of_order", "finish_at_plan", "convex_value_functions", "optimality",
+    "newton_iterations", "newton_pass", "finish_at_plan", "convex_value_functions", "optimality",
     "roll_out_and_keep",
 )  # fmt: skip
 
@@ -333,7 +331,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
         model = work.model
-        replay(source, sizes, "opening_pass", one.steps, False, work.arrays.guess, work.prior, model,
+        replay(source, sizes, "opening_pass", one.steps, False, work.arrays.given, work.prior, model,
                work.arrays.policy, work.arrays.to_go)  # fmt: skip
         return
     for done in range(len(log)):
@@ -419,7 +417,7 @@ class TestSolvers:
         states[0] = (0.0, 0.0, 0.3)
         work = IlqrArrays(
             start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
-            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), plan=Motion(states, controls),
+            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), best=Motion(states, controls),
             trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
         options = IterationSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
@@ -474,10 +472,10 @@ class Begun:
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
-    def damped(self, first: int, last: int, **memory: float) -> tuple[Any, ...]:
+    def damped(self, first: int, last: int, task: int = declarations.DAMP, **memory: float) -> tuple[Any, ...]:
         for name, number in memory.items():
             self.work.memory[name] = number
-        given = self.run._plan_arguments(declarations.DAMP, first, last, self.log)
+        given = self.run._plan_arguments(task, first, last, self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
@@ -587,8 +585,8 @@ class TestRareEnds:
         one = Begun(problem(), start=start)
         arrays = one.work.arrays
         for spoil in (1.0, np.nan):
-            arrays.guess.states[3] *= spoil
-            found = replay(one.source, one.sizes, "opening_pass", 6, True, arrays.guess, one.work.prior,
+            arrays.given.states[3] *= spoil
+            found = replay(one.source, one.sizes, "opening_pass", 6, True, arrays.given, one.work.prior,
                            one.work.model, arrays.policy, arrays.to_go)  # fmt: skip
             assert found[0] == (-1 if spoil == 1 else 3)
 
@@ -606,9 +604,9 @@ class TestRareEnds:
         one.damped(0, 1, merit=1e9, reach=1.0, since_ilqr=float(declarations.PATIENCE))
         assert one.work.memory["reach"] == 0.0
         # Only policy and value functions; of a plan that is no number there are none.
-        assert one.damped(1, 1)[2:] == (False, -1)
-        one.work.arrays.plan.states[2] = np.nan
-        assert one.damped(1, 1)[2:] == (True, 2)
+        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (False, -1)
+        one.work.arrays.best.states[2] = np.nan
+        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (True, 2)
 
     @pytest.mark.parametrize("noise", [False, *rarely(True)])
     def test_ends_of_ilqr(self, noise: bool) -> None:
@@ -618,17 +616,17 @@ class TestRareEnds:
         model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
         work = IlqrArrays(
             start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
-            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), plan=Motion(states, controls),
+            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), best=Motion(states, controls),
             trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
         options = IterationSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
 
-        def iterate(first: int, last: int) -> Any:
-            given = declarations.ITERATE, first, last, options, model, work, log
+        def iterate(first: int, last: int, task: int = declarations.ITERATE) -> Any:
+            given = task, first, last, options, model, work, log
             return replay(source, sizes, "ilqr", *with_rows(given))
 
         assert iterate(0, 2) == (2, declarations.RUNNING, False, -1)
-        assert iterate(2, 2) == (2, declarations.RUNNING, False, -1)
+        assert iterate(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
         log["cost"][1] = -np.inf  # lower than any
         assert iterate(2, 3)[1] == (declarations.RUNNING if noise else declarations.STALLED)
         if noise:
@@ -637,10 +635,10 @@ class TestRareEnds:
         model = model._replace(final=with_numbers(model.final, 0, 3, lambda weight: -2 * weight))
         assert iterate(2, 3)[1] in (declarations.RUNNING, declarations.STALLED)
         assert work.damping[0] > 0
-        plan = work.plan.states.copy()
-        work.plan.states[2] = np.nan
+        plan = work.best.states.copy()
+        work.best.states[2] = np.nan
         assert iterate(2, 3)[1:] == (declarations.NOT_FINITE, True, 2)
-        work.plan.states[...] = plan
+        work.best.states[...] = plan
         work.start[0] = np.nan
         assert iterate(0, 1)[1] == declarations.NO_START
 
@@ -727,7 +725,7 @@ class TestRareEnds:
         dynamics = ls.MjcfRobot(scene_from_xml(drawn.xml, "cart")).dynamics
         for x, dt in (([np.nan, 0, 0, 0], 0.005), ([0.1, 0, 0, 0], -0.005)):
             TestParts.steps(dynamics, np.array(x, dtype=float), np.zeros(1), dt)
-        given = np.array([0, 0, 9.9e9, 9.9e9]), np.zeros(1), compiled.numbers(dynamics), 0.1, np.zeros(4)
+        given = np.array([0, 0, 9.9e9, 9.9e9]), np.zeros(1), numbers_of(dynamics), 0.1, np.zeros(4)
         sizes = {"N": 4, "M": 1, "W": 5}  # the state that is read is gone then, and cannot be read again
         replay(dynamics.step_source, sizes, "advance", *given, but=("read_from",))
         assert np.isnan(given[-1]).all()
@@ -768,13 +766,13 @@ FLOATING = """<mujoco>
 
 def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
     n, m = len(x), len(u)
-    sizes, data = {"N": n, "M": m, "W": n + m}, compiled.numbers(term)
+    sizes, data = {"N": n, "M": m, "W": n + m}, numbers_of(term)
     replay(term.code, sizes, "value", x, u, 2, data)
     replay(term.code, sizes, "derivatives", x, u, 2, data, np.zeros((n + m, n + m)), np.zeros(n + m))
 
 
 def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0, x: Array = X, u: Array = U) -> None:
-    data, source = compiled.numbers(term), source_of(augmented_lagrangian, SHARED=term.shared)
+    data, source = numbers_of(term), source_of(augmented_lagrangian, SHARED=term.shared)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
     if term.shared:
         pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
@@ -856,7 +854,7 @@ class TestParts:
     @staticmethod
     def places(places: SphereCenters, coordinates: int, x: Array) -> None:
         source = source_of(sphere_centers).filled(places=places.code, places_jacobian=places.code)
-        data, n = compiled.numbers(places), len(x)  # pyright: ignore[reportArgumentType]
+        data, n = numbers_of(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
         replay(source, sizes, "centres_of", 2, states, data, np.zeros((2, coordinates)))
         outputs = np.zeros((2, coordinates)), np.zeros((2, coordinates, n))
@@ -917,7 +915,7 @@ class TestParts:
     @staticmethod
     def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:
         n, m = len(x), len(u)
-        sizes, numbers = {"N": n, "M": m, "W": n + m}, compiled.numbers(dynamics)
+        sizes, numbers = {"N": n, "M": m, "W": n + m}, numbers_of(dynamics)
         replay(dynamics.step_source, sizes, "advance", x, u, numbers, dt, np.zeros(n))
         replay(dynamics.step_source, sizes, "step_jacobian", x, u, numbers, dt, np.zeros(n), np.zeros((n, n + m)))
         if dynamics.curvature_source is not None:
@@ -943,9 +941,7 @@ class TestParts:
         x = robot.at() + 0.1 * np.random.default_rng(0).normal(size=n)
         self.steps(dynamics, x, 0.3 * np.ones(m), 0.005 * drawn.substeps)
         if robot.balls is not None:
-            places = robot.balls.bind(dynamics)
-            assert places.code == source_of(mjcf_places)
-            self.places(places, 3 * len(robot.balls), x)
+            self.places(robot.balls.bind(dynamics), 3 * len(robot.balls), x)
 
     @pytest.mark.parametrize("touching", [False, True])
     def test_distances_and_sites_of_mujoco(self, touching: bool) -> None:
@@ -1077,13 +1073,13 @@ class TestInteriorPoint:
         rng = np.random.default_rng(0)
         kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
         one = problem(steps=3, constraints=kept)
-        stages, source = Stages(one), source_of(interior_point)
+        stages, source = Stages(one), source_of(stage_kernels)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
         begun, costates = (3, 1), rng.normal(size=(4, 3))
         given = *begun, 0, plan, costates, stages._model, stages._values, rows, stages.models
-        replay(source_of(active_set), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
+        replay(source_of(stage_kernels), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
         replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
         replay(source, SIZES, "trial_cost", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
@@ -1096,7 +1092,7 @@ class TestInteriorPoint:
         def direction(hessian: Array, free: float = 1.0) -> int:
             given = 3, np.full(3, free), 0.0, 1.0, 1.0, 1.0, stages.models._replace(hessian=hessian), gaps
             rows = stages.active._replace(size=0)
-            failed, _ = replay(source_of(active_set), SIZES, "pivot", *given, rows, policy, to_go, changes)
+            failed, _ = replay(source_of(stage_kernels), SIZES, "pivot", *given, rows, policy, to_go, changes)
             return failed
 
         convex = stages.models.convex + np.eye(5)
@@ -1120,16 +1116,16 @@ class TestActiveSet:
         """From a soft start, with constraints that bend, an equality and limits, some of them held."""
         rng = np.random.default_rng(0)
         kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
-        stages, source = Stages(problem(steps=3, constraints=kept)), source_of(active_set)
+        stages, source = Stages(problem(steps=3, constraints=kept)), source_of(stage_kernels)
         plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         rows = len(stages.owners)
         live = stages.live.astype(np.float64).ravel()
         drawn, force = live * rng.integers(0, 2, size=live.size), live * rng.uniform(-0.1, 1.0, size=live.size)
-        kind = np.where(stages.equality, active_set.EQUALITY, active_set.INEQUALITY)
+        kind = np.where(stages.equality, stage_kernels.EQUALITY, stage_kernels.INEQUALITY)
         table = np.column_stack(
             [kind, rng.uniform(0.5, 2.0, size=(rows, 1)), np.full((rows, 1), 1e-2), np.zeros((rows, 3))]
         )
-        table[stages.owners == -1, 0] = active_set.LIMIT
+        table[stages.owners == -1, 0] = stage_kernels.LIMIT
         table[stages.owners == -1, 3:] = [(i, sign, side) for sign, i, side in stages.limits]
         numbers, pressing, wrong = np.zeros((3, live.size))
         active = ActiveRows(rows, table, live, drawn, numbers, force, pressing, wrong)

@@ -18,9 +18,9 @@ from sampling import examples, rarely
 from whole_problems import claims
 
 import lqrsim as ls
+from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
 from lqrsim.problem import dynamics as dynamics_module
-from lqrsim.solvers import compiled
 
 HOVER = np.full(4, 1.225)  # N, a quarter of the quadrotor's weight
 
@@ -69,7 +69,7 @@ def second_derivatives(dynamics: ls.Dynamics, x: Array, u: Array, weights: Array
     n, m = len(x), len(u)
     function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_double, *[ctypes.c_void_p] * 4)
     hessian, arrived, jacobian = np.zeros((n + m, n + m)), np.zeros(n), np.zeros((n, n + m))
-    arrays = x, u, compiled.numbers(dynamics), weights, arrived, jacobian, hessian
+    arrays = x, u, numbers_of(dynamics), weights, arrived, jacobian, hessian
     first, rest = [one.ctypes.data for one in arrays[:3]], [one.ctypes.data for one in arrays[3:]]
     function(int(dynamics.step_curvature))(*first, dt, *rest)
     a, b, _ = dynamics.linearize(x, u, dt)

@@ -8,7 +8,6 @@ signatures below, called by their addresses.
 import ctypes
 import functools
 import importlib
-import json
 import logging
 import operator
 import threading
@@ -40,9 +39,8 @@ from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
-from lqrsim.kernels import records
+from lqrsim.kernels.model_functions import SIGNATURES
 from lqrsim.machine import instruction_set
-from lqrsim.results.archive import sha256
 
 logger = logging.getLogger("lqrsim")
 
@@ -52,26 +50,6 @@ compiling = threading.RLock()
 
 # Functions that take long to compile, which is announced.
 LONG = ("smoother", "ilqr")
-
-# The arguments of the C functions of a model. A letter is the size of an array's rows, N states or W states and
-# controls; "" is a vector, and a name a record, which is passed field by field.
-_SIGNATURES: dict[str, tuple[str | Scalar, ...]] = {
-    "advance": ("", "", "", FLOAT, ""),  # x, u, p, h, out
-    "step_jacobian": ("", "", "", FLOAT, "", "W"),  # x, u, p, h, out, jacobian
-    "step_curvature": ("", "", "", FLOAT, "", "", "W", "W"),  # x, u, p, h, weights, out, jacobian, hessian
-    "value": ("", "", INT, ""),  # x, u, t, data
-    "derivatives": ("", "", INT, "", "W", ""),  # x, u, t, data, hessian, gradient
-    "project": ("W",),  # hessian
-    "augment": ("", "", INT, "", "", "W", ""),  # x, u, t, data, multipliers, hessian, gradient
-    "augmentation": ("", "", INT, "", ""),  # x, u, t, data, multipliers
-    "constraint_values": ("", "", INT, INT, "", "", ""),  # x, u, t, acts, data, multipliers, values
-    "add_slope": ("", "", INT, INT, "", ""),  # x, u, t, row, data, gradient
-    "noise_value": ("", "", "", "", "NextStep"),  # x, u, data, risk, ahead
-    "noise_quadratic": ("", "", "", "", "NextStep", INT, "QuadraticStage"),  # x, u, data, risk, ahead, convex, stage
-    "measure": ("", "", ""),  # x, data, out
-    "measure_slope": ("", "", "N"),  # x, data, out
-}
-_RECORDS = {"NextStep": ("W", "", "N", ""), "QuadraticStage": ("W", "")}
 
 
 class CompiledModule:
@@ -130,18 +108,10 @@ class CompiledModule:
     def _make_functions(self, names: tuple[str, ...]) -> tuple[float, ...]:
         def write(program: Program, scope: Scope) -> None:
             for name in names:
-                program.export(scope.function(name), self._signature(name), name)
+                program.export(scope.function(name), _signature(name, scope.sizes).members, name)
 
         loaded, _ = self._load(f"{' and '.join(names[:2])} of {self.what}", repr(names), write, False)
         return tuple(float(loaded.address(name)) for name in names)
-
-    def _signature(self, name: str) -> tuple[Type, ...]:
-        kinds: dict[str | Scalar, Type] = {"": VECTOR, INT: INT, FLOAT: FLOAT}
-        kinds |= {letter: Pointer((self._sizes.get(letter, 0),)) for letter in "NW"}
-        for record, parts in _RECORDS.items():
-            fields = getattr(records, record)._fields
-            kinds[record] = Group(tuple(kinds[part] for part in parts), record, fields)
-        return tuple(kinds[one] for one in _SIGNATURES[name])
 
     def _load(
         self, what: str, functions: str, write: Callable[[Program, Scope], Type | None], long: bool
@@ -150,7 +120,7 @@ class CompiledModule:
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
-        found = None if kept is None else _unpacked(kept)
+        found = None if kept is None else _unpacked(*kept)
         if found is None:
             found = self._compiled(what, write, long, key)
         self._loaded.append(found[0])
@@ -172,8 +142,7 @@ class CompiledModule:
         loaded = Loaded(code, libraries)
         if long:
             disk.note(timed, time.perf_counter() - clock)
-        header = {"libraries": libraries, "returns": _encoded(returns), "code": sha256(code)}
-        disk.save(key, json.dumps(header).encode() + b"\n" + code, what)
+        disk.save(key, code, what, libraries=libraries, returns=_encoded(returns))
         return loaded, returns
 
 
@@ -190,6 +159,15 @@ def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
     """
     with compiling:  # also because Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)
+
+
+def _signature(name: str, sizes: Mapping[str, int]) -> Group:
+    """The types of the arguments of a C function, or of the fields of a record."""
+    kinds: dict[str, Type] = {"": VECTOR, "int": INT, "float": FLOAT}
+    kinds |= {size: Pointer((sizes.get(size, 0),)) for size in "NW"}
+    parts = [part.partition(":") for part in SIGNATURES[name].split()]
+    members = tuple(kinds[kind] if kind in kinds else _signature(kind, sizes) for _, _, kind in parts)
+    return Group(members, name, tuple(part for part, _, _ in parts))
 
 
 class Entry:
@@ -335,18 +313,14 @@ def _encoded(returns: Type | None) -> Any:
     return [one.name for one in scalars(returns) if isinstance(one, Scalar)], isinstance(returns, Group)
 
 
-def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, Type | None] | None:
     """Load a cached function; None if it cannot be used, and must be compiled again."""
-    header, _, code = kept.partition(b"\n")
     try:
-        known = json.loads(header)
         returns = None
         if known["returns"] is not None:
             names, several = known["returns"]
             kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
             returns = Group(kinds) if several else kinds[0]
-        if known["code"] != sha256(code):  # LLVM would end the process if this is no object file
-            raise ValueError("its checksum does not fit")
         return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a cached compiled function cannot be used ({error})")

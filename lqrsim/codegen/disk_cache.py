@@ -14,6 +14,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 
@@ -49,23 +50,25 @@ def key(*parts: str | bytes) -> str:
     return sha256(*(piece for part in encoded for piece in (f"{len(part)}:", part)))[:32]
 
 
-def load(name: str) -> bytes | None:
-    """The contents of an item; None if it is missing, damaged or cannot be read."""
+def load(name: str) -> tuple[bytes, dict[str, Any]] | None:
+    """The contents of an item, and what was said of them; None if it is missing, damaged or cannot be read."""
     path = folder() / f"{name}{_SUFFIX}"
     try:
         header, _, contents = path.read_bytes().partition(b"\n")
     except OSError:
         return None
-    if _object_of(header).get("sha256") != sha256(contents):
+    found = _object_of(header)
+    said = found.get("said", {})
+    if found.get("sha256") != sha256(json.dumps(said), contents):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used now
-    return contents
+    return contents, said
 
 
-def save(name: str, contents: bytes, what: str) -> None:
-    """Store an item if possible; two processes may store the same one."""
-    header = json.dumps({"what": what, "sha256": sha256(contents)}).encode()
+def save(name: str, contents: bytes, what: str, **said: Any) -> None:
+    """Store an item if possible, with what is `said` of its contents; two processes may store the same one."""
+    header = json.dumps({"what": what, "said": said, "sha256": sha256(json.dumps(said), contents)}).encode()
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)
@@ -84,14 +87,14 @@ def noted(name: str) -> float | None:
     return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
 
 
-def _durations() -> dict[str, object]:
+def _durations() -> dict[str, Any]:
     try:
         return _object_of((folder() / _DURATIONS).read_bytes())
     except OSError:
         return {}
 
 
-def _object_of(text: bytes) -> dict[str, object]:
+def _object_of(text: bytes) -> dict[str, Any]:
     """The object of a JSON text, such as the header in an item's first line; empty if it is damaged."""
     try:
         found = json.loads(text[:_LONGEST])

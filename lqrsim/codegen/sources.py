@@ -63,7 +63,11 @@ class Source:
         return sha256(self.module, own, self.text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
-        """This source with functions filled in: name -> source, or (source, name there)."""
+        """This source with functions filled in: name -> source, or (source, name there).
+
+        A function can be filled in if the module defines it, or if the module, or one that it imports from, imports it
+        from `declarations.py`, where it is empty: there stands which files have the real one.
+        """
         pairs = {name: one if isinstance(one, tuple) else (one, name) for name, one in fills.items()}
         kept = tuple(fill for fill in self.fills if fill[0] not in pairs)
         return Source(
@@ -181,11 +185,11 @@ class Scope:
     """The meaning of each name in a source, for one set of sizes.
 
     Args:
-      source: the functions. sizes: name -> number, of the sizes in `declarations.py`: N, M, W and so on.
+      source: the functions. sizes: name -> number, of the sizes in `declarations.py`: N, M and so on; W is N + M.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
-        self.source, self.sizes = source, sizes
+        self.source, self.sizes = source, {"W": sizes.get("N", 0) + sizes.get("M", 0), **sizes}
         parsed = _parsed_module(source.module) if source.module else _parsed_text(source.text)
         self._functions, self._imports = parsed.functions, parsed.imports
         self._constants = dict(source.constants)

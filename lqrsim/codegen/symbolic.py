@@ -12,7 +12,7 @@ from typing import Any
 
 from lqrsim.codegen import disk_cache
 from lqrsim.codegen.fingerprint import fingerprint
-from lqrsim.errors import InputError, check_kind, check_number, excerpt
+from lqrsim.errors import InputError, check_kind, check_name, check_number, excerpt
 from lqrsim.rotations import RATIOS
 
 MOST = 1000  # parameters of a function, at most
@@ -24,7 +24,7 @@ class Parameters(SimpleNamespace):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(vars(self)) or '(there are none)'}")
+        check_name("parameter", name, vars(self))
 
 
 class Vector(tuple[Any, ...]):
@@ -44,7 +44,7 @@ class Vector(tuple[Any, ...]):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise InputError(f"name: got {name!r}, want one of: {', '.join(self.names) or '(there are none)'}")
+        check_name("name", name, self.names)
 
     def __getitem__(self, place: Any) -> Any:
         found = super().__getitem__(place)
@@ -86,7 +86,7 @@ def kept(
     stored = disk_cache.load(key)
     if stored is not None:
         with contextlib.suppress(ValueError, RecursionError):
-            found = json.loads(stored)
+            found = json.loads(stored[0])
             if isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items()):
                 return found
     made = make()

@@ -10,7 +10,6 @@ different functions of the same name.
 import collections
 import ctypes
 import inspect
-import json
 import logging
 import re
 import threading
@@ -18,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from lqrsim.codegen.llvm import Loaded, are_there, object_code_of_one
 from lqrsim.codegen.sources import Source, check_source
 from lqrsim.errors import Array, InputError, check_array, check_function, check_items, check_name, excerpt, keep
 from lqrsim.machine import instruction_set
-from lqrsim.results.archive import sha256
 
 logger = logging.getLogger("lqrsim")
 
@@ -70,7 +68,7 @@ def compiled(
     if key in _loaded:
         return _loaded[key]
     kept = disk.load(key) if key else None
-    found = _unpacked(kept) if kept is not None else None
+    found = _unpacked(*kept) if kept is not None else None
     if found is None:
         note_helpers(function)
         # numba compiled helpers with the globals of that time: if these have changed, the result is not cached.
@@ -91,25 +89,21 @@ def compiled(
         text = made.inspect_llvm()
         if lasting and not re.search(r"inttoptr \(i64 \d", text):  # an address in this process
             code, needed = object_code_of_one(text, made.native_name, _SYMBOL)
-            header = {"needed": needed, "code": sha256(code)}
-            packed = json.dumps(header).encode() + b"\n" + code
-            disk.save(key, packed, what)
-            found = _unpacked(packed) or found
+            disk.save(key, code, what, needed=needed)
+            found = _unpacked(code, {"needed": needed}) or found
     if key:
         _loaded[key] = found
     return found
 
 
-def _unpacked(kept: bytes) -> tuple[Any, int] | None:
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Any, int] | None:
     """Load a cached function; None if it cannot be used."""
     from numba.core import registry
 
-    header, _, code = kept.partition(b"\n")
     try:
-        known = json.loads(header)
         # Creating numba's target registers the functions of its runtime.
-        if known["code"] != sha256(code) or not (registry.cpu_target.target_context and are_there(known["needed"])):
-            raise ValueError("its checksum does not fit, or it needs a function that is missing")
+        if not (registry.cpu_target.target_context and are_there(known["needed"])):
+            raise ValueError("it needs a function that is missing")
         loaded = Loaded(code, ())
         return loaded, loaded.address(_SYMBOL)
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
@@ -177,7 +171,7 @@ def parameters_class(names: tuple[str, ...]) -> Any:
     def unknown(self: Any, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(names) or '(there are none)'}")
+        check_name("parameter", name, names)
 
     return type("Parameters", (collections.namedtuple("Parameters", names),), {"__slots__": (), "__getattr__": unknown})
 
@@ -367,6 +361,25 @@ class UserFunction:
         return f"[{i}]" if self.entries else ""
 
 
+def with_derivatives(
+    function: Callable[..., Any], returned: Mapping[str, Any],
+    derivatives: Callable[..., Any] | None, writes: tuple[tuple[int, ...], ...], **both: Any,
+) -> tuple[UserFunction, ...]:  # fmt: skip
+    """A function that returns values, and one that writes its derivatives, unless that is None: `**both` is of both."""
+    both["offset"] = 1 if derivatives is None else 2
+    first = UserFunction(function=function, **returned, **both)
+    return (first,) if derivatives is None else (first, UserFunction(function=derivatives, writes=writes, **both))
+
+
+class Part(Protocol):
+    """What compiled code reads: functions, whose addresses come first, and numbers."""
+
+    @property
+    def functions(self) -> tuple[UserFunction, ...]: ...
+    @property
+    def data(self) -> Array: ...
+
+
 @dataclass(frozen=True)
 class Term:
     """A part of a problem, made for one system: what gets compiled, and the numbers it reads.
@@ -420,9 +433,11 @@ def rows_of(returned: Any, count: int, wanted: str, what: str = "rows") -> list[
     return rows
 
 
-def numbers_of(term: Term) -> Array:
+def numbers_of(part: Part) -> Array:
     """The data of its source: the addresses of its functions, then its own numbers."""
-    return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
+    if not part.functions:
+        return part.data
+    return np.concatenate([[address_of(function) for function in part.functions], part.data])
 
 
 def raise_again(functions: Sequence[UserFunction]) -> None:
@@ -431,6 +446,18 @@ def raise_again(functions: Sequence[UserFunction]) -> None:
         if (error := function.raised) is not None:
             function.forget()
             raise error
+
+
+def interrupt_of(functions: Sequence[UserFunction]) -> BaseException | None:
+    """Ctrl-C, or the like, if one of the functions that compiled code called got it."""
+    raised = (function.raised for function in functions)
+    return next((error for error in raised if error is not None and not isinstance(error, Exception)), None)
+
+
+def raised_by(functions: Sequence[UserFunction]) -> str:
+    """The exceptions of the functions, as text."""
+    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    return "; ".join(raised)
 
 
 def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None:

@@ -3,17 +3,18 @@
 The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
 Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
 
-From AT on, `data` has the number of steps with margins, the number of margins per step, the number of obstacles, and
-the number of steps with a table of obstacles; then each ball's radius, the margins and the tables, step by step. The
-last margins and the last table hold from their step on. A row is an obstacle, for the first ball, then for the next; it
-has margin number `row` modulo the margins per step. AT is 0 for a point, and for balls what `places` reads comes
-before.
+From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
+table hold from their step on. A row is an obstacle, for the first ball, then for the next; it has margin number `row`
+modulo the margins per step. AT is 0 for a point, and for balls what `places` reads comes before.
 """
 
 from lqrsim.kernels.declarations import ROW, N, stack
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AT = 0
+# From there on: numbers of steps with margins, of margins at a step, of obstacles, and of steps with a table of these;
+# then the radius of each ball, or of the point.
+STEPS, EACH, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
 BALLS = 0  # 0 for a point
 AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane, whose third coordinate is 0
 
@@ -21,10 +22,9 @@ AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane
 def value(x, u, t, row, data):
     """The distance of one ball to one obstacle, less its radius and the margin."""
     a, b, c = place(x, row, data)
-    steps, each = int(data[AT]), int(data[AT + 1])
-    least = data[AT + 4 + BALLS + min(t, steps - 1) * each + row % each]
-    if BALLS:
-        least += data[AT + 4 + row // int(data[AT + 2])]
+    steps, each = int(data[AT + STEPS]), int(data[AT + EACH])
+    margin = data[AT + RADII + max(BALLS, 1) + min(t, steps - 1) * each + row % each]
+    least = data[AT + RADII + ball_of(row, data)] + margin
     return signed_distance(data, obstacle_at(t, row, data), a, b, c) - least
 
 
@@ -34,10 +34,10 @@ def slope(x, u, t, row, data, gradient):
     a, b, c = place(x, row, data)
     signed_distance_derivatives(data, obstacle_at(t, row, data), a, b, c, normal, curve)
     if BALLS:
-        ball = row // int(data[AT + 2])
+        first = 3 * ball_of(row, data)
         for i in range(N):
             for j in range(3):
-                gradient[i] += normal[j] * u[3 * ball + j, i]
+                gradient[i] += normal[j] * u[first + j, i]
     else:
         for i in range(len(AXES)):
             gradient[AXES[i]] += normal[i]
@@ -46,12 +46,18 @@ def slope(x, u, t, row, data, gradient):
 def place(x, row, data):
     """The centre of the ball that a row is about, or the position of a robot that is a point."""
     if BALLS:
-        first = 3 * (row // int(data[AT + 2]))
+        first = 3 * ball_of(row, data)
         return x[first], x[first + 1], x[first + 2]
     return x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0
 
 
+def ball_of(row, data):
+    """The number of the ball that a row is about; 0 for a point."""
+    return row // int(data[AT + OBSTACLES]) if BALLS else 0
+
+
 def obstacle_at(t, row, data):
     """The index at which the numbers of a row's obstacle begin."""
-    obstacles, tables = int(data[AT + 2]), AT + 4 + BALLS + int(data[AT]) * int(data[AT + 1])
-    return tables + ROW * (obstacles * min(t, int(data[AT + 3]) - 1) + (row % obstacles if BALLS else row))
+    obstacles, margins = int(data[AT + OBSTACLES]), int(data[AT + STEPS]) * int(data[AT + EACH])
+    obstacle = obstacles * min(t, int(data[AT + TABLES]) - 1) + (row % obstacles if BALLS else row)
+    return AT + RADII + max(BALLS, 1) + margins + ROW * obstacle

@@ -113,8 +113,16 @@ def slope_at(stage, x, u, i):
     return total
 
 
-def riccati_backward_within(t, step, stage, constant, x, limits, policy, to_go):
-    """A step of the cost-to-go as `riccati_backward` makes it, with controls clamped at the state x (N,)."""
+def riccati_backward(t, step, stage, constant, x, limits, policy, to_go):
+    """Write policy and cost-to-go at t, given the cost-to-go at t + 1. Eqs. (9)-(11), (13).
+
+    Args:
+      step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin; overwritten.
+      x: (N,) the state at which controls are clamped to their limits.
+
+    Returns:
+      Whether the control block is positive definite.
+    """
     shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease, good = minimize_within(
         stage, x, limits, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]

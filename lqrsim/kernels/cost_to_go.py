@@ -21,23 +21,6 @@ from lqrsim.kernels.declarations import M, N, stack
 from lqrsim.kernels.linear_algebra import affine, cholesky, congruence, quadratic_at
 
 
-def riccati_backward(t, step, stage, constant, policy, to_go):
-    """Write policy and cost-to-go at t, given the cost-to-go at t + 1. Eqs. (9)-(11), (13).
-
-    Args:
-      step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin; overwritten.
-
-    Returns:
-      Whether the control block is positive definite.
-    """
-    shifted = add_cost_to_go(t, step, stage, constant, to_go)
-    decrease = minimize_control(
-        stage.hessian, stage.gradient, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]
-    )
-    to_go.constant[t] = shifted - decrease
-    return decrease >= 0
-
-
 def add_cost_to_go(t, step, stage, constant, to_go):
     """Add to a stage the cost-to-go of the state that its step leads to; return the constant of the sum."""
     S1, s1, k1 = to_go.hessian[t + 1], to_go.gradient[t + 1], to_go.constant[t + 1]

@@ -25,11 +25,11 @@ from lqrsim.kernels.declarations import (
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.passes import backward_pass, forward_pass, smoothed_states
-from lqrsim.kernels.records import Linearization, ModelOrder
+from lqrsim.kernels.records import Linearization
 from lqrsim.kernels.rollouts import (
     copy_plan,
-    differential_pass,
     dynamics_residual,
+    ilqr_pass,
     initial_step,
     largest_gap,
     line_search,
@@ -54,22 +54,18 @@ def damped_iterations(first, last, settings, model, work, memory, log):
     the plan measures its optimality, and computes the policy and the value functions of the answer. Where the
     merit falls by nothing but rounding in IDLE steps in a row, as at a kink of the dynamics, it has stalled.
 
-    With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
-    `smoother_iterations`.
+    Arguments and results are as for `smoother_iterations`.
     """
-    if first == last:
-        _, failed = relinearize(settings, False, 0.0, model, work, memory, log[first])
-        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         reach = memory.reach
         merit, cost, fraction, negligible = damped_step(settings, model, work, memory)
         full = done + 1 == settings.max_iterations
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, negligible)
-            shorten_step(settings.steps, fraction, work.plan, work.x_hats)
+            shorten_step(settings.steps, fraction, work.best, work.x_hats)
             # At reach 0, as in iLQR, the models are those about a rollout, which has no gap.
-            gap = largest_gap(settings.steps, work.x_hats, work.rollout.states) if reach > 0 else 0.0
-            copy_plan(settings.steps, work.rollout, work.plan)
+            gap = largest_gap(settings.steps, work.x_hats, work.last.states) if reach > 0 else 0.0
+            copy_plan(settings.steps, work.last, work.best)
             memory.plan_cost, memory.merit = cost, merit
             small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
             memory.small_changes = memory.small_changes + 1 if small else 0.0
@@ -99,26 +95,26 @@ def damped_step(settings, model, work, memory):
     """
     shift, reach = stack(N), memory.reach
     merit, cost, fraction, negligible = inf, inf, 0.0, 0.0
-    copy(work.start if settings.fixed else work.plan.states[0], N, work.x_hat)
-    about = Linearization(work.plan, True, reach, memory.weight, work.prior)
+    copy(work.start if settings.fixed else work.best.states[0], N, work.x_hat)
+    about = Linearization(work.best, True, reach, memory.weight, work.prior)
     failed, _ = forward_pass(settings, model, about, work)
     if failed < 0:
         failed, _, negligible = backward_pass(settings, model, about, work)
     if failed < 0:
         for i in range(N):
-            shift[i] = work.x_hat[i] - work.plan.states[0, i]
-        policy_about_plan(settings.steps, work.plan, work.policy)
+            shift[i] = work.x_hat[i] - work.best.states[0, i]
+        policy_about_plan(settings.steps, work.best, work.policy)
         if NOISY:  # with the new policy's cost-to-go
             update_plan_cost(settings.steps, model, work, memory)
         smallest = 0.1 if reach > 0 else 1e-8
         bound = memory.merit + 1e-12 * abs(memory.merit)  # differences by rounding are accepted
-        merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, 0.0, smallest, work.rollout)
+        merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, 0.0, smallest, work.last)
     return merit, cost, fraction, negligible
 
 
 def update_plan_cost(steps, model, work, memory):
     """Evaluate the plan's expected cost and merit with the latest cost-to-go."""
-    cost, added = plan_cost(steps, work.plan, model, work.to_go)
+    cost, added = plan_cost(steps, work.best, model, work.to_go)
     memory.plan_cost, memory.merit = cost, cost + added
 
 
@@ -160,8 +156,8 @@ def relinearize(settings, settled, negligible, model, work, memory, row):
     Returns:
       The outcome, and the step that failed, or -1.
     """
-    steps, plan, policy, to_go, shift = settings.steps, work.plan, work.policy, work.to_go, stack(N)
-    failed, _, left = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
+    steps, plan, policy, to_go, shift = settings.steps, work.best, work.policy, work.to_go, stack(N)
+    failed, _, left = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
     if failed >= 0:
         return RUNNING, failed
     if NOISY:
@@ -180,7 +176,7 @@ def value_functions_at_plan(settings, model, work, memory, row):
     Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: where motions are
     unstable, rounding can spoil the cost-to-come while the rest is right.
     """
-    steps, plan, policy = settings.steps, work.plan, work.policy
+    steps, plan, policy = settings.steps, work.best, work.policy
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     failed, _ = forward_pass(settings, model, Linearization(plan, True, 1.0, 0.0, work.prior), work)
     memory.final_gap = inf

@@ -1,8 +1,7 @@
 """The names that kernels are written against, and that mean something only when they are compiled.
 
-Sizes become constants, and words of the language what `codegen/language.py` says. Open functions are filled in
-with those of dynamics, costs, constraints, noise and sensors, and of the form of the cost-to-come; see
-`codegen/sources.py`. They are declared here so that each kernel can be read, linted and type-checked on its own.
+Sizes become constants, and words of the language what `codegen/language.py` says. Open functions, which are empty here,
+are filled in. So each kernel can be read, linted and type-checked on its own.
 """
 
 from collections.abc import Callable
@@ -32,7 +31,7 @@ ROW = 16  # numbers of an obstacle in `World.table`: kind, position (3), rotatio
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
-ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4
+ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE = 0, 1, 2, 3, 4, 5
 
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
@@ -126,15 +125,19 @@ def fetch_add(words, index, value: int) -> int:
     return 0
 
 
-# Open functions of dynamics, costs, constraints, noise and sensors.
+# Open functions: a kernel that imports one is compiled with what `Source.filled` of `codegen/sources.py` puts in its
+# place: a formula's or a text's function of the same name, or that of a file in `kernels/`, which is named here.
 
 
 def rate(x, u, p, out) -> None:
-    """Write xdot = f(x, u), (N,)."""
+    """Write xdot = f(x, u), (N,): `user_functions.py`."""
 
 
 def rate_jacobian(x, u, p, out, fx, fu) -> None:
-    """Write f (N,), and the structurally nonzero entries of df/dx (N, N) and df/du (N, M)."""
+    """Write f (N,), and the structurally nonzero entries of df/dx (N, N) and df/du (N, M).
+
+    `user_functions.py`, `differences.py`.
+    """
 
 
 def rate_curvature(x, u, p, w, curve) -> None:
@@ -142,33 +145,47 @@ def rate_curvature(x, u, p, w, curve) -> None:
 
 
 def value(x, u, t, data) -> float:
-    """A cost."""
+    """A cost: the files of costs, and what `differences.py` takes differences of."""
     return 0.0
 
 
 def constraint_value(x, u, t, row, data) -> float:
-    """One value of a constraint: nonnegative, or zero for an equality, where it is satisfied."""
+    """One value of a constraint: nonnegative, or zero for an equality, where it is satisfied.
+
+    `value` of `clearance.py`, `distance_constraint.py`, `state_bound.py`.
+    """
     return 0.0
 
 
 def constraint_slope(x, u, t, row, data, gradient) -> None:
-    """Add the gradient (W,) of that value."""
+    """Add the gradient (W,) of that value: `slope` of the same files."""
 
 
 def places(x, data, out) -> None:
-    """Write the centres of a robot's balls, three coordinates each, ball by ball."""
+    """Write the centres of a robot's balls, three coordinates each, ball by ball.
+
+    `user_functions.py`, `mjcf_places.py`; for costs and constraints of distances and errors, these themselves:
+    `distances` of `mjcf_distances.py`, `errors` of `mjcf_sites.py`.
+    """
 
 
 def places_jacobian(x, data, out, slopes) -> None:
-    """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N)."""
+    """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N).
+
+    `differences.py`, `user_functions.py`; `distances_jacobian` of `mjcf_distances.py`, `errors_jacobian` of
+    `mjcf_sites.py`.
+    """
 
 
 def noise_values(x, u, data, out) -> None:
-    """Write the rows of M(x, u) that `noise.py` lists."""
+    """Write the rows of M(x, u) that `noise.py` lists: `user_functions.py`, `constant_values` of `noise.py`."""
 
 
 def noise_slopes(x, u, data, out, slopes) -> None:
-    """Write these rows, and their derivatives, column by column, in the entries of (x, u) that `noise.py` lists."""
+    """Write these rows, and their derivatives, column by column, in the entries of (x, u) that `noise.py` lists.
+
+    `differences.py`, `constant_slopes` of `noise.py`.
+    """
 
 
 def measure(x, data, out) -> None:
@@ -179,7 +196,10 @@ def measure_slope(x, data, out) -> None:
     """Write the structurally nonzero entries of the measurement's Jacobian (Y, N)."""
 
 
-# Open functions of the form of the cost-to-come; see `cost_to_come_dual.py`, `cost_to_come_primal.py`.
+# Open functions of the form of the cost-to-come: `cost_to_come_dual.py`, `cost_to_come_primal.py`.
+FORM = (
+    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "smoothed_state", "previous_state",
+)  # fmt: skip
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool]:

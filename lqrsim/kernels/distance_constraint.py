@@ -1,19 +1,21 @@
 """Distances from a model, minus margins. The kernels' subset.
 
-`data` has the data of the distances. From AT on it has the number of steps with margins (the last ones hold from there
-on), the number of margins at a step, the number of each row's obstacle, and the margins, step by step.
+`data` has the data of the distances, and from AT on the numbers below, and the margins, step by step; the last ones
+hold from their step on.
 """
 
 from lqrsim.kernels.declarations import N
 
 AT = 0
+# From there on: numbers of steps with margins, and of margins at a step; then the number of each row's obstacle.
+STEPS, EACH, OBSTACLES = 0, 1, 2
 ROWS = 1  # how many there are
 
 
 def value(at, u, t, row, data):
     """The row's distance minus its margin, given all distances."""
-    steps, each = int(data[AT]), int(data[AT + 1])
-    return at[row] - data[AT + 2 + ROWS + min(t, steps - 1) * each + int(data[AT + 2 + row]) % each]
+    steps, each, obstacle = int(data[AT + STEPS]), int(data[AT + EACH]), int(data[AT + OBSTACLES + row])
+    return at[row] - data[AT + OBSTACLES + ROWS + min(t, steps - 1) * each + obstacle % each]
 
 
 def slope(at, moves, t, row, data, gradient):

@@ -2,7 +2,7 @@
 
 It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
 from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has the data of the
-distances, and from AT on the sharpness, the weight and D. `places` and `places_jacobian` are the distances here.
+distances, and from AT on the numbers below. `places` and `places_jacobian` are the distances here.
 """
 
 from lqrsim.kernels.declarations import N, places, places_jacobian, stack
@@ -10,6 +10,7 @@ from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.linear_algebra import clear
 
 AT = 0
+SHARPNESS, WEIGHT, FARTHEST = 0, 1, 2  # from there on; the last is D
 ROWS = 1  # how many there are
 MOVED = 1  # states that the distances depend on: the first ones
 
@@ -19,12 +20,12 @@ def value(x, u, t, data):
     total = 0.0
     if t > 0:
         distances = stack(ROWS)
-        sharpness, least = data[AT], exponential(-data[AT] * data[AT + 2])
+        sharpness, least = data[AT + SHARPNESS], exponential(-data[AT + SHARPNESS] * data[AT + FARTHEST])
         places(x, data, distances)
         for row in range(ROWS):
-            beyond = data[AT + 2] - distances[row]
+            beyond = data[AT + FARTHEST] - distances[row]
             total += exponential(-sharpness * distances[row]) - least * (1 + sharpness * beyond)
-    return data[AT + 1] * total
+    return data[AT + WEIGHT] * total
 
 
 def derivatives(x, u, t, data, hessian, gradient):
@@ -32,11 +33,12 @@ def derivatives(x, u, t, data, hessian, gradient):
     total = 0.0
     if t > 0:
         distances, moves = stack(ROWS), stack(ROWS, N)
-        sharpness, weight, least = data[AT], data[AT + 1], exponential(-data[AT] * data[AT + 2])
+        sharpness, weight = data[AT + SHARPNESS], data[AT + WEIGHT]
+        least = exponential(-sharpness * data[AT + FARTHEST])
         clear(moves, ROWS, N)
         places_jacobian(x, data, distances, moves)
         for row in range(ROWS):
-            beyond, cost = data[AT + 2] - distances[row], exponential(-sharpness * distances[row])
+            beyond, cost = data[AT + FARTHEST] - distances[row], exponential(-sharpness * distances[row])
             total += cost - least * (1 + sharpness * beyond)
             if beyond > 0:
                 force, stiffness = weight * sharpness * (cost - least), weight * sharpness * sharpness * cost
@@ -44,4 +46,4 @@ def derivatives(x, u, t, data, hessian, gradient):
                     gradient[i] -= force * moves[row, i]
                     for j in range(MOVED):
                         hessian[i, j] += stiffness * moves[row, i] * moves[row, j]
-    return data[AT + 1] * total
+    return data[AT + WEIGHT] * total

@@ -3,42 +3,53 @@
 All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
 """
 
+from math import inf
+
 from lqrsim.kernels.certificate import certify
-from lqrsim.kernels.cost_to_go import riccati_backward
-from lqrsim.kernels.damped_iterations import damped_iterations
+from lqrsim.kernels.control_limits import riccati_backward
+from lqrsim.kernels.damped_iterations import damped_iterations, relinearize
 from lqrsim.kernels.declarations import (
     CERTIFY,
     DAMP,
     EVALUATE,
     FINISH,
+    LINEARIZE,
+    RUNNING,
+    M,
     N,
     W,
     riccati_forward,
     smoothed_state,
     stack,
+    zeros,
 )
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
-from lqrsim.kernels.linear_algebra import copy, copy_matrix
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.newton_iterations import newton_iterations
 from lqrsim.kernels.passes import opening_pass as opening_pass
-from lqrsim.kernels.records import LinearStep, QuadraticStage
+from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
+from lqrsim.kernels.rollouts import ilqr_pass
 from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
-    """Run undamped, damped or Newton iterations; or certify the rollout and the policy kept.
+    """Run undamped, damped or Newton iterations; or do something else with a plan.
 
     Args:
-      task: one of ITERATE, DAMP, FINISH; CERTIFY, with the Hessians of the cost-to-go; or EVALUATE, with Hessians of
-        the policy itself, which overwrite them.
+      task: one of ITERATE, DAMP, FINISH; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
+        to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
+        of the policy itself, which overwrite them.
       first, last: iterations to run, `last` excluded. The rest are records.
 
     Returns:
       As `iterations.py` says.
     """
     if task >= CERTIFY:
-        certify(settings, task == EVALUATE, work.rollout, work.kept, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
+    if task == LINEARIZE:
+        _, failed = relinearize(settings, False, 0.0, model, work, memory[0], log[0])
+        return 0, RUNNING, failed >= 0, failed
     if task == DAMP:
         return damped_iterations(first, last, settings, model, work, memory[0], log)
     if task == FINISH:
@@ -47,10 +58,13 @@ def smoother(task, first, last, settings, model, work, memory, log):
 
 
 def ilqr(task, first, last, settings, model, work, log):
-    """Run iterations of iLQR; or certify the plan and the policy. As `smoother`."""
+    """Run iterations of iLQR; or linearise about the plan, or certify it, as `smoother` does."""
     if task >= CERTIFY:
-        certify(settings, task == EVALUATE, work.plan, work.policy, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.best, work.policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
+    if task == LINEARIZE:
+        failed, _, _ = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        return 0, RUNNING, failed >= 0, failed
     return ilqr_iterations(first, last, settings, model, work, log)
 
 
@@ -65,11 +79,14 @@ def lq_passes(steps, dynamics, inverse, stages, constants, work):
     Returns:
       The step that failed, or -1; and 0 if it was in the backward pass, 1 in the forward pass, 2 in their sum.
     """
-    stage, costate = QuadraticStage(stack(W, W), stack(W)), stack(N)
+    stage, costate, anywhere = QuadraticStage(stack(W, W), stack(W)), stack(N), zeros(N)
+    limits = Limits(stack(M), stack(M))
+    fill(limits.low, M, -inf)
+    fill(limits.high, M, inf)
     for t in range(steps - 1, -1, -1):
         copy_stage(t, stages, stage)
         step = LinearStep(dynamics.jacobian[t], dynamics.offset[t])
-        if not riccati_backward(t, step, stage, constants[t], work.policy, work.to_go):
+        if not riccati_backward(t, step, stage, constants[t], anywhere, limits, work.policy, work.to_go):
             return t, 0
     for t in range(steps):
         copy_stage(t, stages, stage)

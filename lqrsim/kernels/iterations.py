@@ -40,6 +40,7 @@ from lqrsim.kernels.rollouts import (
     copy_policy,
     differential_pass,
     dynamics_residual,
+    ilqr_pass,
     initial_step,
     largest_gap,
     line_search,
@@ -62,11 +63,18 @@ def relative_improvement(old, cost, negligible):
 def smoother_iterations(first, last, settings, model, work, memory, log):
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy in each iteration.
 
+    It ends where, asked in this order,
+      1. a pass fails;
+      2. the gap is below `settings.valley`: IN_VALLEY;
+      3. cost and gap have settled: COST_CONVERGED, or CONVERGED if the rollout is optimal, too;
+      4. there were `settings.max_iterations`: MAX_ITERATIONS, or DIVERGED without a finite cost;
+      5. the costs repeat, CYCLING; or, if `memory.watched`, they no longer fall: NO_PROGRESS.
+
     Args:
       settings: IterationSettings. model: ProblemModel. memory, log: rows of MEMORY and LOG.
-      work: SmootherArrays. Policy and cost-to-go are what to begin with. `rollout` and `kept` are those of the last
-        complete iteration, and before any those of the first policy. `plan` is the rollout of lowest cost so far, the
-        first policy's included, and `memory.plan_cost` its cost: for the safeguard.
+      work: SmootherArrays. Policy and cost-to-go are what to begin with. `last` and `last_policy` are those of the
+        last complete iteration, and before any those of the first policy. `best` is the rollout of lowest cost so far,
+        the first policy's included, and `memory.plan_cost` its cost: for the safeguard.
 
     With `last` of 0, only the first policy is rolled out.
     """
@@ -79,14 +87,13 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         roll_out_and_keep(steps, work.start, model, work, memory)
         copy(work.start, N, x_hat)
         if settings.guided and not fixed:
-            copy(work.guess.states[0], N, x_hat)
+            copy(work.given.states[0], N, x_hat)
     for done in range(first, last):
-        for i in range(N):
-            if fixed and x_hat[i] != work.start[i]:  # whatever ran before, each pass begins at the given start
-                x_hat[i] = work.start[i]
+        if fixed:  # whatever ran before, each pass begins at the given start
+            copy(work.start, N, x_hat)
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
-        about = Linearization(work.guess, guided, 1.0, 0.0, Prior(weight, work.prior.about))
+        about = Linearization(work.given, guided, 1.0, 0.0, Prior(weight, work.prior.about))
         failed, good = forward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), False, failed
@@ -94,10 +101,10 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         if failed >= 0:
             return done, failure(good, model), True, failed
         if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was not known
-            memory.plan_cost, _ = plan_cost(steps, work.plan, model, work.to_go)
+            memory.plan_cost, _ = plan_cost(steps, work.best, model, work.to_go)
         cost = roll_out_and_keep(steps, x_hat, model, work, memory)
         improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, negligible)
-        gap = largest_gap(steps, work.x_hats, work.rollout.states)
+        gap = largest_gap(steps, work.x_hats, work.last.states)
         settled = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
         full = done + 1 == settings.max_iterations
         left, residual = nan, nan
@@ -105,8 +112,8 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
             return done + 1, IN_VALLEY, False, -1
         if settled or full:
-            left = optimality(settings, work.rollout, model, cost, negligible)
-            residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.rollout.states)
+            left = optimality(settings, work.last, model, cost, negligible)
+            residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.last.states)
         write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
         outcome = outcome_of(settled, settings, left, cost, full)
         if outcome == RUNNING and cycling(log, done):
@@ -120,13 +127,13 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 
 def roll_out_and_keep(steps, start, model, work, memory):
     """Run the policy, and keep it with its rollout; the rollout of lowest cost is the plan. Returns the cost."""
-    cost = rollout(steps, start, work.policy, model, work.rollout)
+    cost = rollout(steps, start, work.policy, model, work.last)
     if NOISY:
-        cost += noise_cost(steps, work.rollout, model, work.to_go)
-    copy_policy(steps, work.policy, work.kept)
+        cost += noise_cost(steps, work.last, model, work.to_go)
+    copy_policy(steps, work.policy, work.last_policy)
     if cost < memory.plan_cost:
         memory.plan_cost = cost
-        copy_plan(steps, work.rollout, work.plan)
+        copy_plan(steps, work.last, work.best)
     return cost
 
 
@@ -225,10 +232,8 @@ def ilqr_iterations(first, last, settings, model, work, log):
       work: IlqrArrays. The policy makes the first trajectory; afterwards the plan is the best trajectory, and policy
         (relative to it) and cost-to-go are about it.
       log: rows of LOG; the last one has the cost that the first iteration improves on.
-
-    With `first` equal to `last`, only policy and cost-to-go are computed, about the plan as it is.
     """
-    steps, policy, plan, to_go, damping = settings.steps, work.policy, work.plan, work.to_go, work.damping
+    steps, policy, plan, to_go, damping = settings.steps, work.policy, work.best, work.to_go, work.damping
     no_shift = zeros(N)
     if first == 0:
         cost = rollout(steps, work.start, policy, model, plan)
@@ -236,17 +241,12 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if not abs(cost) < inf:
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else settings.max_iterations].cost
-    if first == last:
-        failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
-        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
-        failed, good, _ = differential_pass(steps, plan, model, ModelOrder(damping[0], 0.0, to_go), 1, policy, to_go)
+        failed, good, _ = ilqr_pass(steps, plan, model, damping[0], policy, to_go)
         while failed >= 0 and good and damping[0] < 1e25:
             damping[0] = max(10 * damping[0], 1.0)
-            failed, good, _ = differential_pass(
-                steps, plan, model, ModelOrder(damping[0], 0.0, to_go), 1, policy, to_go
-            )
+            failed, good, _ = ilqr_pass(steps, plan, model, damping[0], policy, to_go)
         if failed >= 0:
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
@@ -261,7 +261,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
         settled = abs(improvement) < settings.tolerance
         left = nan
         if settled or done + 1 == settings.max_iterations:
-            failed, _, left = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
+            failed, _, left = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
@@ -271,6 +271,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
             outcome = STALLED
         if outcome != RUNNING:
             if isnan(left):  # policy and cost-to-go are not yet about the trajectory that was found
-                failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
+                failed, _, _ = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

@@ -1,7 +1,7 @@
 """Calls of a problem's functions by their addresses: dynamics, costs, constraints, noise. The kernels' subset.
 
 Passes and iterations are thereby compiled once for a size, and serve all problems of that size. See
-`records.ProblemModel`; the C signatures are in `codegen/compiled_module.py`.
+`records.ProblemModel`.
 """
 
 from lqrsim.kernels.declarations import W, call, call_for_value, stack
@@ -10,6 +10,27 @@ from lqrsim.kernels.linear_algebra import clear, copy_matrix, fill
 VALUE, DERIVATIVES = 0, 1  # columns of `CostModel.functions`
 # Columns of `Constraints.functions`.
 AUGMENT, AUGMENTATION, VALUES, SLOPE, USES_CONTROL = 0, 1, 2, 3, 4
+
+# The arguments of functions that are called by their addresses, and the fields of the records among them, which are
+# passed field by field. Arrays are vectors, or have rows of N or W.
+SIGNATURES = {
+    "advance": "x u p h:float out",
+    "step_jacobian": "x u p h:float out jacobian:W",
+    "step_curvature": "x u p h:float weights out jacobian:W hessian:W",
+    "value": "x u t:int data",
+    "derivatives": "x u t:int data hessian:W gradient",
+    "project": "hessian:W",
+    "augment": "x u t:int data multipliers hessian:W gradient",
+    "augmentation": "x u t:int data multipliers",
+    "constraint_values": "x u t:int acts:int data multipliers values",
+    "add_slope": "x u t:int row:int data gradient",
+    "noise_value": "x u data risk ahead:NextStep",
+    "noise_quadratic": "x u data risk ahead:NextStep convex:int stage:QuadraticStage",
+    "measure": "x data out",
+    "measure_slope": "x data out:N",
+    "NextStep": "jacobian:W arrived hessian:N gradient",
+    "QuadraticStage": "hessian:W gradient",
+}
 
 
 def advance(x, u, model, h, out):

@@ -24,7 +24,7 @@ from lqrsim.kernels.declarations import (
 from lqrsim.kernels.iterations import failure, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.records import CostToGo, ModelOrder
-from lqrsim.kernels.rollouts import copy_plan, differential_pass, initial_step, line_search
+from lqrsim.kernels.rollouts import copy_plan, differential_pass, ilqr_pass, initial_step, line_search
 
 # Shares of the second order, tried in this order until a pass has a minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
@@ -52,7 +52,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
     Returns:
       As `iterations.py` says.
     """
-    steps, plan, shift = settings.steps, work.plan, stack(N)
+    steps, plan, shift = settings.steps, work.best, stack(N)
     if memory.share < 0:
         memory.share, memory.small_changes = 1.0, 0.0
         good = newton_pass(settings, model, work, memory)
@@ -66,11 +66,11 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         for i in range(N):
             shift[i] = work.x_hat[i] - plan.states[0, i]
         bound, wanted = memory.merit + ROUNDING * abs(memory.merit), ARMIJO * memory.decrease
-        merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, SMALLEST, work.rollout)
+        merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, SMALLEST, work.last)
         outcome = RUNNING
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, memory.negligible)
-            copy_plan(steps, work.rollout, plan)
+            copy_plan(steps, work.last, plan)
             memory.plan_cost, memory.merit, memory.share = cost, merit, 1.0
             write_row(log[done], cost, improvement, 0.0, nan, nan, NEWTON)
         else:
@@ -106,11 +106,10 @@ def newton_pass(settings, model, work, memory):
     Returns:
       Whether all numbers were finite.
     """
-    begin, failed, good, left = memory.share, -1, True, nan
+    begin, failed, good, left, plan, shift = memory.share, -1, True, nan, work.best, stack(N)
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # the cost of noise is weighed with the cost-to-go of smoothing
-        order = ModelOrder(0.0, 0.0, work.to_go)
-        failed, good, _ = differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
+        failed, good, _ = ilqr_pass(settings.steps, plan, model, 0.0, work.last_policy, work.to_go)
         memory.failed = failed
         if failed >= 0:
             return good
@@ -122,7 +121,15 @@ def newton_pass(settings, model, work, memory):
         else:
             damping = SMALL * max(abs(memory.merit), SMALL) * 1e3 ** (k - len(SHARES))
         if share <= begin:
-            failed, good, left = pass_of_order(settings, model, work, share, damping, second)
+            order = ModelOrder(damping, share, work.to_go)
+            failed, good, left = differential_pass(settings.steps, plan, model, order, 1, work.policy, second)
+            copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+            if failed < 0 and not settings.fixed:
+                left += initial_step(plan.states[0], model, share, second, shift)
+                for i in range(N):
+                    work.x_hat[i] += shift[i]
+                if isnan(left):
+                    failed = 0
             memory.failed, memory.share, memory.damping = failed, share, damping
             if failed < 0 or not good:
                 break
@@ -133,20 +140,6 @@ def newton_pass(settings, model, work, memory):
     memory.decrease = 2 * left
     memory.promised = relative_optimality(failed, left, memory.merit, memory.negligible)
     return good
-
-
-def pass_of_order(settings, model, work, share, damping, second):
-    """One pass with that share of the second order and that damping; returns as `differential_pass` does."""
-    plan, shift, order = work.plan, stack(N), ModelOrder(damping, share, work.to_go)
-    failed, good, left = differential_pass(settings.steps, plan, model, order, 1, work.policy, second)
-    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
-    if failed < 0 and not settings.fixed:
-        left += initial_step(plan.states[0], model, share, second, shift)
-        for i in range(N):
-            work.x_hat[i] += shift[i]
-        if isnan(left):
-            failed = 0
-    return failed, good, left
 
 
 def finish_at_plan(settings, model, work, memory, row):
@@ -164,10 +157,9 @@ def convex_value_functions(settings, model, work, memory, row):
 
     A control at a limit gets no gain, even if the next step would take it off the limit by less than the tolerance.
     """
-    policy, controls = work.policy, work.plan.controls
+    policy, controls = work.policy, work.best.controls
     if not NOISY:
-        order = ModelOrder(memory.damping, 0.0, work.to_go)
-        differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
+        ilqr_pass(settings.steps, work.best, model, memory.damping, work.last_policy, work.to_go)
     value_functions_at_plan(settings, model, work, memory, row)
     for t in range(settings.steps):
         for i in range(M):

@@ -1,8 +1,7 @@
 """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
 
-The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the
-sharpness, the weight, the number of obstacles, the number of steps with a table of obstacles, of which the last holds
-from its step on, the radius of each ball (of a point, one), and the tables. What `places` reads comes before AT.
+The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the numbers
+below, and the tables of obstacles, of which the last holds from its step on. What `places` reads comes before AT.
 """
 
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
@@ -10,6 +9,9 @@ from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AT = 0
+# From there on: sharpness, weight, numbers of obstacles and of steps with a table of these; then the radius of each
+# ball, or of the point.
+SHARPNESS, WEIGHT, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
 BALLS = 0  # 0 for a point
 AXES = (0, 1, 2)  # states that are the position, two in a plane, whose third coordinate is 0; or that move the balls
 BLOCK = 8  # obstacles whose exponentials are computed together, as vectors
@@ -25,18 +27,18 @@ def value(x, u, t, data):
             places(x, data, centres)
             for k in range(BALLS):
                 c = 3 * k
-                total += cost_of_ball(centres[c], centres[c + 1], centres[c + 2], data[AT + 4 + k], tables, data)
+                total += cost_of_ball(centres[c], centres[c + 1], centres[c + 2], data[AT + RADII + k], tables, data)
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
-            total = cost_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + 4], tables, data)
-    return data[AT + 1] * total
+            total = cost_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + RADII], tables, data)
+    return data[AT + WEIGHT] * total
 
 
 def derivatives(x, u, t, data, hessian, gradient):
     """Add the Hessian (W, W) and the gradient (W,), and return the cost. The curvature of the centres is left out."""
     total = 0.0
     if t > 0:
-        sharpness, tables = data[AT], tables_at(t, data)
+        sharpness, tables = data[AT + SHARPNESS], tables_at(t, data)
         force, stiffness, product = stack(3), stack(3, 3), stack(3)
         if BALLS:
             centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
@@ -44,7 +46,7 @@ def derivatives(x, u, t, data, hessian, gradient):
             for k in range(BALLS):
                 c = 3 * k
                 total += derivatives_of_ball(
-                    centres[c], centres[c + 1], centres[c + 2], data[AT + 4 + k], tables, data, force, stiffness
+                    centres[c], centres[c + 1], centres[c + 2], data[AT + RADII + k], tables, data, force, stiffness
                 )
                 for a in range(len(AXES)):
                     for j in range(3):
@@ -58,7 +60,9 @@ def derivatives(x, u, t, data, hessian, gradient):
                             hessian[AXES[a], AXES[b]] += jacobian[c + j, AXES[b]] * product[j]
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
-            total = derivatives_of_ball(x[AXES[0]], x[AXES[1]], height, data[AT + 4], tables, data, force, stiffness)
+            total = derivatives_of_ball(
+                x[AXES[0]], x[AXES[1]], height, data[AT + RADII], tables, data, force, stiffness
+            )
             for j in range(len(AXES)):
                 gradient[AXES[j]] += sharpness * force[j]
                 for k in range(len(AXES)):
@@ -68,20 +72,19 @@ def derivatives(x, u, t, data, hessian, gradient):
 
 def tables_at(t, data):
     """Where the table of obstacles at step t begins."""
-    radii = BALLS if BALLS else 1
-    return AT + 4 + radii + ROW * int(data[AT + 2]) * min(t, int(data[AT + 3]) - 1)
+    return AT + RADII + max(BALLS, 1) + ROW * int(data[AT + OBSTACLES]) * min(t, int(data[AT + TABLES]) - 1)
 
 
 def cost_of_ball(a, b, c, radius, table, data):
     """The cost of a ball at (a, b, c), divided by the weight."""
-    costs, count, total = stack(BLOCK), int(data[AT + 2]), 0.0
+    costs, count, total = stack(BLOCK), int(data[AT + OBSTACLES]), 0.0
     for block in range(0, count, BLOCK):
         size = min(BLOCK, count - block)
         for i in range(BLOCK):
             costs[i] = 0.0
         for i in range(size):
             distance = signed_distance(data, table + ROW * (block + i), a, b, c)
-            costs[i] = -data[AT] * (distance - radius)
+            costs[i] = -data[AT + SHARPNESS] * (distance - radius)
         for i in range(BLOCK):
             costs[i] = exponential(costs[i])
         for i in range(size):
@@ -92,23 +95,23 @@ def cost_of_ball(a, b, c, radius, table, data):
 def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
     """The cost of a ball at (a, b, c); write its gradient (3,) and Hessian (3, 3) there, divided by the sharpness."""
     slope, curve, slopes, curves = stack(BLOCK, 3), stack(BLOCK, 3, 3), zeros(3), zeros(3, 3)
-    costs, count, total = stack(BLOCK), int(data[AT + 2]), 0.0
+    costs, count, total = stack(BLOCK), int(data[AT + OBSTACLES]), 0.0
     for block in range(0, count, BLOCK):
         size = min(BLOCK, count - block)
         for i in range(BLOCK):
             costs[i] = 0.0
         for i in range(size):
             distance = signed_distance_derivatives(data, table + ROW * (block + i), a, b, c, slope[i], curve[i])
-            costs[i] = -data[AT] * (distance - radius)
+            costs[i] = -data[AT + SHARPNESS] * (distance - radius)
         for i in range(BLOCK):
             costs[i] = exponential(costs[i])
         for i in range(size):
-            cost = data[AT + 1] * costs[i]
+            cost = data[AT + WEIGHT] * costs[i]
             total += cost
             for j in range(3):
                 slopes[j] -= cost * slope[i, j]
                 for k in range(3):
-                    curves[j, k] += cost * (data[AT] * slope[i, j] * slope[i, k] - curve[i, j, k])
+                    curves[j, k] += cost * (data[AT + SHARPNESS] * slope[i, j] * slope[i, k] - curve[i, j, k])
     for j in range(3):
         force[j] = slopes[j]
         for k in range(3):

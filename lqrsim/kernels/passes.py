@@ -5,7 +5,7 @@ A pass returns the step at which it failed, or -1, and whether all numbers there
 
 from math import inf
 
-from lqrsim.kernels.control_limits import fix_controls_at_limits, limited_control, riccati_backward_within
+from lqrsim.kernels.control_limits import fix_controls_at_limits, limited_control, riccati_backward
 from lqrsim.kernels.declarations import (
     NOISY,
     M,
@@ -108,7 +108,7 @@ def backward_pass(settings, model, about, work):
         ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
         size += abs(constant)
-        good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
+        good = riccati_backward(t, step, stage, constant, x, model.limits, work.policy, to_go)
         if not good or not smoothed_state(t, to_go, to_come, costate, x_hat):
             good = finite(stage.hessian, W, W) and finite(step.jacobian, N, W) and finite(to_come.matrix[t], N, N)
             return t, good, 0.0
@@ -151,7 +151,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         linearize_forward(x, u, model, arrived, step)
         ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
-        if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
+        if not riccati_backward(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
         copy(x, N, x_hat)
         minimize_cost_to_go(to_go.hessian[t], to_go.gradient[t], x_hat)

@@ -233,7 +233,7 @@ class ActiveRows(NamedTuple):
     """An active set: the rows of all constraints and control limits, `size` at each step.
 
     Attributes:
-      table: (size, 6) properties of each row; see `active_set.py`.
+      table: (size, 6) properties of each row; see `stages.py`.
       live, held: ((T+1) size,) 1 for rows that act, and for those in the active set, else 0.
       numbers: their values. force: their multipliers. pressing: their multipliers after a step.
       wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
@@ -293,7 +293,7 @@ class SmootherArrays(NamedTuple):
     Attributes:
       start: (N,) the first state. x_hat: (N,) the smoothed state that a pass has reached. x_hats: (T+1, N) all of them.
       homotopy_scaled: the stage cost of the passes; not the true one in the first iterations of a homotopy.
-      guess: guides the first pass. plan: the best trajectory so far. rollout: that of the last policy, `kept`.
+      given: the trajectory that guides the first pass. best: the best one so far. last: that of the last policy.
       certificate: (1,) row of `CERTIFICATE`.
     """
 
@@ -306,10 +306,10 @@ class SmootherArrays(NamedTuple):
     smoothing: SmootherGains
     homotopy_scaled: Any
     prior: Prior
-    guess: Motion
-    plan: Motion
-    rollout: Motion
-    kept: Policy
+    given: Motion
+    best: Motion
+    last: Motion
+    last_policy: Policy
     certificate: Arrays
 
 
@@ -327,14 +327,14 @@ class IlqrArrays(NamedTuple):
     """All arrays of iLQR.
 
     Attributes:
-      plan: the best trajectory so far. trial: that of a line search. damping: (1,) weight on changes of the controls.
+      best: the best trajectory so far. trial: that of a line search. damping: (1,) weight on changes of the controls.
       certificate: (1,) row of `CERTIFICATE`.
     """
 
     start: Arrays
     policy: Policy
     to_go: CostToGo
-    plan: Motion
+    best: Motion
     trial: Motion
     damping: Arrays
     certificate: Arrays

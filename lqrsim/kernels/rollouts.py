@@ -6,7 +6,7 @@ The kernels' subset. Shapes and names are those of `passes.py`.
 from math import isnan, nan
 
 from lqrsim.kernels.control_limits import limited_control, minimize_within
-from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
+from lqrsim.kernels.declarations import NOISY, M, N, W, inline, stack, zeros
 from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clamp, congruence, copy, copy_matrix, finite
 from lqrsim.kernels.model_functions import (
     advance,
@@ -19,7 +19,7 @@ from lqrsim.kernels.model_functions import (
     step_second_order,
 )
 from lqrsim.kernels.passes import end_model
-from lqrsim.kernels.records import Limits, NextStep, QuadraticStage
+from lqrsim.kernels.records import Limits, ModelOrder, NextStep, QuadraticStage
 
 
 def rollout(steps, x0, policy, model, plan):
@@ -113,6 +113,12 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
     return -1, True, predicted
 
 
+@inline
+def ilqr_pass(steps, plan, model, damping, policy, to_go):
+    """`differential_pass` of iLQR, with that damping."""
+    return differential_pass(steps, plan, model, ModelOrder(damping, 0.0, to_go), 1, policy, to_go)
+
+
 def initial_step(x0, model, share, to_go, direction):
     """Write the best move (N,) of a soft start x0, given the cost-to-go at 0; return its predicted decrease, or NaN."""
     S, s = to_go.hessian[0], to_go.gradient[0]
@@ -182,7 +188,7 @@ def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     Returns:
       The merit, the cost, and the fraction: `bound`, `bound` and 0 if none down to `smallest` will do.
     """
-    fraction, plan, policy = 1.0, work.plan, work.policy
+    fraction, plan, policy = 1.0, work.best, work.policy
     while fraction >= smallest:
         for i in range(N):
             trial.states[0, i] = plan.states[0, i] + fraction * shift[i]

@@ -81,12 +81,10 @@ class Clearance(KeepsClear, Constraint):
         else:
             found, tables, count = shape.centers, world.tables(times), len(shape.radii)
             rows, shared = [(name, number) for name in shape.names for number in range(len(world))], 3 * count
-            sizes = [*margins.shape, len(world), len(tables)]
-            if found is None:
-                kernel, least = source_of(clearance, AXES=shape.moved_by), (shape.radii + margins).ravel()
-            else:
-                kernel, least = source_of(clearance, AT=found.numbers, BALLS=count), [*shape.radii, *margins.ravel()]
-            own = [*sizes, *least, *tables.ravel()]
+            kernel = source_of(clearance, AXES=shape.moved_by)
+            if found is not None:
+                kernel = source_of(clearance, AT=found.numbers, BALLS=count)
+            own = [*margins.shape, len(world), len(tables), *shape.radii, *margins.ravel(), *tables.ravel()]
 
         def describe(row: int) -> str:
             part, number = rows[row]

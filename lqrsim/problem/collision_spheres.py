@@ -13,7 +13,6 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import (
     Term,
-    UserFunction,
     axes_of,
     check_depends_on,
     check_derivative,
@@ -23,6 +22,7 @@ from lqrsim.codegen.user_functions import (
     numbers_of,
     raise_again,
     rows_of,
+    with_derivatives,
 )
 from lqrsim.errors import (
     Array,
@@ -235,22 +235,15 @@ class CollisionSpheres:
         }
 
     def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
-        names, parameters = dynamics.state_coordinates.names, tuple(dynamics.parameters)
+        names, size = dynamics.state_coordinates.names, self._size_of(dynamics)
         axes, unused = axes_of("CollisionSpheres", self.depends_on, names)
-        rest: dict[str, Any] = {"level": self.level, "states": len(names), "controls": 0, "parameters": parameters}
-        rest |= {"offset": 1 if self.jacobian is None else 2, "with_control": False}
-        size = self._size_of(dynamics)
-        values = size * len(self)
-        functions = (
-            UserFunction(
-                function=self.function, values=values, entries=self.names, columns=size, unused=unused, **rest
-            ),
-        )
+        returned = {"values": size * len(self), "entries": self.names, "columns": size, "unused": unused}
+        functions = with_derivatives(
+            self.function, returned, self.jacobian, ((len(self), size, len(names)),),
+            level=self.level, states=len(names), controls=0, parameters=tuple(dynamics.parameters), with_control=False,
+        )  # fmt: skip
         source = source_of(user_functions, BALLS=len(self), COORDINATES=size)
-        if self.jacobian is not None:
-            shape = len(self), size, len(names)
-            functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
-        else:
+        if self.jacobian is None:
             source = source_of(differences, BALLS=len(self), AXES=axes).filled(places=source)
         return SphereCenters(source, dynamics.data, axes, size == 2, functions=functions)
 

@@ -16,13 +16,13 @@ from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import (
     Term,
-    UserFunction,
     axes_of,
     check_depends_on,
     check_derivative,
     check_signature,
     level_of,
     name_of,
+    with_derivatives,
 )
 from lqrsim.errors import (
     Array,
@@ -389,13 +389,15 @@ class ObstacleCost(KeepsClear, Cost):
             sizes = self.sharpness, self.weight, len(shape.world), len(tables)
             own = np.concatenate([sizes, shape.radii, tables.ravel()])
             if found is None:
-                return CostTerm(source_of(obstacle_cost, AXES=axes), own, nonconvex_in=axes, factor=1)
+                return CostTerm(
+                    source_of(obstacle_cost, AXES=axes), own, nonconvex_in=axes, factor=obstacle_cost.WEIGHT
+                )
             kernel = source_of(obstacle_cost, AT=found.numbers, BALLS=len(shape.radii), AXES=axes)
         return CostTerm(
             found.filling(kernel),
             np.concatenate([found.data, own]),
             nonconvex_in=axes or None,
-            factor=len(found.data) + 1,
+            factor=len(found.data) + obstacle_cost.WEIGHT,
             functions=found.functions,
             exact_hessian=False,
         )
@@ -501,11 +503,10 @@ class FunctionCost(OfFunction, Cost):
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
         axes, unused = axes_of("FunctionCost", self.depends_on, names)
-        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
-        rest["offset"] = 1 if self.derivatives is None else 2
-        functions = (UserFunction(function=self.function, values=1, unused=unused, **rest),)
-        if self.derivatives is not None:
-            functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
+        functions = with_derivatives(
+            self.function, {"values": 1, "unused": unused}, self.derivatives, ((n + m,), (n + m, n + m)),
+            level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
+        )  # fmt: skip
         source = source_of(user_functions)
         if self.derivatives is None:
             source = source_of(differences, AXES=axes).filled(value=source)

@@ -96,7 +96,7 @@ class PlainTerm:
         first = term.functions[:1]
         parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
         wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
-        sizes, calls = {"N": states, "M": controls, "W": self.size}, plain_calls(term.functions, parameters)
+        sizes, calls = {"N": states, "M": controls}, plain_calls(term.functions, parameters)
         self._functions = plain_functions(term.code, sizes, wanted, calls)
         places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
         self._data = np.concatenate([places, term.data])

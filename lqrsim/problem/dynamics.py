@@ -20,6 +20,7 @@ from lqrsim.codegen.user_functions import (
     level_of,
     name_of,
     plain_calls,
+    with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_number, excerpt
 from lqrsim.kernels import differences, runge_kutta, step_curvature, user_functions
@@ -213,13 +214,11 @@ class Dynamics:
         """
         if self.level == "symbolic":
             return ()
-        n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
-        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": names}
-        rest["offset"] = 1 if self.jacobian is None else 2
-        rate = UserFunction(function=self.f, values=n, entries=self.state_coordinates.names, **rest)
-        if self.jacobian is None:
-            return (rate,)
-        return rate, UserFunction(function=self.jacobian, writes=((n, n), (n, m)), **rest)
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        return with_derivatives(
+            self.f, {"values": n, "entries": self.state_coordinates.names}, self.jacobian, ((n, n), (n, m)),
+            level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
+        )  # fmt: skip
 
     @cached_property
     def source(self) -> Source:
@@ -269,7 +268,7 @@ class Dynamics:
     def compiled(self) -> CompiledModule:
         """The compiled module of `step_source`."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
+        return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m)
 
     @cached_property
     def curvature_source(self) -> Source | None:
@@ -302,7 +301,7 @@ class Dynamics:
         if self.curvature_source is None:
             return 0.0
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        module = module_of(self.curvature_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
+        module = module_of(self.curvature_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m)
         return module.addresses("step_curvature")[0]
 
     @property
@@ -458,7 +457,7 @@ class Dynamics:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
         calls = plain_calls(self.functions, self.parameters)
-        return plain_functions(self.step_source, {"N": n, "M": m, "W": n + m}, names, calls)
+        return plain_functions(self.step_source, {"N": n, "M": m}, names, calls)
 
     def _numbers(self) -> Array:
         """The `p` of the compiled functions, with places for the addresses of functions."""

@@ -17,7 +17,6 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import (
     Term,
-    UserFunction,
     axes_of,
     check_depends_on,
     check_signature,
@@ -26,6 +25,7 @@ from lqrsim.codegen.user_functions import (
     numbers_of,
     raise_again,
     rows_of,
+    with_derivatives,
 )
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_name, check_number, excerpt
 from lqrsim.kernels import differences, user_functions
@@ -229,14 +229,13 @@ class Noise:
         names = (*states, *controls)
         active, unused = axes_of("Noise", self.depends_on, names)
         n, m = len(states), len(controls)
-        function = UserFunction(
-            function=self.function, level=self.level, states=n, controls=m, parameters=tuple(self.parameters), offset=1,
-            values=n * self.size, entries=states, columns=self.size,
-            unused=unused,
+        functions = with_derivatives(
+            self.function, {"values": n * self.size, "entries": states, "columns": self.size, "unused": unused}, None,
+            (), level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
         )  # fmt: skip
         given = source_of(user_functions, COLUMNS=self.size, STRENGTH=1 + len(self.parameters))
         source = source_of(differences, COLUMNS=self.size, AXES=active).filled(noise_values=given)
-        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=(function,))
+        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, functions=functions)
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
         """The matrices M (K, n, k) at given states and controls, in the states' units.
@@ -255,7 +254,7 @@ class Noise:
         u = check_array("controls", controls, (len(x), m), infinite=True)
         term = self.bind(dynamics)
         compact = np.zeros((len(x), len(term.rows), self.size))
-        module = module_of(term.code, "noise", N=n, M=m, W=n + m)
+        module = module_of(term.code, "noise", N=n, M=m)
         module.matrices_of(len(x), in_c_order(x), in_c_order(u), numbers_of(term), compact)
         raise_again(term.functions)
         found = np.zeros((len(x), n, self.size))

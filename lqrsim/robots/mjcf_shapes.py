@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_number, vectors_of
-from lqrsim.kernels import mjcf_distances, mjcf_places
+from lqrsim.kernels import differences, mjcf_distances, mjcf_places
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.dynamics import Dynamics
@@ -160,9 +160,10 @@ class MjcfBalls(CollisionSpheres):
         if not isinstance(dynamics, MjcfDynamics):
             raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
         memory = MjcfMemory.of(dynamics)
-        positions = dynamics.physics.model.nv
-        data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
-        return SphereCenters(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
+        positions = tuple(range(dynamics.physics.model.nv))
+        data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
+        source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_places))
+        return SphereCenters(source, data, positions, functions=(memory,))
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:

@@ -16,17 +16,16 @@ from collections.abc import Callable
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels.active_set import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures
+from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
+from lqrsim.solvers.interior_point import AT_LIMIT, REGULARISATION, Measures
 from lqrsim.solvers.settings import INSIDE
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.stages import FIRMNESS, MIXES, Stages
 
 STEPS = 12  # at most: a solve that needs more does not converge
 PIVOTS, FEW = 15, 4  # most pivots of a convex problem, and of one that need not be convex
 PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
 SHARES = (0.0, 0.3)  # fractions of the convex models in a step, tried in turn
-PENALTY = 8.0  # penalty that makes the policy keep the constraints, in cost per squared row size
 
 
 class ActiveSet:
@@ -95,7 +94,7 @@ class ActiveSet:
         """
         stages = self.stages
         for share in MIXES:
-            if self._solve(share, price=PENALTY * REGULARISATION)[0]:
+            if self._solve(share, price=FIRMNESS * REGULARISATION)[0]:
                 break
         else:
             stages.policy.gain[...] = 0.0
@@ -107,7 +106,7 @@ class ActiveSet:
         """Multipliers (T+1, rows) and penalty of each constraint."""
         owners = self.stages.owners
         sizes = [self.sizes.rows[owners == k] for k in range(len(self.stages.problem.constraint_terms))]
-        prices = [PENALTY * self._scale / float(np.median(size**2)) if len(size) else 1.0 for size in sizes]
+        prices = [FIRMNESS * self._scale / float(np.median(size**2)) if len(size) else 1.0 for size in sizes]
         return [(self.force[:, owners == k].copy(), price) for k, price in enumerate(prices)]
 
     def _measure(self, cost: float) -> None:

@@ -15,6 +15,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.engine import RunResult
+from lqrsim.solvers.settings import can_be_exact
 from lqrsim.versions import versions
 
 
@@ -84,10 +85,9 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
         return f"raise max_iterations: the cost still fell in the last one, by {fell:.2g} to {log[-1].cost:.6g}"
-    exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
     limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
-    if status is not Status.TIME_LIMIT and exact and paper and (problem.constraints or limited):
+    if status is not Status.TIME_LIMIT and can_be_exact(problem) and paper and (problem.constraints or limited):
         return (
             'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
         )

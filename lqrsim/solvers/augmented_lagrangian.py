@@ -16,7 +16,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import LOG
+from lqrsim.kernels.records import LOG, Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
@@ -26,7 +26,7 @@ from lqrsim.solvers.compiled import ConstraintMultipliers
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess
 
-PENALTY = 8.0  # initial penalty, relative to the cost of changing the constraint's value
+INITIAL = 8.0  # initial penalty, relative to the cost of changing the constraint's value
 GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and in all before it is given up
 STUCK = 3  # how often in a row the penalty may grow to no avail
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
@@ -37,10 +37,10 @@ STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they a
 REFINED = 5  # damped iterations from a plan of the search before Newton's method goes on
 
 
-def finish(run: SolveRun) -> RunResult:
+def by_multipliers(run: SolveRun) -> RunResult:
     """Run to the end, with the method, its safeguard and these iterations; certified."""
     if run.initial_guess.multipliers and run.run_opening_pass():
-        found = satisfy(run, None)
+        found = meet_constraints(run, None)
         if found.success or run.budget.over:
             return run.certified(found)
         # Knowledge of another problem does not help here.
@@ -62,11 +62,11 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
             found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
         return run, found
     if found.success:
-        return run, satisfy(run, found)
+        return run, meet_constraints(run, found)
     return _first_feasible(run, found)
 
 
-def satisfy(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> RunResult:
+def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> RunResult:
     """Continue from the result without the constraints or, without one, from another solution's multipliers.
 
     `stale` is the number of undamped iterations that come no closer before damped ones follow.
@@ -74,7 +74,7 @@ def satisfy(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> Ru
     lagrangian = AugmentedLagrangian(run)
     if found is None:
         run.roll_out()
-        lagrangian.evaluate(run.work.states, run.work.controls)
+        lagrangian.evaluate(*run.work.last)
     else:
         lagrangian.evaluate(found.states, found.controls)
         if lagrangian.kept:
@@ -102,7 +102,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     with budget.without_costs():
         kept = without.solve()
         if kept.success and not budget.over:
-            kept = satisfy(without, kept)
+            kept = meet_constraints(without, kept)
     if not kept.success or budget.over:
         # Only the constraints of the plan are known; its certificate has the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
@@ -113,9 +113,9 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     )  # fmt: skip
     run = _again(run, problem, initial_guess)
     if kept.multipliers:
-        return run, satisfy(run, None)
+        return run, meet_constraints(run, None)
     found = run.solve()
-    return run, satisfy(run, found) if found.success and not budget.over else found
+    return run, meet_constraints(run, found) if found.success and not budget.over else found
 
 
 def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, patience: int) -> RunResult:
@@ -124,7 +124,6 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
     They end after `patience` that come no closer.
     """
     work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
-    work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
     rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
     done, since, stale, nearest = 0, 0, 0, np.inf
     while True:
@@ -135,7 +134,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
         if stopped or len(log) == begin or not np.isfinite(log[-1].cost):
             break
         last = log[-1]
-        lagrangian.evaluate(work.states, work.controls)
+        lagrangian.evaluate(*work.last)
         settled = ending.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
         if done == len(rows) or (settled and lagrangian.solved):
             break
@@ -162,35 +161,32 @@ def _damped(
 ) -> RunResult:
     """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
     work = run.work
-    plans = [(work.states, work.controls, undamped.cost)]
-    plans += [(found.states, found.controls, found.cost)] if found is not None else []
-    plans = [plan for plan in plans if np.isfinite(plan[2])]
+    plans = [(work.last, undamped.cost)]
+    plans += [(Motion(found.states, found.controls), found.cost)] if found is not None else []
+    plans = [(plan, cost) for plan, cost in plans if np.isfinite(cost)]
     if not plans:
         return undamped
-    lagrangian.evaluate(*plans[-1][:2])
+    lagrangian.evaluate(*plans[-1][0])
     lagrangian.start()
     merits = []
-    for *plan, cost in plans:
+    for plan, cost in plans:
         lagrangian.evaluate(*plan)
         merits.append(cost + lagrangian.added())
-    states, controls, cost = plans[int(np.argmin(merits))]
-    work.plan[0][:], work.plan[1][:] = states, controls
-    work.memory["plan_cost"] = cost
+    plan, cost = plans[int(np.argmin(merits))]
+    work.take(*plan, cost)
     return _rounds(run, lagrangian, "the undamped method failed with the constraints")
 
 
-def refine(run: SolveRun) -> RunResult:
+def damped_from_rollout(run: SolveRun) -> RunResult:
     """Run to the end, only by steps that lower the cost, from the rollout of the first policy; certified.
 
     So it stays in the homotopy class that it begins with, which undamped iterations would leave.
     """
     run.roll_out()
-    cost = float(run.work.memory["plan_cost"])
-    optimality = run.linearize_about_plan() if np.isfinite(cost) else np.nan
+    optimality = run.linearize_about_plan() if np.isfinite(run.work.cost) else np.nan
     if not np.isfinite(optimality):
         return run.certified(run.solve())
     if not run.problem.constraints:
-        run.work.memory["merit"] = cost
         if not run.second_order:
             damped = run.damped()
         else:
@@ -200,7 +196,7 @@ def refine(run: SolveRun) -> RunResult:
                 return run.certified(run.newton())
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
-    lagrangian.evaluate(*run.work.plan)
+    lagrangian.evaluate(*run.work.best)
     lagrangian.start()
     return run.certified(_rounds(run, lagrangian, ""))
 
@@ -208,14 +204,13 @@ def refine(run: SolveRun) -> RunResult:
 def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunResult:
     """Damped iterations from the plan in the memory and updates of the multipliers, until the constraints are met."""
     work, budget = run.work, run.budget
-    lagrangian.evaluate(*work.plan)
+    lagrangian.evaluate(*work.best)
     rounds, rough = 0, True
     while True:
         rounds += 1
-        work.memory["merit"] = work.memory["plan_cost"] + lagrangian.added()
         # Until the multipliers are about right, there is no point in a minimum to all its digits.
-        ending = run.damped(least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
-        lagrangian.evaluate(*work.plan)
+        ending = run.damped(added=lagrangian.added(), least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
+        lagrangian.evaluate(*work.best)
         if ending.success and lagrangian.solved:
             if not rough:
                 found = run.damped_result(ending, ending.status, why)
@@ -310,7 +305,7 @@ class AugmentedLagrangian:
             own.values[...] = 0.0
             if not self._first[which] > 0:
                 # Only now: once there is a penalty, the passes' curvature contains it.
-                self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
+                self._first[which] = INITIAL * self._curvature(which) if len(values) else 1.0
             own.penalty = self._first[which]
 
     def update(self, growth: float = GROWTH) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of
-from lqrsim.codegen.user_functions import address_of
+from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
@@ -23,7 +23,7 @@ from lqrsim.kernels import (
     model_functions,
     projection,
 )
-from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
+from lqrsim.kernels.declarations import FIRST, FORM, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import (
     Constraints,
     CostModel,
@@ -37,14 +37,11 @@ from lqrsim.kernels.records import (
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.noise import NoiseTerm, numbers_of
+from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 
 # The forms of the cost-to-come, and the kernels of each.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
-_OF_FORM = (
-    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "smoothed_state", "previous_state",
-)  # fmt: skip
 
 
 def core(problem: Problem, form: str = "dual") -> CompiledModule:
@@ -59,18 +56,17 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
     """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/entry_points.py`."""
     what = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(with_form(form), what, N=n, M=m, W=n + m, NOISY=0)
+    return module_of(with_form(form), what, N=n, M=m, NOISY=0)
 
 
 @functools.cache
 def with_form(form: str) -> Source:
     """The entry points with a form of the cost-to-come."""
-    return source_of(entry_points).filled(**dict.fromkeys(_OF_FORM, source_of(FORMS[form])))
+    return source_of(entry_points).filled(**dict.fromkeys(FORM, source_of(FORMS[form])))
 
 
 def _sizes(dynamics: Dynamics) -> dict[str, int]:
-    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    return {"N": n, "M": m, "W": n + m}
+    return {"N": len(dynamics.state_coordinates), "M": len(dynamics.control_coordinates)}
 
 
 def structure(problem: Problem) -> tuple[Any, ...]:
@@ -109,14 +105,7 @@ def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> Dynamic
     """The dynamics' functions and parameters for compiled code."""
     advance, step_jacobian = dynamics.compiled.addresses("advance", "step_jacobian")
     curvature = dynamics.step_curvature if second_order else 0.0
-    return DynamicsModel(advance, step_jacobian, curvature, numbers(dynamics))
-
-
-def numbers(part: Dynamics | CostTerm | ConstraintTerm) -> Array:
-    """The data of a part for compiled code: the addresses of its functions, then its numbers."""
-    if not part.functions:
-        return part.data
-    return np.concatenate([[address_of(function) for function in part.functions], part.data])
+    return DynamicsModel(advance, step_jacobian, curvature, numbers_of(dynamics))
 
 
 def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
@@ -129,11 +118,11 @@ def _cost(problem: Problem, field: str, constraints: Sequence["ConstraintMultipl
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
     stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one in (own.term for own in constraints))
     acting = Constraints(
-        _constraint_functions(stated, sizes), tuple(numbers(own.term) for own in constraints),
+        _constraint_functions(stated, sizes), tuple(numbers_of(own.term) for own in constraints),
         tuple(own.array for own in constraints), len(constraints),
     )  # fmt: skip
     indefinite = sum(term.nonconvex_in is not None for term in terms)
-    return CostModel(functions, tuple(map(numbers, terms)), len(terms), indefinite, project, acting)
+    return CostModel(functions, tuple(map(numbers_of, terms)), len(terms), indefinite, project, acting)
 
 
 _Sizes = tuple[tuple[str, int], ...]

@@ -25,10 +25,9 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
-from lqrsim.solvers import augmented_lagrangian
-from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, damped_from_rollout, meet_constraints
 from lqrsim.solvers.budget import Laps
-from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
@@ -44,7 +43,6 @@ RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
-ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 @dataclass
@@ -121,8 +119,8 @@ class Ladder:
         run.smooth(GUIDED if self._guided else OPENING)
         ending = run.checked_ending()
         settled = ending.success or ending.outcome == declarations.IN_VALLEY
-        plan = run.work.arrays.rollout if settled else run.work.plan  # the plan of least cost so far
-        if ending is not run.ending or not np.isfinite(run.work.memory["plan_cost"]):
+        plan = run.work.arrays.last if settled else run.work.best  # the plan of least cost so far
+        if ending is not run.ending or not np.isfinite(run.work.cost):
             return None
         self._smoothed = copied(plan)
         if self._budget.stop.due:
@@ -159,7 +157,7 @@ class Ladder:
     def _refined(self) -> RunResult | None:
         """From the plan of damped iterations on the augmented Lagrangian."""
         with self._budget.limited(REFINED):
-            found = augmented_lagrangian.refine(self._run)
+            found = damped_from_rollout(self._run)
         return self._after_multipliers(found)
 
     def _augmented(self, start: RunResult) -> RunResult | None:
@@ -171,7 +169,7 @@ class Ladder:
         if self._smoothed is None or run.settings.elastic is not None or not self._guided:
             return None
         with self._budget.limited(AUGMENTED):
-            found = augmented_lagrangian.satisfy(run, run.result(run.ending), stale=STALE)
+            found = meet_constraints(run, run.result(run.ending), stale=STALE)
         return self._after_multipliers(found, most=start.cost)
 
     def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:

@@ -3,14 +3,14 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
 from lqrsim.kernels.records import (
@@ -73,6 +73,7 @@ MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the
 # smoothing has then found the valley, and what is left is the way along it. Damped iterations, which come there slowly,
 # end where the cost falls by less than NEARLY, twice, with a gap below NEAR.
 VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
+ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 _idle: "list[SolveRun]" = []
 _lending = threading.Lock()
 
@@ -162,9 +163,7 @@ def iterate(
         clock, begin = time.perf_counter(), done
         try:
             done, outcome, backward, failed = run(begin, min(begin + bite, last))
-            for function in functions:
-                if function.raised is not None and not isinstance(function.raised, Exception):
-                    stop.error = function.raised  # Ctrl-C
+            stop.error = interrupt_of(functions) or stop.error
             missed = violation() if done > begin else 0.0
         except BaseException as error:  # Ctrl-C: raised again when there is a solution
             stop.error, outcome = error, declarations.TIMED_OUT
@@ -182,12 +181,6 @@ def iterate(
         if stop.error is not None:
             outcome = declarations.TIMED_OUT
     return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
-
-
-def raised_by(functions: Iterable[UserFunction]) -> str:
-    """The exceptions of the functions, as text."""
-    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
-    return "; ".join(raised)
 
 
 def check_finite_at_start(
@@ -301,7 +294,6 @@ class SolveRun:
         self.initial_guess, self.budget = initial_guess, budget
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # of smoothing, and which comes next
         self._last: Iteration | None = None  # of smoothing
-        self.work.memory["watched"] = float(self.settings.safeguard)
         self.ending = Ending(declarations.RUNNING)
         settings, problem = self.settings, self.problem
         self.second_order = settings.second_order(problem)
@@ -348,7 +340,7 @@ class SolveRun:
         if not self._row and not self.run_opening_pass():
             return
         begin, last = len(self.budget.log), min(last, len(self._rows))
-        self.ending = self._iterate(self._arguments, self.work.arrays.rollout, self._rows, self._row, last)
+        self.ending = self._iterate(self._arguments, self.work.arrays.last, self._rows, self._row, last)
         if len(self.budget.log) > begin:
             self._row, self._last = self._row + len(self.budget.log) - begin, self.budget.log[-1]
         if self.ending.outcome == declarations.TIMED_OUT and not self._row:
@@ -362,7 +354,7 @@ class SolveRun:
         work = self.work
         arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._shares[0]))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.given, work.prior, homotopy_scaled,
             arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
@@ -387,9 +379,8 @@ class SolveRun:
 
     def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
         """Newton's method from the best plan so far; `added` is the constraints' share of its cost."""
-        memory = self.work.memory
-        memory["merit"], memory["share"] = memory["plan_cost"] + added, -1.0
-        ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.plan)
+        self.work.begin_newton(added)
+        ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
         return self.damped_result(ending, ending.status, detail)
@@ -397,7 +388,6 @@ class SolveRun:
     def safeguard(self, found: RunResult) -> RunResult:
         """Damped iterations from the best plan so far, after smoothing failed."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
-        work.memory["merit"] = work.memory["plan_cost"]
         damped = None
         for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.second_order else ((0.0, 0.0),):
             damped = self.damped(least=least)
@@ -407,7 +397,7 @@ class SolveRun:
             if found.success or self.budget.over:
                 return found
         assert damped is not None
-        if not np.isfinite(work.memory["plan_cost"]):
+        if not np.isfinite(work.cost):
             # Nothing leads anywhere: report how it failed.
             given_up = found.status in (Status.MAX_ITERATIONS, Status.STALLED)
             return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
@@ -418,21 +408,19 @@ class SolveRun:
             status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)
 
-    def damped(self, *, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
-        """Damped iterations from the plan, whose cost and merit are in the memory; see `kernels/damped_iterations.py`.
+    def damped(self, *, added: float = 0.0, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
+        """Damped iterations from the best plan so far; see `kernels/damped_iterations.py`.
 
-        The tolerances of cost and gap are at least `least`.
+        `added` is the constraints' share of its cost; the tolerances of cost and gap are at least `least`.
         """
-        memory = self.work.memory
-        memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
-        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
-        return self._iterate(partial(self._plan_arguments, declarations.DAMP, least=least), self.work.plan)
+        self.work.begin_damped(added)
+        return self._iterate(partial(self._plan_arguments, declarations.DAMP, least=least), self.work.best)
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
         """More iterations, in rows of their own; a prior acts no longer."""
-        self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
+        self.work.disregard_costs()
         begin, again = len(self.budget.log), partial(self._arguments, again=True)
-        ending = self._iterate(again, self.work.arrays.rollout, rows, first, last)
+        ending = self._iterate(again, self.work.arrays.last, rows, first, last)
         if len(self.budget.log) > begin:
             self._last = self.budget.log[-1]
         return ending
@@ -442,7 +430,7 @@ class SolveRun:
     def checkpoint(self) -> list[tuple[Array, Array]]:
         """The arrays with the state of smoothing, and copies."""
         arrays = self.work.arrays
-        return [(one, one.copy()) for one in (*arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat)]
+        return [(one, one.copy()) for one in (*arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat)]
 
     def go_on(self, checkpoint: list[tuple[Array, Array]], others: Sequence[Iteration] = ()) -> None:
         """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
@@ -459,9 +447,9 @@ class SolveRun:
 
     def linearize_about_plan(self) -> float:
         """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
-        rows, memory = np.full(1, np.nan, LOG), self.work.memory
-        memory["merit"] = memory["plan_cost"]
-        self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, rows))
+        rows = np.full(1, np.nan, LOG)
+        self.work.begin_damped()
+        self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, rows))
         return float(rows["optimality"][0])
 
     def fails_at(self, risk: float) -> int:
@@ -470,7 +458,7 @@ class SolveRun:
         Overwrites the arrays of the passes.
         """
         self.work.model.noise.risk[0] = risk
-        *_, failed = self._loop(*self._plan_arguments(declarations.DAMP, 0, 0, np.full(1, np.nan, LOG)))
+        *_, failed = self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, np.full(1, np.nan, LOG)))
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
@@ -480,15 +468,16 @@ class SolveRun:
         """Result of smoothing, with its ending."""
         work, last = self.work, self._last
         return RunResult(
-            status=ending.status, detail=ending.detail(self.problem.steps), states=work.states, controls=work.controls,
-            law=work.arrays.kept, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
+            status=ending.status, detail=ending.detail(self.problem.steps), states=work.last.states,
+            controls=work.last.controls, law=work.arrays.last_policy, cost=_cost_of(last),
+            violation=np.inf if last is None else last.violation,
             gap=np.nan if last is None else last.gap,
             values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
 
     def best(self, found: RunResult) -> RunResult:
         """The best plan so far in place of the last one, with a policy and value functions about it."""
-        cost = float(self.work.memory["plan_cost"])
+        cost = self.work.cost
         if not np.isfinite(cost) or (not cost < found.cost and found.values):
             return found
         optimality = self.linearize_about_plan()
@@ -501,8 +490,8 @@ class SolveRun:
         if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # stopped, and did not look back
             return self.best(
                 RunResult(
-                    status=status, detail=detail, states=self.work.states, controls=self.work.controls,
-                    law=self.work.arrays.kept, cost=np.inf, violation=np.inf, gap=np.nan,
+                    status=status, detail=detail, states=self.work.last.states, controls=self.work.last.controls,
+                    law=self.work.arrays.last_policy, cost=np.inf, violation=np.inf, gap=np.nan,
                 )
             )  # fmt: skip
         optimality = self.budget.log[-1].optimality if self.budget.log else np.nan
@@ -511,7 +500,7 @@ class SolveRun:
     def _about_plan(self, optimality: float, status: Status, detail: str) -> RunResult:
         """The plan in memory, with the last policy and value functions about it."""
         work = self.work
-        states, controls = work.plan
+        states, controls = work.best
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is no model about the plan, nor a policy
             law, gap = (np.zeros_like(work.arrays.policy.gain), controls.copy()), np.nan
@@ -526,7 +515,7 @@ class SolveRun:
                 )
         return RunResult(
             status=status, detail=detail.removeprefix("; "), states=states, controls=controls, law=law,
-            cost=float(work.memory["plan_cost"]), violation=self._violation_of(work.plan), gap=gap, values=values,
+            cost=work.cost, violation=self._violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
     def certified(self, found: RunResult) -> RunResult:
@@ -548,8 +537,8 @@ class SolveRun:
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
         """This run as a candidate of a search; `found` is its result if it was run to its end."""
-        states, controls = (self.work.states, self.work.controls) if found is None else (found.states, found.controls)
-        plan = Trajectory(states.copy(), controls.copy(), self.problem.dt)
+        plan = self.work.last if found is None else found
+        plan = Trajectory(plan.states.copy(), plan.controls.copy(), self.problem.dt)
         cost, status = (self.cost, None) if found is None else (found.cost, found.status)
         return Candidate(name, cost, len(self.budget.log), status, plan)
 
@@ -586,7 +575,7 @@ class SolveRun:
         """Arguments for damped or Newton iterations from the plan, with at least these tolerances of cost and gap."""
         work, tolerance = self.work, self.final if task == declarations.FINISH else self.rough
         options = self._options(rows, max(tolerance, least[0]), least[1])
-        arrays = work.arrays._replace(prior=work.no_prior, rollout=work.trial)
+        arrays = work.arrays._replace(prior=work.no_prior, last=work.trial)
         return task, first, last, options, work.model, arrays, work.memory_rows, rows
 
     def _check_arguments(
@@ -594,7 +583,7 @@ class SolveRun:
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         work, plan = self.work, Motion(found.states, found.controls)
-        arrays = work.arrays._replace(to_go=to_go, rollout=plan, kept=Policy(*found.law), certificate=certificate)
+        arrays = work.arrays._replace(to_go=to_go, last=plan, last_policy=Policy(*found.law), certificate=certificate)
         options = self._options(self._rows, self.final)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
@@ -615,10 +604,10 @@ class Workspace:
 
     Attributes:
       arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
-      memory: the safeguard's state between two iterations, a row of `MEMORY`; memory_rows: (1,) that row.
+      memory: what the iterations remember, a row of `MEMORY`; memory_rows: (1,) that row.
       multipliers: those of each constraint; changes act at once.
-      start: (n,) the start state. plan: the best so far. states, controls: of the last rollout, (T+1, n) and (T, m).
-      trial: the rollout that a line search tries. core: the compiled iterations.
+      start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
+        that a line search from the best plan tries. core: the compiled iterations.
       fixed: whether the start is given exactly. dual: which form it is.
     """
 
@@ -643,11 +632,11 @@ class Workspace:
             to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
             to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
             smoothing=SmootherGains(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
-            homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
+            homotopy_scaled=None, prior=self.no_prior, given=plan(), best=plan(), last=plan(), last_policy=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
-        self.start, self.plan, self.trial = self.arrays.start, self.arrays.plan, plan()
-        self.states, self.controls = self.arrays.rollout
+        self.start, self.trial = self.arrays.start, plan()
+        self.best, self.last = self.arrays.best, self.arrays.last
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
@@ -670,6 +659,7 @@ class Workspace:
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # Everything else is written before it is read.
         self.memory_rows[...] = 0.0
+        self.memory["watched"] = float(settings.safeguard)
         arrays.start[...] = arrays.x_hat[...] = start
         arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
         value = initial_guess.cost_to_go
@@ -678,9 +668,34 @@ class Workspace:
             array[...] = given
         # Without a trajectory: the start state, and the controls with which the dynamics can run backwards.
         plan = initial_guess.trajectory
-        for array in (arrays.guess, arrays.plan):
+        for array in (arrays.given, arrays.best):
             array.states[...] = start if plan is None else plan.states
             array.controls[...] = initial_guess.offset if plan is None else plan.controls
+
+    @property
+    def cost(self) -> float:
+        """The cost of the best plan; infinite where there is none."""
+        return float(self.memory["plan_cost"])
+
+    def take(self, states: Array, controls: Array, cost: float = np.inf) -> None:
+        """Take a plan for the best one; its cost is infinite where it is not known."""
+        self.best.states[...], self.best.controls[...] = states, controls
+        self.memory["plan_cost"] = cost
+
+    def disregard_costs(self) -> None:
+        """With constraints the least cost is no measure, and a rollout of lower cost is no better plan."""
+        self.memory["watched"], self.memory["plan_cost"] = 0.0, -np.inf
+
+    def begin_damped(self, added: float = 0.0) -> None:
+        """Begin damped iterations from the best plan; `added` is the constraints' share of its cost."""
+        memory = self.memory
+        memory["merit"] = memory["plan_cost"] + added
+        memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
+        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
+
+    def begin_newton(self, added: float = 0.0) -> None:
+        """The same for Newton's method, which begins with a pass about the plan."""
+        self.memory["merit"], self.memory["share"] = self.memory["plan_cost"] + added, -1.0
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""

@@ -117,7 +117,7 @@ def find_duration(
     states = np.column_stack([begin.states, np.full(len(begin.states), problem.steps * problem.dt)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
-        point = InteriorPoint(freed, plan, room=0.02, stages=stages)
+        point = InteriorPoint(freed, plan, stages=stages)
         found = point.run(tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch)
     # Remove everything that belongs to the duration.
     rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]

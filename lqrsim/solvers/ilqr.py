@@ -150,7 +150,7 @@ def _solve(
     states, controls = plan
     go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
     work = IlqrArrays(
-        start=start, policy=policy, to_go=go, plan=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
+        start=start, policy=policy, to_go=go, best=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
         certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
     most = settings.max_iterations
@@ -172,7 +172,9 @@ def _solve(
     ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
     whole = done > 0 and ending.failed < 0
     if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was about the previous trajectory
-        *_, failed = loop(declarations.ITERATE, done, done, options, model, work, rows)
+        if not done:
+            loop(declarations.ITERATE, 0, 0, options, model, work, rows)  # only the first rollout
+        *_, failed = loop(declarations.LINEARIZE, 0, 0, options, model, work, rows)
         whole = failed < 0 and np.isfinite(states).all()
     if not whole:  # without a pass about the trajectory the policy has no feedback
         policy.gain[:] = 0
@@ -194,7 +196,7 @@ def _solve(
 
         def fails(risk: float) -> int:
             model.noise.risk[0] = risk
-            return loop(declarations.ITERATE, 1, 1, options, model, work, rows)[3]
+            return loop(declarations.LINEARIZE, 0, 0, options, model, work, rows)[3]
 
         detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)
     found = RunResult(

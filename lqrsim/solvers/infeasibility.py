@@ -20,7 +20,7 @@ from lqrsim.solvers.engine import RunResult, Workspace
 
 STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
-AT_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
+NEAR_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
 NAMED = 3  # most constraints that a message names beside the one that is violated most
 
 
@@ -115,8 +115,8 @@ def _balance(
     states, controls = plan.states, plan.controls
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     space = problem.control_coordinates
-    low = controls <= space.low + AT_LIMIT * control_size
-    high = controls >= space.high - AT_LIMIT * control_size
+    low = controls <= space.low + NEAR_LIMIT * control_size
+    high = controls >= space.high - NEAR_LIMIT * control_size
     total, size, pressed = 0.0, 0.0, np.zeros(m)
     ahead, own = slopes[steps, :n], alone[steps, :n]
     for t in range(steps - 1, -1, -1):

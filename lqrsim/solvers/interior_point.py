@@ -26,10 +26,9 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.settings import INSIDE
-from lqrsim.solvers.stages import Sizes, Stages, joined
+from lqrsim.solvers.stages import MIXES, Sizes, Stages, joined
 
 INTERIOR = "interior point"  # name of its iterations in the log
-MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # fractions of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, relative to the cost, if not even that has a minimum
 REGULARISATION = 1e-8  # of equalities, relative
 # Regularisation of active rows in the first step without a barrier. Where a row couples controls, curvature across it
@@ -102,14 +101,19 @@ class Found:
     scale: float
 
 
-class Point(NamedTuple):
-    """An iterate: a plan, its cost, the states its steps arrive at, the live rows' values (K,), and slacks (P,)."""
+class Iterate(NamedTuple):
+    """A plan, its cost, the states its steps arrive at, the live rows' values (K,), slacks (P,) and multipliers (K,).
+
+    With the costates (T+1, n). A trial of a line search has the multipliers and costates before the step.
+    """
 
     plan: Motion
     cost: float
     arrived: Array
     numbers: Array
     slack: Array
+    force: Array
+    costates: Array
 
 
 class Step(NamedTuple):
@@ -172,11 +176,11 @@ class Rows:
         """The sum of each row's slacks, with their signs, (K,)."""
         return np.bincount(self.row, self.sign * slacks, len(self.size))
 
-    def missed(self, point: Point) -> Array:
+    def missed(self, point: Iterate) -> Array:
         """Row values minus slacks, (K,)."""
         return point.numbers - self.total(point.slack)
 
-    def largest_miss(self, point: Point) -> float:
+    def largest_miss(self, point: Iterate) -> float:
         """The largest of these, relative to the rows' sizes."""
         return float((np.abs(self.missed(point)) / self.size).max(initial=0.0))
 
@@ -247,16 +251,14 @@ class InteriorPoint:
         self.parameter = self._first = barrier * self._scale / max(len(self._rows.row), 1)
         self._known = stages.of_constraints(multipliers)
         known = self._known[stages.live] if multipliers else None
-        slack, self._force = self._rows.beginning(numbers, known, parameter=self.parameter, room=room)
-        self._costates = np.zeros((stages.steps + 1, stages.n))
-        self.point = Point(plan, cost, arrived, numbers, slack)
+        slack, force = self._rows.beginning(numbers, known, parameter=self.parameter, room=room)
+        costates = np.zeros((stages.steps + 1, stages.n))
         self.iterations = 0
         self._filter: list[tuple[float, float]] = []
         self._errors: list[float] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
         self._soft = 1.0
-        self._linearize(np.inf)
-        self._costates, _ = self._adjoint()
+        self._begin_at(Iterate(plan, cost, arrived, numbers, slack, force, costates))
         self._measure()
         # In a sum over many rows, those that are far from acting count, too.
         begun, steps = self._off(self.point), stages.steps
@@ -292,7 +294,7 @@ class InteriorPoint:
             creeping = 0 if self._part >= CREEP or falls else creeping + 1
             begun = begun if creeping else now.cost
             ended = watch(self.measures) or creeping == CREEPING
-        finer, found = tolerance, self._state
+        finer, found = tolerance, (self.point, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
             # A lower barrier shows which rows are active, also where the cost is mostly constant.
             finer *= FINER
@@ -302,24 +304,25 @@ class InteriorPoint:
                     break
             ended = ended or self.iterations >= most
             if not self._within(tolerance, violation):
-                self.point, self._force, self._costates, self.measures = found
+                self.point, self.measures = found
                 break
-            found = self._state
+            found = self.point, self.measures
         return self._found(solved)
 
-    @property
-    def _state(self) -> tuple[Point, Array, Array, Measures]:
-        """What an iteration changes of the iterate."""
-        return self.point, self._force, self._costates, self.measures
+    def _begin_at(self, point: Iterate) -> None:
+        """Go to a point, with the costates that belong to its multipliers."""
+        self.point = point
+        self._linearize(np.inf)
+        self.point = point._replace(costates=self._adjoint()[0])
 
-    def _go_back(self, point: Point, force: Array, costates: Array, measures: Measures) -> None:
-        """Undo steps without a barrier."""
-        self.point, self._force, self._costates, self.measures = point, force, costates, measures
-        self._linearize(1e-10 * self._scale)
+    def _go_to(self, point: Iterate, least: float) -> None:
+        """Go to a point; its multipliers up to `least` count as zero in the models."""
+        self.point = point
+        self._linearize(least)
         self._measure()
 
     def _found(self, solved: bool) -> Found:
-        stages, spread = self.stages, self.stages.spread(self._force)
+        stages, spread = self.stages, self.stages.spread(self.point.force)
         known = tuple(spread[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
@@ -331,10 +334,10 @@ class InteriorPoint:
 
     def _linearize(self, least: float) -> None:
         """Compute the models about the plan; multipliers up to `least` count as zero."""
-        self.stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), least)
+        self.stages.linearize(self.point.plan, self.point.costates, self.stages.spread(self.point.force), least)
 
     def _adjoint(self) -> tuple[Array, Array]:
-        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self.stages.pull(self._force)))
+        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self.stages.pull(self.point.force)))
 
     def _measure(self) -> None:
         """Compute the measures at the plan of the current models."""
@@ -346,11 +349,11 @@ class InteriorPoint:
         self._scale = max(abs(point.cost), least) if np.isfinite(point.cost) else least
         stationarity = float((np.abs(slopes) * self.sizes.controls).max())
         stationarity = max(stationarity, float((np.abs(start[0]) * self.sizes.states * stages.free).max()))
-        self._products = point.slack * rows.duals(self._force)
+        self._products = point.slack * rows.duals(self.point.force)
         # Margin times multiplier; for violated elastic rows, the product of the other slack.
         largest = float(self._products.max(initial=0.0))
         if rows.hard.all():
-            largest = float(np.where(rows.equality, 0.0, np.abs(point.numbers) * self._force).max(initial=0.0))
+            largest = float(np.where(rows.equality, 0.0, np.abs(point.numbers) * self.point.force).max(initial=0.0))
         self.measures = Measures(
             cost=point.cost, stationarity=stationarity / self._scale,
             violation=float(rows.violation(point.numbers).max(initial=0.0)),
@@ -366,19 +369,17 @@ class InteriorPoint:
 
     def _settle(self, tolerance: float, violation: float) -> bool:
         """Take Newton steps without a barrier from the given plan and multipliers; return whether they converge."""
-        stages, kept, plan, size = self.stages, self._state, self._begun, self.sizes.rows
+        stages, kept, plan, size = self.stages, self.point, self._begun, self.sizes.rows
         cost, arrived = stages.trial(plan)
         numbers, force = stages.values(plan), self._known.copy()
         at_limit = (stages.owners == -1) & (numbers <= AT_LIMIT * size)
         force[at_limit] = np.broadcast_to(AT_LIMIT * self._scale / size, force.shape)[at_limit]
-        self.point = Point(plan, cost, arrived, numbers[stages.live], self.point.slack)
-        self._force = np.clip(force[stages.live], -self._rows.highest, self._rows.highest)
-        self._linearize(np.inf)
-        self._costates, _ = self._adjoint()
+        force = np.clip(force[stages.live], -self._rows.highest, self._rows.highest)
+        self._begin_at(Iterate(plan, cost, arrived, numbers[stages.live], kept.slack, force, kept.costates))
         if np.isfinite(cost) and self._cross(tolerance, violation):
             self.iterations = 1
             return True
-        self._go_back(*kept)
+        self._go_to(kept, 1e-10 * self._scale)
         return False
 
     def _cross(self, tolerance: float, violation: float) -> bool:
@@ -387,22 +388,22 @@ class InteriorPoint:
         So controls end at their limits, and multipliers lose the barrier's contribution. Constraints keep a margin for
         rounding.
         """
-        rows, kept, size, highest = self._rows, self._state, self._rows.size, self._rows.highest
+        rows, kept, size, highest = self._rows, self.point, self._rows.size, self._rows.highest
         aim = np.where(rows.equality | rows.limit, 0.0, INSIDE * violation)
-        numbers = self.point.numbers
-        paid = np.isfinite(highest) & (rows.violation(numbers) / size > 1 - np.abs(self._force) / highest)
-        presses = ~paid & (rows.equality | (self._force * size / self._scale > numbers / size))
+        numbers, force = self.point.numbers, self.point.force
+        paid = np.isfinite(highest) & (rows.violation(numbers) / size > 1 - np.abs(force) / highest)
+        presses = ~paid & (rows.equality | (force * size / self._scale > numbers / size))
         right = False
         for k in range(CROSSINGS):
             # The first step may be long, and a weight as large as that of the others would spoil it by rounding.
             sigma = np.where(presses, self._scale / ((REGULARISATION if k else CROSSING) * size**2), 0.0)
-            self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
-            if not self._step_along(sigma, aim):
+            force = np.where(presses, force, np.where(paid, np.sign(force) * highest, 0.0))
+            if not self._step_along(sigma, aim, force):
                 break
-            numbers, found = self.point.numbers, self.measures
-            beyond = presses & (np.abs(self._force) > highest)
-            lifted = presses & ~rows.equality & (self._force < 0)
-            back = paid & (numbers * np.sign(self._force) > 0)
+            numbers, force, found = self.point.numbers, self.point.force, self.measures
+            beyond = presses & (np.abs(force) > highest)
+            lifted = presses & ~rows.equality & (force < 0)
+            back = paid & (numbers * np.sign(force) > 0)
             ignored = ~presses & ~paid & (numbers < 0)
             presses, paid = presses & ~beyond & ~lifted | back | ignored, paid & ~back | beyond
             right = not (beyond | lifted | back | ignored).any()
@@ -413,27 +414,28 @@ class InteriorPoint:
         right = right and found.stationarity < tolerance and found.gap < tolerance
         if right and (rows.elastic or found.violation <= violation):
             return True
-        self._go_back(*kept)
+        self._go_to(kept, 1e-10 * self._scale)
         return False
 
-    def _step_along(self, sigma: Array, aim: Array) -> bool:
-        """Take a step without a barrier that brings rows of weight sigma (K,) to their aims; False if there is none."""
+    def _step_along(self, sigma: Array, aim: Array, force: Array) -> bool:
+        """Take a step without a barrier that brings rows of weight sigma (K,) to their aims; False if there is none.
+
+        It begins with multipliers `force`, (K,).
+        """
         stages, numbers = self.stages, self.point.numbers - aim
+        self.point = self.point._replace(force=force)
         self._linearize(0.0)
         gaps = stages.models.arrived - self.point.plan.states[1:]
         barrier = stages.curvature(sigma)
-        gradient = stages.models.gradient - stages.pull(self._force - sigma * numbers)
+        gradient = stages.models.gradient - stages.pull(force - sigma * numbers)
         if not stages.direction(stages.models.hessian + barrier, gradient, gaps):
             return False
-        self._force = self._force - sigma * (numbers + stages.moved())
-        self._costates = stages.to_go.gradient.copy()
+        force, costates = force - sigma * (numbers + stages.moved()), stages.to_go.gradient.copy()
         none = np.zeros(len(self.point.slack))
-        there = self._at(Step(stages.changes, none, np.zeros(0), self._costates), 1.0)
+        there = self._at(Step(stages.changes, none, np.zeros(0), costates), 1.0)
         if there is None:
             return False
-        self.point = there._replace(slack=self.point.slack)
-        self._linearize(0.0)
-        self._measure()
+        self._go_to(there._replace(slack=self.point.slack, force=force, costates=costates), 0.0)
         return True
 
     def _iterate(self, tolerance: float) -> bool:
@@ -497,26 +499,17 @@ class InteriorPoint:
         None if none has, not even with a weight on changes of the controls. Rows are softened by `soft`, (K,).
         """
         stages, point, rows = self.stages, self.point, self._rows
-        duals = rows.duals(self._force)
+        duals = rows.duals(self.point.force)
         sigma = 1 / (soft + np.bincount(rows.row, point.slack / duals, len(point.numbers)))
         barrier, none = stages.curvature(sigma), np.zeros(len(point.slack))
-        for mix in MIXES:
-            system, self._mixed = System(self._hessian(mix, barrier), sigma, duals), mix > 0
-            if self._solve(system, none):
-                return system
-        diagonal = np.arange(stages.n, stages.n + stages.m)
-        projected = System(self._hessian(1.0, barrier), sigma, duals)
-        for weight in WEIGHTS:
-            heavier = projected.hessian.copy()
-            heavier[:, diagonal, diagonal] += weight * self._scale / self.sizes.controls**2
-            if self._solve(projected._replace(hessian=heavier), none):
-                return projected
+        weights = [weight * self._scale / self.sizes.controls**2 for weight in WEIGHTS]
+        for number, hessian in enumerate(stages.hessians(barrier, weights)):
+            self._mixed = number > 0
+            if self._solve(system := System(hessian, sigma, duals), none):
+                # Without the weights, no correction has a minimum: there is none then.
+                weighed = number >= len(MIXES)
+                return system._replace(hessian=stages.models.convex + barrier) if weighed else system
         return None
-
-    def _hessian(self, mix: float, barrier: Array) -> Array:
-        models = self.stages.models
-        mixed = models.hessian if mix == 0 else (1 - mix) * models.hessian + mix * models.convex
-        return mixed + barrier
 
     def _direction(self, system: System, least: float, free: bool) -> tuple[Step, Array]:
         """The step and its corrections (P,) of the products of slacks and multipliers."""
@@ -532,7 +525,7 @@ class InteriorPoint:
         self, system: System, corrections: Array, beyond: Array | float = 0.0, wider: Array | float = 0.0
     ) -> bool:
         """Compute the step in plan and costates; `beyond` and `wider` add to the residuals of rows and to the gaps."""
-        pull = self._force - system.sigma * (self._target(system, corrections) + beyond)
+        pull = self.point.force - system.sigma * (self._target(system, corrections) + beyond)
         gradient = self.stages.models.gradient - self.stages.pull(pull)
         return self.stages.direction(system.hessian, gradient, self._gaps + wider)
 
@@ -589,7 +582,7 @@ class InteriorPoint:
         falling = changes < 0
         return min(1.0, float((-share * numbers[falling] / changes[falling]).min())) if falling.any() else 1.0
 
-    def _search(self, step: Step, system: System, corrections: Array | None) -> tuple[Point, float, Step] | None:
+    def _search(self, step: Step, system: System, corrections: Array | None) -> tuple[Iterate, float, Step] | None:
         """Backtrack along a step until the filter accepts; the first trial also with a second-order correction.
 
         The correction reduces the residuals after the whole step, which remain because rows and dynamics are not
@@ -615,7 +608,7 @@ class InteriorPoint:
             part /= 2
         return None
 
-    def _corrected(self, tried: Point, system: System, part: float, corrections: Array) -> Point | None:
+    def _corrected(self, tried: Iterate, system: System, part: float, corrections: Array) -> Iterate | None:
         """The point of a step that also reduces the residuals at a trial point; None where these have fallen."""
         now, missed = self.point, self._rows.missed
         if not self._off(tried) >= self._off(now):
@@ -627,7 +620,7 @@ class InteriorPoint:
         other = self._step(system, corrections, beyond)
         return self._at(other, self._longest(now.slack, other.slack))
 
-    def _closed(self, tried: Point, system: System, part: float, slope: float) -> Point:
+    def _closed(self, tried: Iterate, system: System, part: float, slope: float) -> Iterate:
         """The point nearer to a motion that keeps its rows, by the least changes, as far as the filter takes them.
 
         With the models of the step, so that each change costs a Riccati pass and a look at where the steps lead. So a
@@ -641,21 +634,21 @@ class InteriorPoint:
                 break
             multipliers = -sigma * (stages.moved() + missed)
             slack = -(self.point.slack / system.duals) * (self._rows.sign * multipliers[self._rows.row])
-            change = Step(stages.changes, slack, multipliers, self._costates)
+            change = Step(stages.changes, slack, multipliers, self.point.costates)
             closer = self._at(change, self._longest(tried.slack, slack), about=tried)
             if closer is None or self._off(closer) > CLOSER * off or not self._acceptable(closer, part, slope):
                 break
             tried = closer
         return tried
 
-    def _force_step(self, system: System) -> tuple[Point, float, Step] | None:
+    def _force_step(self, system: System) -> tuple[Iterate, float, Step] | None:
         """A step where the filter rejects every part of the last one; None if there is none, or there were too many.
 
         It is that of the projected Hessian; or, if that is rejected too, a little of it, be it better or not.
         """
         self._forced += 1
         none = np.zeros(len(self.point.slack))
-        system = system._replace(hessian=self._hessian(1.0, self.stages.curvature(system.sigma)))
+        system = system._replace(hessian=self.stages.models.convex + self.stages.curvature(system.sigma))
         if self._forced > FORCED or not self._solve(system, none):
             return None
         self._filter = []
@@ -667,7 +660,7 @@ class InteriorPoint:
         tried = self._at(step, part)
         return None if tried is None else (tried, part, step)
 
-    def _take(self, new: Point, part: float, step: Step, duals: Array) -> None:
+    def _take(self, new: Iterate, part: float, step: Step, duals: Array) -> None:
         """Go to a point with that part of a step in multipliers and costates."""
         off, rows = self._off(self.point), self._rows
         self._filter.append(((1 - MARGIN) * off, self._merit(self.point) - MARGIN * off))
@@ -675,16 +668,15 @@ class InteriorPoint:
         if part >= LONG:
             self._soft = max(1.0, self._soft / SOFTER)
         dual_part = self._longest(duals, rows.sign * step.multipliers[rows.row])
-        self._force = self._force + np.where(rows.regularised > 0, part, dual_part) * step.multipliers
-        self._costates = self._costates + part * (step.costates - self._costates)
+        costates = self.point.costates
+        force = self.point.force + np.where(rows.regularised > 0, part, dual_part) * step.multipliers
         # The products of slacks and multipliers stay within reach of the barrier's parameter, where rows are hard.
         hard, middle = rows.row[rows.hard], self.parameter / new.slack[rows.hard]
-        self._force[hard] = np.clip(self._force[hard], middle / WIDE, WIDE * middle)
-        least, self.point = 1e-10 * self._scale, new
-        self._linearize(least)
-        self._measure()
+        force[hard] = np.clip(force[hard], middle / WIDE, WIDE * middle)
+        costates = costates + part * (step.costates - costates)
+        self._go_to(new._replace(force=force, costates=costates), 1e-10 * self._scale)
 
-    def _at(self, step: Step, part: float, *, about: Point | None = None) -> Point | None:
+    def _at(self, step: Step, part: float, *, about: Iterate | None = None) -> Iterate | None:
         """The point a part of a step further than this one, or another; None where it is not finite."""
         about, rows = self.point if about is None else about, self._rows
         plan = Motion(
@@ -697,17 +689,17 @@ class InteriorPoint:
             return None
         slack = about.slack + part * step.slack
         slack = np.where(rows.hard, np.maximum(slack, numbers[rows.row]), slack)
-        return Point(plan, cost, arrived, numbers, slack)
+        return about._replace(plan=plan, cost=cost, arrived=arrived, numbers=numbers, slack=slack)
 
-    def _off(self, point: Point) -> float:
+    def _off(self, point: Iterate) -> float:
         """Total violation of dynamics and rows at a point, relative to their sizes."""
         return self._gap(point) + float((np.abs(self._rows.missed(point)) / self._rows.size).sum())
 
-    def _gap(self, point: Point) -> float:
+    def _gap(self, point: Iterate) -> float:
         """The dynamics' share of it."""
         return float((np.abs(point.arrived - point.plan.states[1:]) / self.sizes.states).sum())
 
-    def _merit(self, point: Point) -> float:
+    def _merit(self, point: Iterate) -> float:
         """Cost plus prices plus barrier."""
         paid = -float((self._rows.sign * self._rows.bound) @ point.slack)
         return point.cost + paid - self.parameter * float(np.log(point.slack).sum())
@@ -717,7 +709,7 @@ class InteriorPoint:
         slacks = -self._rows.sign * self._rows.bound - self.parameter / self.point.slack
         return float((self.stages.models.gradient * joined(step.plan)).sum() + slacks @ step.slack)
 
-    def _acceptable(self, tried: Point, part: float, slope: float) -> bool:
+    def _acceptable(self, tried: Iterate, part: float, slope: float) -> bool:
         """Whether the filter accepts a trial point."""
         off, merit = self._off(tried), self._merit(tried)
         before, at_first = self._off(self.point), self._merit(self.point)

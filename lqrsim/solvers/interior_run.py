@@ -18,14 +18,12 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.interior_point import AT_LIMIT, INTERIOR, Found, InteriorPoint, Measures
+from lqrsim.solvers.stages import FIRMNESS, Stages
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # iterations from one plan
-PENALTY = 8.0  # of the augmented Lagrangian that makes the policy keep the constraints, in cost per squared row size
 UPDATES = 5  # of multipliers, if Newton's steps at the end violate constraints
-AT_LIMIT = 1e-9  # distance from its limit, relative to its range, at which a pressing control is put there
 
 
 class Barrier(NamedTuple):
@@ -131,10 +129,9 @@ class InteriorRun:
         if not np.isfinite(states).all():
             return None
         self._take_multipliers(found, work.constraint_values(states, controls))
-        work.plan.states[...], work.plan.controls[...] = states, controls
-        work.memory["plan_cost"] = self.stages.trial(Motion(states, controls))[0]
+        work.take(states, controls, self.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
-        lagrangian.evaluate(*work.plan)
+        lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(INTERIOR):
             result = self._newton(lagrangian)
             for _ in range(UPDATES):
@@ -167,7 +164,7 @@ class InteriorRun:
         each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(each):
             size = found.sizes.rows[self.stages.owners == k]
-            own.penalty = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            own.penalty = FIRMNESS * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
             presses = known > own.penalty * (numbers - own.margin)  # others are left over from the barrier
             acts = np.isfinite(numbers) & (own.term.equality | presses)

@@ -39,7 +39,7 @@ def solve_all(
             check(problem, settings)
             start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
             check_functions(problem, start, resolve(settings.start, problem).offset[0])
-            compiled.core(problem, settings.core_form)
+            compiled.core(problem, getattr(settings, "form", "dual"))
             compiled.arguments(problem)  # compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
+from lqrsim.codegen.user_functions import raised_by
+from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
@@ -19,18 +19,17 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
-from lqrsim.solvers.augmented_lagrangian import satisfy
+from lqrsim.solvers.augmented_lagrangian import meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.engine import RunResult, SolveRun, raised_by
-from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
+from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
-from lqrsim.solvers.interior_run import LITTLE
+from lqrsim.solvers.interior_run import LITTLE, copied
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
 BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
-ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 def prepare(
@@ -96,11 +95,11 @@ class PreparedSolver:
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
         compiled.rollout(self.problem, *law, state)
-        run.work.constraint_values(*run.work.plan)
+        run.work.constraint_values(*run.work.best)
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and run.second_order:
-            stages, plan = Stages(self.problem), Motion(*run.work.plan)
+            stages, plan = Stages(self.problem), Motion(*run.work.best)
             _Neighbour(run, stages, plan, _Best(run)).find()
             # Another solve may need what this one did not.
             stages.convexify(plan)
@@ -162,8 +161,9 @@ class PreparedSolver:
         if time_limit is not None:
             stop.deadline = clock + check_number("time_limit", time_limit, above=0.0)
         budget = Budget(self.settings.max_iterations, stop, attentive=True)
-        guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
-        run = SolveRun.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), budget)
+        run = SolveRun.lent(
+            problem, self.settings, resolve(start, problem), np.asarray(state, dtype=np.float64), budget
+        )
         best = _Best(run)
         with problem.dynamics.solving(1):
             if problem.constraints and run.second_order:
@@ -209,7 +209,7 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
     A horizon that moves along has a last step for which the old policy was not made. Where the rollout violates
     constraints, it is the old plan itself, from the new state.
     """
-    plan = Motion(*(array.copy() for array in best.plan))
+    plan = copied(best.plan)
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
         return plan
     planned = start.trajectory
@@ -219,29 +219,15 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
     return plan
 
 
-def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
-    """The policy to start from, with its cost-to-go and multipliers as far as they are known."""
-    n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
-    law = start.policy
-    gain, offset = (
-        check_array("start: gain", law.gain, (steps, m, n)),
-        check_array("start: offset", law.offset, (steps, m)),
-    )
-    multipliers = start.multipliers
-    if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
-        multipliers = ()  # of other constraints
-    return InitialGuess(in_c_order(gain), in_c_order(offset), start.cost_to_go, None, "", multipliers=multipliers)
-
-
 def _solve(run: SolveRun, best: "_Best") -> RunResult:
     """Smoothing, its safeguard and the augmented Lagrangian, until they converge or have to stop."""
     run.budget.report_to(best)
     try:
         if run.initial_guess.multipliers:
-            return satisfy(run, None)
+            return meet_constraints(run, None)
         found = run.solve(look_back=False)
         if run.problem.constraints and found.success and not run.budget.stop.due:
-            found = satisfy(run, found)
+            found = meet_constraints(run, found)
         return found
     except InputError as error:  # a function that is not finite at the start
         return replace(_unchanged(best), status=Status.NOT_FINITE, detail=str(error))
@@ -290,7 +276,7 @@ class _Neighbour:
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    run.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE.parameter,
+                    run.problem, copied(self._best.plan), barrier=LITTLE.parameter,
                     room=LITTLE.room, multipliers=known, stages=self._stages,
                 )  # fmt: skip
 
@@ -353,10 +339,10 @@ class _Best:
         clock = time.perf_counter()
         run.roll_out()
         self.rolling_out = time.perf_counter() - clock
-        values = self._work.constraint_values(self._work.states, self._work.controls)
-        self.cost, self.violation = float(self._work.memory["plan_cost"]), self._work.violation(values)
+        values = self._work.constraint_values(*self._work.last)
+        self.cost, self.violation = self._work.cost, self._work.violation(values)
         self.before = self.cost
-        self.plan = self._work.states.copy(), self._work.controls.copy()
+        self.plan = copied(self._work.last)
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
         # Equalities are kept only within a tolerance.
@@ -370,12 +356,14 @@ class _Best:
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
-                there = *arrays.plan, *compiled.law_about(*arrays.plan, arrays.policy.gain)
+                there = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
             else:
-                there = *arrays.rollout, *arrays.kept, *arrays.to_go
+                there = *arrays.last, *arrays.last_policy, *arrays.to_go
             # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.
             if not self._copies:
-                self._copies = tuple(np.empty_like(array) for array in (*arrays.plan, *arrays.kept, *arrays.to_go))
+                self._copies = tuple(
+                    np.empty_like(array) for array in (*arrays.best, *arrays.last_policy, *arrays.to_go)
+                )
             copies = self._copies[: len(there)]  # the cost-to-go about Newton's plans is computed at the end
             for copy, array in zip(copies, there, strict=True):
                 np.copyto(copy, array)
@@ -403,5 +391,5 @@ class _Best:
     def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
         states, controls, gain, offset, *to_go = arrays
         self.cost, self.violation, self.improved = cost, violation, True
-        self.plan, self.law = (states, controls), (gain, offset)
+        self.plan, self.law = Motion(states, controls), (gain, offset)
         self.cost_to_go = Quadratic(*to_go) if to_go else None

@@ -18,7 +18,6 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Limits, Motion, Policy
-from lqrsim.solvers.interior_point import MIXES
 from lqrsim.solvers.stages import Sizes, Stages, joined
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; its factor
@@ -119,7 +118,7 @@ def restore(
     still = Policy(np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m)))
     plan = stages.follow(begun, 0.0, still, _limits(stages, begun.controls))
     parameter, least = FIRST * price * sizes.cost / count, LEAST * price * sizes.cost / count
-    diagonal = np.arange(stages.n, stages.n + stages.m)
+    diagonal, none = np.arange(stages.n, stages.n + stages.m), np.zeros((stages.steps, stages.n))
     settled, near, damping, close, level, dual, before = False, False, 1.0, 0, LEVEL, None, np.inf
     force, costates = np.zeros(len(penalty.size)), np.zeros((stages.steps + 1, stages.n))
     for _ in range(most):
@@ -131,7 +130,8 @@ def restore(
             force, curvature, dual = penalty.model(numbers, dual, parameter, damping)
             gradient, barrier = stages.models.gradient - stages.pull(force), stages.curvature(curvature)
             barrier[:, diagonal, diagonal] += damping * DAMPING * price * sizes.cost / sizes.controls**2 / stages.steps
-            if not _direction(stages, barrier, gradient, sizes, price):
+            weights = (weight * price * sizes.cost / sizes.controls**2 / stages.steps for weight in WEIGHTS)
+            if not any(stages.direction(hessian, gradient, none) for hessian in stages.hessians(barrier, weights)):
                 return None
             slope = float((gradient * joined(stages.changes)).sum())
             if -slope > SETTLED * parameter * len(penalty.size) or parameter <= least:
@@ -172,21 +172,6 @@ def restore(
             break
         plan = taken
     return Restored(plan, settled, near)
-
-
-def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, price: float) -> bool:
-    """Find a descent direction, with the largest share of the exact Hessian for which the model has a minimum."""
-    models, none = stages.models, np.zeros((stages.steps, stages.n))
-    for mix in MIXES:
-        if stages.direction((1 - mix) * models.hessian + mix * models.convex + barrier, gradient, none):
-            return True
-    diagonal = np.arange(stages.n, stages.n + stages.m)
-    for weight in WEIGHTS:
-        heavier = models.convex + barrier
-        heavier[:, diagonal, diagonal] += weight * price * sizes.cost / sizes.controls**2 / stages.steps
-        if stages.direction(heavier, gradient, none):
-            return True
-    return False
 
 
 def _limits(stages: Stages, controls: Array) -> Limits:

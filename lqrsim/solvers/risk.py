@@ -1,20 +1,62 @@
-"""The largest risk for which the expectation of exp(risk * cost) exists."""
+"""Costs under noise: of sampled runs; and the largest risk for which the expectation of exp(risk * cost) exists."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_kind
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_memory, check_seed
+from lqrsim.kernels.records import Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
+from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 
 DIGITS = 1e-12  # relative accuracy
-
+MOST_TRIALS = 10_000_000
 Fails = Callable[[float], int]  # the step at which a backward pass fails with a risk, or -1
+
+
+def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, seed: int = 0) -> Array:
+    """Costs of simulated runs of a solution's policy from the first state of its plan, with noise drawn at random.
+
+    The robot moves by the formulas of the problem, x' = g(x, u) + M(x, u) w, not in MuJoCo, and obstacles do not stop
+    it. The same seed draws the same noise for any solution, so that costs of two solutions can be compared trial by
+    trial.
+
+    Args:
+      problem: with noise.
+      solution: solution of that problem, or of another one with as many states, controls and steps.
+      trials: number of runs K.
+      seed: seed of the noise.
+
+    Returns:
+      (K,) the costs.
+
+    Raises:
+      InputError: the problem has no noise, the solution does not fit it, or an argument is not as described.
+    """
+    check_problem(problem)
+    if problem.noise_term is None:
+        raise InputError("problem: got one without noise, want Problem(noise=...), or problem.driven_by(noise)")
+    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
+    shape = problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates)
+    if solution.policy.gain.shape != shape:
+        got = solution.policy.gain.shape
+        raise InputError(f"solution: got a policy of shape {got}, want {shape}: steps, controls, states")
+    trials = check_count("trials", trials, at_most=MOST_TRIALS)
+    seed, size = check_seed("seed", seed), problem.noise_term.size
+    check_memory("trials", trials, 8 * (problem.steps * size + 1), "whose noise")
+    draws = np.empty((trials, problem.steps, size))
+    for trial in range(trials):
+        stream = np.random.SeedSequence(seed, spawn_key=(trial,))
+        draws[trial] = np.random.Generator(np.random.SFC64(stream)).standard_normal((problem.steps, size))
+    policy = Policy(in_c_order(solution.policy.gain), in_c_order(solution.policy.offset))
+    start = solution.trajectory.states[0].copy()
+    return compiled.noisy_costs(problem, start, policy, draws)
 
 
 def largest_risk(problem: Problem, solution: Solution) -> float:
@@ -43,7 +85,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
         raise InputError(f"solution: got a plan of {got} steps, controls and states, want {wanted}")
     settings = SmootherSettings(tolerance=1e-4, max_iterations=1, start=plan, constraint_tolerance=1e-3)
     run = SolveRun(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Budget(1))
-    run.work.plan.states[:], run.work.plan.controls[:] = plan.states, plan.controls
+    run.work.take(plan.states, plan.controls)
     if run.fails_at(0.0) >= 0:
         raise InputError("solution: got a plan about which no backward pass succeeds, want one that converged")
     high = 1e-6 / max(abs(solution.cost), 1e-100) if np.isfinite(solution.cost) else 1.0
@@ -66,9 +108,9 @@ def named(fails: Fails, risk: float, steps: int) -> str:
 def name_risk(run: SolveRun, found: RunResult) -> str:
     """The detail of an answer whose risk was too high."""
     problem, work = run.problem, run.work
-    if not np.isfinite(work.memory["plan_cost"]):
-        work.plan.states[:], work.plan.controls[:] = work.states, work.controls
-    if not np.isfinite(work.plan.states).all():
+    if not np.isfinite(work.cost):
+        work.take(*work.last)
+    if not np.isfinite(work.best.states).all():
         return found.detail
     return "; ".join(part for part in (named(run.fails_at, problem.risk, problem.steps), found.detail) if part)
 

@@ -55,11 +55,6 @@ class Settings:
         if (value := getattr(self, name)) is not None:
             keep(self, **{name: check_number(name, value, above=0.0)})
 
-    @property
-    def core_form(self) -> str:
-        """The form of the compiled passes."""
-        return "dual"
-
     def options(self, start: InitialGuess) -> dict[str, object]:
         """The options that a solution records."""
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
@@ -97,18 +92,9 @@ class SmootherSettings(Settings):
         check_name("first_pass", self.first_pass, ("forward", "backward"))
         keep(self, safeguard=check_flag("safeguard", self.safeguard))
 
-    @property
-    def core_form(self) -> str:
-        return self.form
-
     def second_order(self, problem: Problem) -> bool:
-        """Whether Newton's method has the last iterations. With stop="cost", the paper's test ends the paper's method.
-
-        The steps of an MJCF have no second derivatives, and without these an iteration of smoothing is worth several of
-        Newton's; see `experiments/convergence.py`. Nor has the expected cost of noise.
-        """
-        exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
-        return self.finish is not None and self.stop == "optimal" and exact
+        """Whether Newton's method has the last iterations; with stop="cost" the paper's method has them."""
+        return self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
 
     @property
     def price(self) -> float:
@@ -127,6 +113,15 @@ class SmootherSettings(Settings):
         """Tolerance at which smoothing ends, coarser where Newton's method follows."""
         final = self.final(problem)
         return max(final, ROUGH) if self.second_order(problem) else final
+
+
+def can_be_exact(problem: Problem) -> bool:
+    """Whether Newton's method and the interior point, with their second derivatives, can solve a problem.
+
+    The steps of an MJCF have none, and without these an iteration of smoothing is worth several of Newton's; see
+    `experiments/convergence.py`. Nor has the expected cost of noise, with which constraints are left to smoothing.
+    """
+    return not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
 
 
 S = TypeVar("S", bound=Settings)

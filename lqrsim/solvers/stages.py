@@ -5,20 +5,22 @@ plan need not satisfy the dynamics; a step closes the gaps between its states. W
 of those who use the stages: the interior point, the active set, and the restoration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import active_set as active_kernel
-from lqrsim.kernels import interior_point as kernel
+from lqrsim.kernels import stages as kernel
 from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Motion, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
+
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # fractions of the projected Hessian, tried in turn
+FIRMNESS = 8.0  # penalty that makes a policy keep the constraints, in cost per squared row size
 
 
 class Sizes(NamedTuple):
@@ -44,9 +46,7 @@ class Stages:
     def __init__(self, problem: Problem) -> None:
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
-        what, sizes = f"{n} states and {m} controls", {"N": n, "M": m, "W": n + m}
-        self._module = module_of(source_of(kernel), f"interior point, {what}", **sizes)
-        self._active = module_of(source_of(active_kernel), f"active set, {what}", **sizes)
+        self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
         self._take(problem)
         counts = [term.rows for term in problem.constraint_terms]
@@ -75,7 +75,6 @@ class Stages:
         terms = problem.constraint_terms
         own = [compiled.ConstraintMultipliers(problem, term) for term in terms]
         self._model = compiled.arguments(problem, multipliers=own, second_order=True)
-        self._costs = compiled.costs_module(problem)
         limits = self._model.limits
         self.low, self.high = limits.low, limits.high
         self.limits = [
@@ -101,19 +100,18 @@ class Stages:
         self._rows.support[...] = 0.0
         return self
 
-    def _call(self, name: str, *arguments: Any, module: CompiledModule | None = None) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         """Call a compiled function, reusing the layout of its arguments."""
         call = self._calls.get(name)
         if call is None:
-            call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
+            call = self._calls[name] = self._module.lay_out(name, *arguments)
         return call(*arguments)
 
     def values(self, plan: Motion) -> Array:
         """The rows' values (T+1, R); undefined where they do not act."""
         numbers = np.empty(self.live.shape)
         if self._values:
-            constraints, costs = self._model.stage.constraints, self._costs
-            self._call("evaluate_constraints", self.steps, *plan, constraints, self._values, module=costs)
+            self._call("evaluate_constraints", self.steps, *plan, self._model.stage.constraints, self._values)
         begin = 0
         for one in self._values:
             end = begin + len(one) // (self.steps + 1)
@@ -219,6 +217,20 @@ class Stages:
         models = self.models._replace(hessian=in_c_order(hessian), gradient=in_c_order(gradient))
         return self.pivot(in_c_order(gaps), models, self.active._replace(size=0))[0]
 
+    def hessians(self, barrier: Array, weights: Iterable[Array]) -> Iterator[Array]:
+        """Hessians (T+1, n+m, n+m) of the Lagrangian with a barrier, to be tried in turn until one has a minimum.
+
+        First mixed with those of the projected cost, by `MIXES`; then these with weights (m,) on changes of controls.
+        """
+        exact, convex = self.models.hessian, self.models.convex
+        for mix in MIXES:
+            yield (exact if mix == 0 else (1 - mix) * exact + mix * convex) + barrier
+        diagonal = np.arange(self.n, self.n + self.m)
+        for weight in weights:
+            heavier = convex + barrier
+            heavier[:, diagonal, diagonal] += weight
+            yield heavier
+
     def moved(self) -> Array:
         """The changes of the live rows' values, (K,)."""
         return np.matmul(self.slopes, joined(self.changes)[:, :, None])[:, :, 0][self.live]
@@ -233,13 +245,13 @@ class Stages:
     ) -> float:
         return self._call(
             "linearize_plan", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows,
-            self.models, active, module=self._active,
+            self.models, active,
         )  # fmt: skip
 
     def measure(self, plan: Motion, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
         """Residuals of the plan of the current models; writes its gaps. See the kernel."""
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
-        return self._call("optimality_measures", self.steps, *of, module=self._active)
+        return self._call("optimality_measures", self.steps, *of)
 
     def pivot(
         self, gaps: Array, models: StageModels | None = None, rows: ActiveRows | None = None, *,
@@ -249,13 +261,13 @@ class Stages:
         models, rows = self.models if models is None else models, self.active if rows is None else rows
         failed, wrong = self._call(
             "pivot", self.steps, self.free, share, scale, weight, price, models, gaps, rows, self.policy, self.to_go,
-            self.changes, module=self._active,
+            self.changes,
         )  # fmt: skip
         return failed == -1, wrong
 
     def change(self, *, worst: bool) -> None:
         """Change which rows are held; see the kernel."""
-        self._call("update_active_set", self.steps, int(worst), self.active, module=self._active)
+        self._call("update_active_set", self.steps, int(worst), self.active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
         """Roll out a plan with gains (T, m, n) about it; return the motion, its cost and the constraints' values.
@@ -267,7 +279,7 @@ class Stages:
         policy = self.policy._replace(gain=gain)
         cost = self._call(
             "rollout_of_active_set", self.steps, self._soft, plan, policy, limits, self.active, self._model,
-            self._values, out, module=self._active,
+            self._values, out,
         )  # fmt: skip
         return out, cost, [one.reshape(self.steps + 1, -1) for one in self._values]
 

@@ -40,8 +40,8 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Status, Trajectory
-from lqrsim.solvers import augmented_lagrangian
 from lqrsim.solvers.assembly import assemble, clearance_of
+from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.budget import Budget, Callback, Stop
 from lqrsim.solvers.constrained import Known, Ladder
 from lqrsim.solvers.engine import RunResult, SolveRun
@@ -135,7 +135,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
         return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
-    found = augmented_lagrangian.finish(run)
+    found = by_multipliers(run)
     # It begins with the optimum without the constraints, which is often the same from all starts: they count as one.
     if found.stuck and not known.evidence:
         known.evidence.append(Evidence(found, found.violation))
@@ -146,7 +146,7 @@ def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on its side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
-    found = augmented_lagrangian.refine(run)
+    found = damped_from_rollout(run)
     if not found.stuck:
         return found
     known.evidence.append(one := Evidence(found, found.violation))
@@ -160,17 +160,17 @@ def _without_constraints(run: SolveRun) -> RunResult:
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
         return run.solve()
     run.smooth(OPENING)
-    controls = run.work.plan.controls
+    controls = run.work.best.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        found = InteriorRun(run).instead(run.work.plan)
+        found = InteriorRun(run).instead(run.work.best)
         if found is not None:
             return found
     found = run.solve()
     if found.success or budget.stop.due or budget.left < 2:
         return found
     point = InteriorRun(run)
-    plan = run.work.plan if np.isfinite(found.cost) else point.start()
+    plan = run.work.best if np.isfinite(found.cost) else point.start()
     return point.instead(plan) or found
 
 
@@ -258,7 +258,7 @@ class Search:
                 break
             run = self._another(resolve(prior, problem))
             run.smooth(FOLLOW)
-            states, controls = (part.copy() for part in run.work.arrays.rollout)
+            states, controls = (part.copy() for part in run.work.arrays.last)
             if np.isfinite(states).all():
                 missed = run.work.violation(run.work.constraint_values(states, controls))
                 found.append((missed, name, Trajectory(states, controls, problem.dt)))
