@@ -97,6 +97,19 @@ def test_derivatives_beside_a_jump_are_those_of_free_flight(kind: str, mass: flo
     assert np.abs(np.hstack([a, b]) - want).max() > 1e3  # central differences straddle the jump
 
 
+@settings(max_examples=8)
+@given(mass=MASSES, speed=SPEEDS, number=st.integers(0, 3), part=st.floats(0.1, 0.9))
+def test_what_is_before_a_jump_is_free_flight(mass: float, speed: float, number: int, part: float) -> None:
+    begin = 1 - (number - part) * H * speed  # it is beyond its limit from this physics step on
+    switches = modes_of(robot_of("slide", mass)).step(np.array([begin, speed]), np.array([0.0]))[1]
+    before = switches.before_jump(switches.values < 0)
+    assert switches.forces.any()
+    assert not switches.forces[before].any()
+    distances = 1 - begin - H * speed * np.arange(number + 1)
+    np.testing.assert_allclose(switches.values[before], distances, rtol=0, atol=1e-12)
+    assert switches.before_jump(np.zeros(len(before), bool)).all()
+
+
 def pushed(mass: float, goal: float, speed: float) -> ls.Problem:
     """The slide is to be beyond its limit, and cannot without hitting it."""
     robot = robot_of("slide", mass)

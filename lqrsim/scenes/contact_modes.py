@@ -48,6 +48,11 @@ class Switches:
         """Which of them are forces, whose change of sign is a kink and not a jump."""
         return (self.names & _FORCE) != 0
 
+    def before_jump(self, crossed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Which of them are seen before the first distance of those crossed has an effect, or with it."""
+        jumps = self.names[crossed & ~self.forces]
+        return self.names < (jumps[0] // _FORCE + 1) * _FORCE if len(jumps) else np.ones(len(self.names), np.bool_)
+
     def same_mode(self, other: "Switches") -> bool:
         """Whether the same acts. What is out of sight of one of them does not act in it."""
         if not np.array_equal(self.names[self.forces], other.names[other.forces]):

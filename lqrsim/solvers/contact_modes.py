@@ -36,7 +36,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 
 MARGIN = 1e-9  # m, rad or m/s^2, by which a plan stays on its side of a switch
 ENOUGH = 0.1  # share of the predicted decrease that a step must bring
-PUSHES = 5  # times that a step is pushed back to its side
+PUSHES = 10  # times that a step is pushed back to its side
 HALVINGS = 8  # of a step that are tried before it is damped more
 FLAT = 0.05  # least curvature of the second step, relative to that of the first
 SHORT, SKEW = 1e-6, 1e-6  # steps of a period, and cosines between what they mend and themselves, that say nothing
@@ -305,22 +305,23 @@ class Descent:
         for _ in range(PUSHES):
             if not np.isfinite(there.cost):
                 break
-            rows, missing, crossed = list[int](), list[float](), False
+            rows, missing, crossed, jumped = list[int](), list[float](), False, False
             for t, period in enumerate(model.periods):
                 here = slice(model.first[t], model.first[t + 1])
-                if not len(period.switches.names):
-                    continue
-                switches = self._modes.step(there.states[t], there.controls[t])[1]
-                values, sides = switches.at(period.switches.names), model.sides[here]
-                across = (sides * values < 0) & model.known[here]
-                pressed = multipliers[here] > 0
-                held = np.isfinite(values) & model.known[here] & (across | pressed)
-                aim = np.where(pressed, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                sides, held = model.sides[here], multipliers[here] > 0
+                short = np.zeros(len(held))
+                if len(held) and not jumped:
+                    values = self._modes.step(there.states[t], there.controls[t])[1].at(period.switches.names)
+                    across = (sides * values < 0) & model.known[here]
+                    seen = period.switches.before_jump(across)
+                    aim = np.where(held, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                    across &= seen
+                    held = (across | held) & (np.isfinite(values) | ~seen)
+                    short = np.where(seen, sides * aim - values, 0.0)
+                    crossed, jumped = crossed or bool(across.any()), bool((across & ~period.switches.forces).any())
+                # What comes after a jump says nothing: switches that are pressed there are to be where they were meant.
                 rows += (model.first[t] + np.flatnonzero(held)).tolist()
-                missing += (sides * aim - values)[held].tolist()
-                crossed = crossed or bool(across.any())
-                if (across & ~period.switches.forces).any():
-                    break  # what comes after a jump says nothing
+                missing += short[held].tolist()
             if not crossed:
                 break
             factor = scipy.linalg.cho_factor(model.hessian) if factor is None else factor
