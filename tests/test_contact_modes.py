@@ -1,8 +1,10 @@
 """Plans at the edges of contact modes: switches and derivatives of periods, and what is called optimal there."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import scipy.optimize
@@ -23,6 +25,7 @@ from lqrsim.solvers.contact_modes import (
     minimize,
     optimality_in_mode,
     rolled_out,
+    secant_curvature,
     surroundings,
 )
 
@@ -36,6 +39,11 @@ BALL = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRA
   <worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.1"><joint name="x" type="slide" axis="0 0 1"/>
   <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator>
   </mujoco>"""
+# A pendulum that a motor swings, with a limit.
+SWING = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"/>
+  <compiler autolimits="true" angle="radian"/><worldbody><body><joint name="x" axis="0 1 0" range="-4 LIMIT"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="MASS"/></body></worldbody>
+  <actuator><motor joint="x" gear="10" ctrlrange="-1 1"/></actuator></mujoco>"""
 FILES = {"slide": SLIDE, "ball": BALL}
 GRAVITY = {"slide": 0.0, "ball": 9.81}
 MASSES, SPEEDS = st.floats(0.5, 3.0), st.floats(0.2, 2.0)
@@ -88,6 +96,19 @@ def test_derivatives_beside_a_jump_are_those_of_free_flight(kind: str, mass: flo
     np.testing.assert_allclose(period.slopes[gone], sign * np.array([1, 3 * H, push * 6 * H * H]), rtol=0, atol=1e-6)
     a, b, _ = robot.dynamics.linearize(state, control, DT)
     assert np.abs(np.hstack([a, b]) - want).max() > 1e3  # central differences straddle the jump
+
+
+@settings(max_examples=8)
+@given(mass=MASSES, speed=SPEEDS, number=st.integers(0, 3), part=st.floats(0.1, 0.9))
+def test_what_is_before_a_jump_is_free_flight(mass: float, speed: float, number: int, part: float) -> None:
+    begin = 1 - (number - part) * H * speed  # it is beyond its limit from this physics step on
+    switches = modes_of(robot_of("slide", mass)).step(np.array([begin, speed]), np.array([0.0]))[1]
+    before = switches.before_jump(switches.values < 0)
+    assert switches.forces.any()
+    assert not switches.forces[before].any()
+    distances = 1 - begin - H * speed * np.arange(number + 1)
+    np.testing.assert_allclose(switches.values[before], distances, rtol=0, atol=1e-12)
+    assert switches.before_jump(np.zeros(len(before), bool)).all()
 
 
 def pushed(mass: float, goal: float, speed: float) -> ls.Problem:
@@ -216,3 +237,98 @@ def test_the_optimality_in_a_mode_bounds_what_the_mode_allows(seed: int) -> None
     fall = (plan.cost - least_cost(mass, goal, speed)) / plan.cost
     # Without limits of the controls, and with all switches in sight, it is the fall itself, in a linear mode.
     assert optimality >= fall - 1e-6
+
+
+def swung(mass: float, limit: float, start: float, goal: float, effort: float, steps: int) -> ls.Problem:
+    """The pendulum is to swing up and stop at the goal."""
+    text = SWING.replace("MASS", repr(mass)).replace("LIMIT", repr(limit)).replace("INTEGRATOR", "Euler")
+    robot = ls.MjcfRobot(scene_from_xml(text, "swing"))
+    return ls.Problem(
+        dynamics=robot.dynamics, dt=DT, steps=steps, initial=ls.FixedState(np.array([start, 0.0])),
+        stage_cost=ls.ControlCost([effort]), final_cost=ls.QuadraticCost([1.0, 1.0], about=np.array([goal, 0.0])),
+        control_limits=(-1, 1),
+    )  # fmt: skip
+
+
+def modes_for(problem: ls.Problem) -> ContactModes:
+    assert isinstance(problem.dynamics, MjcfDynamics)
+    modes = problem.dynamics.contact_modes(DT)
+    assert modes is not None
+    return modes
+
+
+def swings(problem: ls.Problem, controls: Array, plan: CostedPlan | None = None, gain: Array | None = None) -> Array:
+    """Angles at each physics step, and the last speed, by plain `mj_step`: of controls, or changed about a plan."""
+    assert isinstance(problem.dynamics, MjcfDynamics)
+    assert problem.start is not None
+    data, seen = mujoco.MjData(problem.dynamics.physics.model), []
+    data.qpos[:], data.qvel[:] = problem.start
+    for t, control in enumerate(controls):
+        data.ctrl[:] = control
+        if plan is not None and gain is not None:
+            data.ctrl[:] += plan.controls[t] + gain[t] @ (np.concatenate([data.qpos, data.qvel]) - plan.states[t])
+        control[:] = data.ctrl
+        for _ in range(round(DT / H)):
+            seen.append(data.qpos[0])
+            mujoco.mj_step(problem.dynamics.physics.model, data)
+    return np.array([*seen, data.qpos[0], data.qvel[0]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_secants_are_the_second_derivatives_that_mujoco_does_not_have(seed: int) -> None:
+    draws, steps, effort, goal, limit = np.random.default_rng(seed), 6, 0.1, 1.6, 1.0
+    mass = draws.uniform(0.7, 1.5)
+    problem = swung(mass, limit, draws.uniform(0.986, 0.99), goal, effort, steps)
+    modes, held = modes_for(problem), 0.206 * mass + 0.01 * draws.standard_normal((steps, 1))  # against its weight
+    assert problem.start is not None
+    begin = rolled_out(problem, np.tile(problem.start, (steps + 1, 1)), held, np.zeros((steps, 1, 2)))
+    model, earlier = ModeModel(problem, modes, begin), []
+    for _ in range(5):  # plans beside it, which need not lie on the way to it
+        other = begin.controls + 3e-3 * draws.standard_normal((steps, 1))
+        beside = ModeModel(problem, modes, rolled_out(problem, begin.states, other, model.gain))
+        earlier.append((beside.points, beside.periods))
+    # Any multipliers of the switches will do: of the angle at each physics step, which is near its limit all the time.
+    step = minimize(model, model.hessian)
+    assert step is not None
+    assert len(model.values) == 4 * steps
+    pulls = draws.uniform(0, 100, len(model.values))
+    lacking = secant_curvature(model, earlier, replace(step, multipliers=pulls, limits=0 * step.limits))
+
+    def lagrangian(change: Array) -> float:
+        controls = change.reshape(steps, 1).copy()
+        angles = swings(problem, controls, begin, model.gain)
+        cost = 0.5 * effort * float(np.sum(controls**2)) + 0.5 * (angles[-2] - goal) ** 2 + 0.5 * angles[-1] ** 2
+        return cost - float(pulls @ (limit - angles[:-2]))
+
+    # Second differences by 1e-3: rounding of 1e-14 over 1e-6. Plans 3e-3 away know curvature to some thousandths.
+    wrong, missed = [], []
+    for _ in range(6):
+        way = draws.standard_normal(steps)
+        way *= 1e-3 / np.linalg.norm(way)
+        true = (lagrangian(way) - 2 * lagrangian(0 * way) + lagrangian(-way)) / (way @ way)
+        missed.append(abs(float(way @ model.hessian @ way / (way @ way)) - true))
+        wrong.append(abs(float(way @ (model.hessian + lacking) @ way / (way @ way)) - true))
+    assert max(wrong) < 0.05 * max(missed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_end_of_a_descent_is_quick_where_curvature_counts(seed: int) -> None:
+    draws, steps = np.random.default_rng(seed), 40
+    effort = draws.uniform(0.7, 1.3)
+    problem = swung(draws.uniform(1.3, 1.7), 10.0, 0.0, np.pi, effort, steps)
+    assert problem.start is not None
+    begin = rolled_out(
+        problem, np.tile(problem.start, (steps + 1, 1)), np.full((steps, 1), 0.02), np.zeros((steps, 1, 2))
+    )
+    budget = Budget(12, Stop())  # 6 to 8 iterations are enough; Gauss and Newton need 21 to 32
+    descent = Descent(problem, modes_for(problem), begin, 1e-10, budget)
+    assert descent.run() is ls.Status.CONVERGED
+
+    def cost_of(controls: Array) -> float:
+        angles = swings(problem, controls[:, None].copy())
+        return 0.5 * effort * float(controls @ controls) + 0.5 * (angles[-2] - np.pi) ** 2 + 0.5 * angles[-1] ** 2
+
+    own = descent.plan.controls[:, 0]
+    assert cost_of(own) == pytest.approx(descent.plan.cost, rel=1e-9)
+    found = scipy.optimize.minimize(cost_of, own, method="L-BFGS-B", bounds=[(-1, 1)] * steps, options={"maxiter": 20})
+    assert found.fun > descent.plan.cost * (1 - 1e-8)  # quotients of differences are wrong by 1e-8

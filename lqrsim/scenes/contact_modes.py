@@ -18,8 +18,8 @@ from lqrsim.errors import Array
 _NEAR = 0.02  # m or rad, within which distances are watched
 _SMALLER = 1.0, 1e-2, 1e-4  # differences, relative to the first, that are tried until one stays in the mode
 _KIND = mujoco.mjtConstraint
-_LIMITS = [int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)]
-_CONTACTS = [int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)]
+_LIMITS = np.array([int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)])
+_CONTACTS = np.array([int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)])
 # A switch's name, as a number: its stage, whether it is a force, what of, and which of those.
 _STAGE, _FORCE, _CONTACT, _GEOM, _NUMBER, _EDGE = 1 << 48, 1 << 47, 1 << 46, 1 << 14, 1 << 16, 1 << 4
 
@@ -33,19 +33,25 @@ class Switches:
     names: Names
     values: Array
 
-    def at(self, names: Names) -> Array:
-        """The values of the switches of these names, NaN where there is none."""
+    def at(self, names: Names, numbers: Array | None = None) -> Array:
+        """The values of the switches of these names, NaN where there is none; or other numbers of them, (k, ...)."""
+        numbers = self.values if numbers is None else numbers
         if np.array_equal(names, self.names):
-            return self.values
-        found = np.full(len(names), np.nan)
+            return numbers
+        found = np.full((len(names), *numbers.shape[1:]), np.nan)
         _, here, there = np.intersect1d(names, self.names, assume_unique=True, return_indices=True)
-        found[here] = self.values[there]
+        found[here] = numbers[there]
         return found
 
     @property
     def forces(self) -> npt.NDArray[np.bool_]:
         """Which of them are forces, whose change of sign is a kink and not a jump."""
         return (self.names & _FORCE) != 0
+
+    def before_jump(self, crossed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Which of them are seen before the first distance of those crossed has an effect, or with it."""
+        jumps = self.names[crossed & ~self.forces]
+        return self.names < (jumps[0] // _FORCE + 1) * _FORCE if len(jumps) else np.ones(len(self.names), np.bool_)
 
     def same_mode(self, other: "Switches") -> bool:
         """Whether the same acts. What is out of sight of one of them does not act in it."""
@@ -134,20 +140,20 @@ class ContactModes:
         model, seen = self._model, self._seen
         seen.qpos[:] = qpos
         mujoco.mj_fwdPosition(self._ahead, seen)
-        limits, first = np.isin(seen.efc_type, _LIMITS), stage * _STAGE
+        limits, first = _among(seen.efc_type, _LIMITS), stage * _STAGE
         if limits.any():
             distances = (seen.efc_pos - seen.efc_margin)[limits] + _NEAR
             found.append((first + _limits(self._ahead, seen, limits), distances))
         if seen.ncon:
             geoms, wide, own = seen.contact.geom, self._ahead.geom_margin, model.geom_margin
             # Versions of MuJoCo differ in whether the margin of two geoms is their sum or their maximum.
-            summed = np.isclose(seen.contact.includemargin, wide[geoms].sum(axis=1))
+            summed = np.abs(seen.contact.includemargin - wide[geoms].sum(axis=1)) < 1e-9
             margins = np.where(summed, own[geoms].sum(axis=1), own[geoms].max(axis=1))
             found.append((first + _contacts(geoms), seen.contact.dist - margins))
         data = self._data
         if data.nefc == 0:
             return
-        limits, contacts = np.isin(data.efc_type, _LIMITS), np.isin(data.efc_type, _CONTACTS)
+        limits, contacts = _among(data.efc_type, _LIMITS), _among(data.efc_type, _CONTACTS)
         excess = np.empty(data.nefc)  # of acceleration, above what the constraint wants; it pushes if this is negative
         mujoco.mj_mulJacVec(model, data, excess, data.qacc)
         excess -= data.efc_aref
@@ -192,6 +198,11 @@ class ContactModes:
         return self.step(other[:n], other[n:])
 
 
+def _among(types: npt.NDArray[np.int32], kinds: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """`np.isin`, which takes long for so few."""
+    return np.asarray((types[:, None] == kinds).any(axis=1))
+
+
 def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.bool_]) -> Names:
     """Names of the limits in these rows: of a joint or a tendon, which one, and which of its two limits."""
     which, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
@@ -204,5 +215,5 @@ def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.boo
 def _contacts(geoms: npt.NDArray[np.int32]) -> Names:
     """Names of contacts: the two geoms, and which of theirs; with room for the edges of a friction pyramid."""
     pairs = (geoms[:, 0].astype(np.int64) * _GEOM + geoms[:, 1]) * _NUMBER
-    earlier = np.array([np.count_nonzero(pairs[:k] == one) for k, one in enumerate(pairs)], dtype=np.int64)
+    earlier = np.tril(pairs[:, None] == pairs, -1).sum(axis=1, dtype=np.int64)
     return _CONTACT + pairs + earlier * _EDGE

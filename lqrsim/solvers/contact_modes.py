@@ -6,6 +6,8 @@ The gradient is not zero there, and steps along it go across. Here a switch is a
 
 - The model of the cost is that of iLQR, in the offsets of the policy with its gains held, and derivatives are those of
   the plan's own mode. The step minimises it with all switches on their sides, linearised: a quadratic program.
+- A second step knows of curvature, too. MuJoCo has no second derivatives, but how a period's Jacobian differs between
+  the last plans, times the multipliers, says what they are along the way: secants. The better of both steps counts.
 - A step that crosses a switch after all, because it is curved, is pushed back to its own side.
 - Where no such step lowers the cost, each switch that the plan is pressed against is crossed on its own. If the cost is
   lower there, the descent goes on from there.
@@ -13,6 +15,7 @@ The gradient is not zero there, and steps along it go across. Here a switch is a
 The plan is optimal if neither is possible; `optimality_in_mode` and `surroundings` measure both again.
 """
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,8 +36,10 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 
 MARGIN = 1e-9  # m, rad or m/s^2, by which a plan stays on its side of a switch
 ENOUGH = 0.1  # share of the predicted decrease that a step must bring
-PUSHES = 5  # times that a step is pushed back to its side
+PUSHES = 10  # times that a step is pushed back to its side
 HALVINGS = 8  # of a step that are tried before it is damped more
+FLAT = 0.05  # least curvature of the second step, relative to that of the first
+SHORT, SKEW = 1e-6, 1e-6  # steps of a period, and cosines between what they mend and themselves, that say nothing
 DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature where steps fail, at first and at most
 ROUNDS = 50  # of adding switches to a quadratic program
 SMALL = 1e-3  # how far plans beside a plan change a control, as a part of its range
@@ -57,12 +62,14 @@ class ModeModel:
       gain: (T, m, n). hessian, gradient: of the cost, (T m, T m) and (T m,). slopes, values: of K switches, (K, T m)
         and (K,). sides: +1 or -1. first: (T+1,) where those of each period begin. known: whether their slopes are.
       responses: (T m, T m) of the controls. low, high: (T, m) room of the controls. periods: the linearised periods.
+      points: (T, n+m) states and controls where they begin. motions: (T, n+m, T m) how these respond.
     """
 
     def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
         states, controls, steps = plan.states, plan.controls, problem.steps
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
+        self.points, self.motions = np.hstack([states[:-1], controls]), np.empty((steps, n + m, size))
         data, costs = compiled.arguments(problem), compiled.costs_module(problem)
 
         def quadratic(x: Array, u: Array, t: int, cost: object) -> tuple[Array, Array]:
@@ -77,11 +84,11 @@ class ModeModel:
         self.low, self.high = (np.broadcast_to(limit, controls.shape) - controls for limit in (space.low, space.high))
         self.gain = self._gains()
         self.hessian, self.gradient, reached = np.zeros((size, size)), np.zeros(size), np.zeros((n, size))
-        slopes, self.responses = [], np.zeros((steps, m, size))
+        slopes = []
         for t, (period, (hessian, gradient)) in enumerate(zip(self.periods, self.stages, strict=True)):
-            self.responses[t] = self.gain[t] @ reached
-            self.responses[t][:, t * m : (t + 1) * m] += np.eye(m)
-            both = np.vstack([reached, self.responses[t]])
+            both = self.motions[t]
+            both[:n], both[n:] = reached, self.gain[t] @ reached
+            both[n:, t * m : (t + 1) * m] += np.eye(m)
             self.hessian += both.T @ hessian @ both
             self.gradient += both.T @ gradient
             slopes.append(period.slopes @ both)
@@ -89,7 +96,7 @@ class ModeModel:
         self.hessian += reached.T @ self.last[0] @ reached
         self.hessian = 0.5 * (self.hessian + self.hessian.T)
         self.gradient += reached.T @ self.last[1]
-        self.slopes, self.responses = np.vstack(slopes), self.responses.reshape(size, size)
+        self.slopes, self.responses = np.vstack(slopes), self.motions[:, n:].reshape(size, size)
         self.values = np.concatenate([period.switches.values for period in self.periods])
         self.sides = np.where(self.values < 0, -1.0, 1.0)
         self.first = np.cumsum([0, *(len(period.switches.names) for period in self.periods)])
@@ -177,8 +184,55 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     pulls = np.zeros(len(model.values) + 2 * size)
     pulls[which] = weights / lengths
     multipliers, lower, upper = np.split(pulls, [len(model.values), len(model.values) + size])
-    decrease = -float(model.gradient @ change + 0.5 * change @ model.hessian @ change)
+    decrease = -float(model.gradient @ change + 0.5 * change @ curvature @ change)
     return ModeStep(change, decrease, multipliers, (lower - upper).reshape(model.low.shape))
+
+
+Linearized = tuple[Array, list[Period]]  # points and periods of a plan
+
+
+def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: ModeStep) -> Array:
+    """What the model's Hessian lacks of that of the Lagrangian, (T m, T m): second derivatives of periods and switches.
+
+    For each period by symmetric updates of rank one (SR1), from zero, over the earlier plans in whose mode it was.
+
+    Args:
+      earlier: linearised plans, the last one last. step: has the multipliers.
+    """
+    n = len(model.last[1])
+    lacking, costate, pulls = np.zeros_like(model.hessian), model.last[1], model.sides * step.multipliers
+    for t in reversed(range(len(model.periods))):
+        period, pull = model.periods[t], pulls[model.first[t] : model.first[t + 1]]
+        held = period.switches.names[pull != 0]
+        bend, where, before, rate = np.zeros((model.points.shape[1],) * 2), None, None, np.zeros(0)
+        for points, periods in (*earlier, (model.points, model.periods)):
+            other = periods[t]
+            if not other.switches.same_mode(period.switches):
+                continue
+            rate = other.jacobian.T @ costate - other.switches.at(held, other.slopes).T @ pull[pull != 0]
+            if not np.isfinite(rate).all():
+                continue
+            if where is not None and before is not None:
+                way = points[t] - where
+                rest = rate - before - bend @ way
+                along, size = float(rest @ way), float(np.linalg.norm(way))
+                if size < SHORT:
+                    continue
+                if abs(along) > SKEW * size * np.linalg.norm(rest):
+                    bend += np.outer(rest, rest) / along
+            where, before = points[t], rate
+        lacking += model.motions[t].T @ bend @ model.motions[t]
+        rate = model.stages[t][1] + rate
+        rate[n:] -= step.limits[t]
+        costate = rate[:n] + model.gain[t].T @ rate[n:]
+    return 0.5 * (lacking + lacking.T)
+
+
+def bent(curvature: Array, lacking: Array) -> Array:
+    """The sum of a positive definite matrix and another one, with negative curvature turned round, and none flat."""
+    parts, vectors = scipy.linalg.eigh(lacking, curvature)
+    vectors = curvature @ vectors
+    return (vectors * np.maximum(np.abs(1 + parts), FLAT)) @ vectors.T
 
 
 class Descent:
@@ -192,21 +246,23 @@ class Descent:
         self, problem: Problem, modes: ContactModes, plan: CostedPlan, tolerance: float, budget: Budget
     ) -> None:
         self._problem, self._modes, self._tolerance, self._budget = problem, modes, tolerance, budget
-        self._damping, self._laps = 0.0, Laps(budget, plan.cost)
+        self._damping, self._laps, self._earlier = 0.0, Laps(budget, plan.cost), list[Linearized]()
         self.plan, self.model = plan, ModeModel(problem, modes, plan)
 
     def run(self) -> Status:
         """Descend until the plan is optimal, nothing lowers the cost, or the budget is over."""
-        aim, about = None, None
+        aim, lacking, about = None, None, None
         while not self._budget.over:
             if about is not self.model:
-                aim, about = minimize(self.model, self.model.hessian), self.model
+                aim, lacking, about = minimize(self.model, self.model.hessian), None, self.model
             if aim is not None and aim.decrease < self._tolerance * abs(self.plan.cost):
                 beyond = self._crossed(aim)
                 if beyond is None:
                     return Status.CONVERGED
             else:
-                beyond = self._descended()
+                if lacking is None and aim is not None:
+                    lacking = secant_curvature(self.model, self._earlier, aim)
+                beyond = self._descended(lacking)
                 if beyond is None:
                     if self._damping > MOST:
                         return Status.STALLED
@@ -214,22 +270,33 @@ class Descent:
             self._go_to(beyond)
         return Status.TIME_LIMIT if self._budget.stop.due else Status.MAX_ITERATIONS
 
-    def _descended(self) -> CostedPlan | None:
+    def _descended(self, lacking: Array | None) -> CostedPlan | None:
         """A step that lowers the cost in the plan's mode; None if none was found with this damping, which grows."""
-        model, cost = self.model, self.plan.cost
-        diagonal = np.diag(np.diag(model.hessian))
-        step = minimize(model, model.hessian + self._damping * diagonal)
-        if step is not None and step.decrease > 0:
-            for halvings in range(HALVINGS):
-                share = 0.5**halvings
-                change, most = share * step.change, cost - ENOUGH * share * step.decrease
-                there = changed(self._problem, self.plan, model, change)
-                if not there.cost < most:
-                    there = self._pushed_back(there, change, step.multipliers)
-                if there.cost < most:
-                    self._damping = 0.1 * self._damping if self._damping > DAMPING else 0.0
-                    return there
-        self._damping = max(10 * self._damping, DAMPING)
+        damped = self.model.hessian + self._damping * np.diag(np.diag(self.model.hessian))
+        plans = [self._stepped(damped)]
+        if lacking is not None and lacking.any():
+            with contextlib.suppress(np.linalg.LinAlgError):  # without damping it need not be positive definite
+                plans.append(self._stepped(bent(damped, lacking)))
+        best = min((one for one in plans if one is not None), key=lambda one: one.cost, default=None)
+        if best is None:
+            self._damping = max(10 * self._damping, DAMPING)
+        else:
+            self._damping = 0.1 * self._damping if self._damping > DAMPING else 0.0
+        return best
+
+    def _stepped(self, curvature: Array) -> CostedPlan | None:
+        """The plan after a step of this curvature, halved until it lowers the cost enough; None if it never does."""
+        model, cost, step = self.model, self.plan.cost, minimize(self.model, curvature)
+        if step is None or not step.decrease > 0:
+            return None
+        for halvings in range(HALVINGS):
+            share = 0.5**halvings
+            change, most = share * step.change, cost - ENOUGH * share * step.decrease
+            there = changed(self._problem, self.plan, model, change)
+            if not there.cost < most:
+                there = self._pushed_back(there, change, step.multipliers)
+            if there.cost < most:
+                return there
         return None
 
     def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
@@ -238,22 +305,23 @@ class Descent:
         for _ in range(PUSHES):
             if not np.isfinite(there.cost):
                 break
-            rows, missing, crossed = list[int](), list[float](), False
+            rows, missing, crossed, jumped = list[int](), list[float](), False, False
             for t, period in enumerate(model.periods):
                 here = slice(model.first[t], model.first[t + 1])
-                if not len(period.switches.names):
-                    continue
-                switches = self._modes.step(there.states[t], there.controls[t])[1]
-                values, sides = switches.at(period.switches.names), model.sides[here]
-                across = (sides * values < 0) & model.known[here]
-                pressed = multipliers[here] > 0
-                held = np.isfinite(values) & model.known[here] & (across | pressed)
-                aim = np.where(pressed, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                sides, held = model.sides[here], multipliers[here] > 0
+                short = np.zeros(len(held))
+                if len(held) and not jumped:
+                    values = self._modes.step(there.states[t], there.controls[t])[1].at(period.switches.names)
+                    across = (sides * values < 0) & model.known[here]
+                    seen = period.switches.before_jump(across)
+                    aim = np.where(held, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                    across &= seen
+                    held = (across | held) & (np.isfinite(values) | ~seen)
+                    short = np.where(seen, sides * aim - values, 0.0)
+                    crossed, jumped = crossed or bool(across.any()), bool((across & ~period.switches.forces).any())
+                # What comes after a jump says nothing: switches that are pressed there are to be where they were meant.
                 rows += (model.first[t] + np.flatnonzero(held)).tolist()
-                missing += (sides * aim - values)[held].tolist()
-                crossed = crossed or bool(across.any())
-                if (across & ~period.switches.forces).any():
-                    break  # what comes after a jump says nothing
+                missing += short[held].tolist()
             if not crossed:
                 break
             factor = scipy.linalg.cho_factor(model.hessian) if factor is None else factor
@@ -283,6 +351,8 @@ class Descent:
 
     def _go_to(self, plan: CostedPlan) -> None:
         """Take a plan, and linearise about it."""
+        kept = self.model.points.shape[1] - 1
+        self._earlier = [*self._earlier[-kept:], (self.model.points, self.model.periods)]
         self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)
         self._laps.record("contact modes", plan.cost, optimality=np.nan)
 
