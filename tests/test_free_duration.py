@@ -79,7 +79,7 @@ def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
     np.testing.assert_array_equal(np.abs(solution.trajectory.controls), 1.0)
 
 
-@pytest.mark.parametrize(("weight", "way"), [(1e-12, 2.7), (1e-9, 1.0), (1e-6, 0.3), (1e-3, 1.0), (1.0, 2.7)])
+@pytest.mark.parametrize(("weight", "way"), [(1e-12, 2.7), (1e-9, 1.0), (1.0, 0.3)])
 def test_a_cost_that_is_zero_where_the_goal_is_met_is_no_worse_than_zero(weight: float, way: float) -> None:
     """Two plans that meet the goal differ by rounding alone, however small or large the weight is."""
     free = dataclasses.replace(

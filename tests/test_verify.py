@@ -338,7 +338,7 @@ def verified_as_rod(run: ls.Rollout, thickness: float, seed: int, changed: pytes
     return ls.verify_run(run)
 
 
-@pytest.mark.parametrize(("thickness", "seed"), [(0.3, 0), (0.6, 1), (1.5, 2), (5.0, 3), (12.0, 4)])
+@pytest.mark.parametrize(("thickness", "seed"), [(0.3, 0), (0.8, 1), (5.0, 3)])
 def test_a_thin_rod_is_seen_as_well_as_a_ball(
     thickness: float, seed: int, short: ls.Rollout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,7 +370,7 @@ def test_the_middle_of_a_thin_mask_is_its_centre(
     np.testing.assert_allclose(checks.mask_middle(mask), centre, rtol=0, atol=1.0)
 
 
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(
     kind=st.sampled_from(["capsule", "cylinder", "box", "ellipsoid", "sphere"]),
     size=st.tuples(*[st.floats(0.3, 1.0)] * 3), seed=st.integers(0, 1000),
