@@ -73,6 +73,8 @@ def main() -> int:
         # tests share is made once, in the order that tests/conftest.py puts them in.
         every = ["-n", str((os.cpu_count() or 1) + 1), "--dist", "loadfile", "--no-loadscope-reorder"]
         every += [] if rest == ["--long"] else ["-m", "not long"]
+        # Matrices are small: more threads of theirs wait for each other, and keep processors busy with that.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         return run([PYTHON, "-m", "pytest", *(every if rest in ([], ["--long"]) else rest)])
     if options.command == "numbers":
         return run([PYTHON, "tests/tools/print_numbers.py", *rest])

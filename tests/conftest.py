@@ -33,8 +33,9 @@ def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
 # The slowest files start first: a file is not divided among processors, and one that starts last keeps all waiting.
 # In this order the first three files do not compile the same code at the same time.
 LONGEST = (
-    "kernels", "campaign", "failure_commands", "render", "viewer", "verify", "docs", "disturbances_all", "stated",
-    "process", "whole_problems",
+    "kernels", "campaign", "failure_commands", "render", "parking", "process", "docs", "verify", "offset_free",
+    "robustness_api", "demo", "mjcf_distances", "stated", "given_solutions", "whole_problems", "viewer", "smoother",
+    "site",
 )  # fmt: skip
 
 

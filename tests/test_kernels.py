@@ -844,7 +844,7 @@ class TestParts:
 
         of_term(ls.FunctionCost(cost, derivatives=slopes if given else None, parameters={"a": 0.7}).bind(CART))
 
-    @pytest.mark.parametrize("level", ["formula", *rarely("plain"), "plain with Jacobian"])
+    @pytest.mark.parametrize("level", BALLS)
     def test_balls(self, level: str) -> None:
         balls = BALLS[level]
         of_term(ls.ObstacleCost(WORLD, balls=balls, sharpness=3.0).bind(CART))

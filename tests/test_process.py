@@ -43,10 +43,11 @@ sys.exit(cli.main())
 
 
 def start(*command: str | Path, **options: object) -> subprocess.Popen[str]:
-    """In a group of its own."""
+    """In a group of its own, and with the threads that NumPy starts by default: signals may come to any of them."""
     words = [str(word) for word in command]
+    outside = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    return subprocess.Popen(words, **(pipes | options))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return subprocess.Popen(words, **(pipes | {"env": outside} | options))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 def wait_for(found: Path, pattern: str, process: subprocess.Popen[str]) -> None:
