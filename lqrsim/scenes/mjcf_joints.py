@@ -345,7 +345,7 @@ def reach_of(model: mujoco.MjModel, body: int) -> float:
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
     reach = 0.0
-    for geom in np.flatnonzero(collides) if collides.any() else range(model.ngeom):
+    for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):
         if (path := path_to(model, geom, body)) is not None:
             offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path)]
             reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(one) for one in offsets)))

@@ -334,7 +334,7 @@ def extent(plant: Plant) -> float:
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True
     reach = 0.0
-    for geom in np.flatnonzero(collides):
+    for geom in np.flatnonzero(collides).tolist():
         path = mjcf_joints.path_to(model, geom, plant.body)
         if path is None:
             continue
