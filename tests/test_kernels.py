@@ -594,8 +594,8 @@ class TestRareEnds:
         """A merit that no step can have; then with a weight, which grows, and falls again."""
         one = Begun(problem())
         one.run._loop(*one.run._arguments(0, 2, one.log))
-        begin = {"reach": 1.0, "ilqr_next": 2.0, "plan_cost": float(one.work.memory["plan_cost"])}
-        assert one.damped(0, 3, merit=-1e9, **begin)[1] == declarations.RUNNING
+        cost = float(one.work.memory["plan_cost"])
+        assert one.damped(0, 3, merit=-1e9, reach=1.0, ilqr_next=2.0, plan_cost=cost)[1] == declarations.RUNNING
         assert one.log["method"][:3].tolist() == [declarations.REJECTED] * 3
         assert one.work.memory["reach"] == 0.0
         for weight in (1e-2, 1e-7):
