@@ -51,8 +51,8 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
     `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
     winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
-    states by at least 2 % of what that effort moves them in two periods. Where a stated lag would have to be there for the
-    robot to stay near its plan, filter and law are milder, and do about as well with it: see `lag_margin.py`.
+    states by at least 2 % of what that effort moves them in two periods. Where a robot would leave its plan without a
+    lag that is stated, filter and law are milder, and do about as well with it: see `lag_margin.py`.
     `model.uncertainty` is the uncertainty that the filter assumes.
 
     Args:
