@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency
+from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency, MotorLag
 
 FOLDER, TOOLS = Path(__file__).parent.parent / "experiments", Path(__file__).parent / "tools"
 FILES = sorted([*FOLDER.glob("*.py"), *TOOLS.glob("*.py")])
@@ -156,6 +156,18 @@ def test_benchmark_of_sensors() -> None:
     assert script.p_worse(lost, won) == pytest.approx(0.5**5)
     assert script.p_worse(won, lost) == 1.0
     assert "by more than chance" in script.report(result)
+
+
+def test_benchmark_of_lags() -> None:
+    """A small part: the template's disc does as well without its lag, and what is told of it is printed."""
+    script = import_module("benchmark_lag")
+    result = script.main(script.Config(robots=("my_robot",), presets=("light",), trials=3))
+    (row,) = result["rows"]
+    assert row["reached"] == [3] * 4
+    assert row["periods"] == pytest.approx(0.48)
+    assert 0 < row["told"] <= 1
+    assert [one.time_constant for one in script.with_lag([MotorLag(0.1)], 0.5)] == [0.05]
+    assert "| my_robot, light | 0.48 |" in script.report(result)
 
 
 @pytest.mark.long

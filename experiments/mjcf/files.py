@@ -29,4 +29,15 @@ REACHER = """<mujoco model="reacher"><option timestep="0.01" integrator="implici
   joint="shoulder" gear="1" ctrlrange="-40 40"/><motor name="elbow_motor" joint="elbow" gear="1" ctrlrange="-15 15"/>
   </actuator></mujoco>"""
 
+# That of docs/arms.md.
+TWO_LINKS = """<mujoco model="two_links"><option timestep="0.01" integrator="implicitfast"/>
+  <compiler autolimits="true"/><default><joint axis="0 -1 0" damping="0.5" armature="0.02"/><geom size="0.03"/>
+  </default><worldbody><geom name="post" type="cylinder" size="0.05 0.3" pos="0.55 0 -0.25"/>
+  <body name="base" pos="0 0 0.3">
+  <geom name="base" type="cylinder" size="0.04 0.03"/><body name="upper"><joint name="shoulder" range="-170 170"/>
+  <geom type="capsule" fromto="0.1 0 0 0.4 0 0" mass="1"/><body name="fore" pos="0.4 0 0">
+  <joint name="elbow" range="-150 150"/><geom type="capsule" fromto="0.08 0 0 0.35 0 0" mass="0.5"/></body></body>
+  </body></worldbody><actuator><motor name="shoulder" joint="shoulder" ctrlrange="-20 20"/>
+  <motor name="elbow" joint="elbow" ctrlrange="-8 8"/></actuator></mujoco>"""
+
 FILES = {"cart-pole": CART_POLE, "box on the floor": BOX, "arm of six hinges": ARM}

@@ -42,6 +42,8 @@ class LinearLoop:
       model: model of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
       filter_gain: K, (T+1, Z, Y); None for a law of the states that are shown.
       low, high: limits of the controls, (m,).
+      assumed: the model that the filter assumes, by which Z is that of its estimates; by default that of the true
+        system.
     """
 
     model: PlanModel
@@ -50,12 +52,17 @@ class LinearLoop:
     filter_gain: Array | None
     low: Array
     high: Array
+    assumed: PlanModel | None = None
+
+    @property
+    def _assumed(self) -> PlanModel:
+        return self.assumed or self.model
 
     def moments(self) -> LoopMoments:
         """Prediction from the start to the plan's end, for C laws at once with gain (C, T, m, Z)."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
-        width, many = 2 * size if estimates else size, self.gain.shape[:-3]
+        width, many = size + self._assumed.size if estimates else size, self.gain.shape[:-3]
         mean, covariance = np.zeros((*many, steps + 1, width)), np.zeros((*many, steps + 1, width, width))
         across, std = np.empty((*many, steps, n, n)), np.empty((*many, steps, model.m))
         saturation = np.empty((*many, steps, model.m))
@@ -76,7 +83,7 @@ class LinearLoop:
                 moved = free @ P + onto @ (slope[..., None] * response)
                 to_noise = onto @ (slope[..., None] * gain)
                 if estimates:
-                    to_noise[..., size:, :] += model.F[t]
+                    to_noise[..., size:, :] += self._assumed.F[t]
                 ahead = moved @ free.T + moved @ np.swapaxes(slope[..., None] * law, -1, -2) @ onto.T
                 ahead += to_noise @ noise @ np.swapaxes(to_noise, -1, -2) + (onto * left[..., None, :]) @ onto.T
                 means = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
@@ -99,9 +106,10 @@ class LinearLoop:
         F, G, c = step.F[t], step.G[t], step.c[t]
         if self.filter_gain is None:
             return F, G, c
-        own = self.model.F[t] @ seen
-        free = np.vstack([F @ np.eye(len(F), 2 * len(F)), own])
-        return free, np.vstack([G, self.model.G[t]]), np.concatenate([c, self.model.c[t]])
+        assumed = self._assumed
+        own = assumed.F[t] @ seen
+        free = np.vstack([F @ np.eye(len(F), seen.shape[1]), own])
+        return free, np.vstack([G, assumed.G[t]]), np.concatenate([c, assumed.c[t]])
 
     def _seen(self, t: int) -> tuple[Array, Array]:
         """Input of the law as a matrix times X, and the covariance of its noise."""
@@ -110,8 +118,9 @@ class LinearLoop:
             return np.eye(n, size), np.diag(model.shown_std**2)
         received = 1 - model.uncertainty.loss
         K = received * self.filter_gain[t]
-        seen = np.zeros((size, 2 * size))
-        seen[:, size:] = np.eye(size)
+        guess = self._assumed.size
+        seen = np.zeros((guess, size + guess))
+        seen[:, size:] = np.eye(guess)
         seen[:, :n] += K @ model.H[t]
         seen[:, size : size + n] -= K @ model.H[t]
         noise = K @ model.measurement_root[t]

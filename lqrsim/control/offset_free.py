@@ -10,13 +10,21 @@ import numpy as np
 from lqrsim.control.controllers import Controller
 from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
+from lqrsim.control.lag_margin import Design, with_margin
 from lqrsim.control.linear_loop import LinearLoop
-from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
+from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
-from lqrsim.control.tracking import StateMoments, choose_tolerances, reach_of, unit_means, with_filter
+from lqrsim.control.tracking import (
+    StateMoments,
+    choose_tolerances,
+    reach_of,
+    tolerances_to_try,
+    unit_means,
+    with_filter,
+)
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
-from lqrsim.control.uncertainty import Uncertainty, check_seconds, per_entry
+from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
@@ -43,8 +51,9 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
     `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
     winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
-    states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` is the uncertainty that it
-    assumes.
+    states by at least 2 % of what that effort moves them in two periods. Where a robot would leave its plan without a
+    lag that is stated, filter and law are milder, and do about as well with it: see `lag_margin.py`.
+    `model.uncertainty` is the uncertainty that the filter assumes.
 
     Args:
       problem: the problem that was solved.
@@ -57,7 +66,8 @@ class OffsetFree(Controller):
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter. np.inf takes the uncertainty as it is
-        stated: constants do not change, what varies has the mean zero, and a steady disturbance leaves an error.
+        stated: constants do not change, what varies has the mean zero, so that a steady disturbance leaves an error,
+        and a lag is there.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
       replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
         without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
@@ -114,11 +124,14 @@ class OffsetFree(Controller):
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
-        self.model = for_filter(PlanModel.of(problem.dynamics, plan, uncertainty, sensor), memory, efforts)
+        stated = PlanModel.of(problem.dynamics, plan, uncertainty, sensor)
+        self.model = for_filter(stated, memory, efforts)
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
         self.weights = self._weights(tolerate, efforts, at_end)
+        if uncertainty.lag > 0 and memory < np.inf:
+            self._keep_margin(stated, memory, tolerate, efforts, at_end)
         self._law = FilterLaw.of(solution, self.model, self.filter, self.weights)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
 
@@ -140,6 +153,17 @@ class OffsetFree(Controller):
 
         told = self.problem, self.solution, self.uncertainty
         return choose_tolerances(*told, self.model, effort, at_end, moments)
+
+    def _keep_margin(
+        self, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
+    ) -> None:
+        """Make the design milder if it needs the lag."""
+        tried = tolerances_to_try(self.model, effort, at_end) if tolerate is None else self.weights.alone
+        design = Design(self.model, self.filter, self.weights)
+        self.model, self.filter, self.weights = with_margin(
+            self.problem, self.solution, stated, design, tried,
+            lambda share, doubt: for_filter(_told_of(stated, share), memory, effort, doubt),
+        )  # fmt: skip
 
     def start(self, trials: int) -> "FilterRun | ReplannedRun":
         records = empty_records(self._law, trials) if self.record else None
@@ -166,7 +190,7 @@ class OffsetFree(Controller):
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
-        return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits)
+        return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)
 
     @property
     def policy(self) -> OutputFeedbackPolicy:
@@ -183,7 +207,7 @@ class OffsetFree(Controller):
         model, limits = self.model, np.array(self._law.limits)
         parts = (self.gain, self.offset, self._law.nominal, self.filter.gain, model.output, model.transition, limits)
         told = self.uncertainty
-        numbers = np.array([model.plan.dt, told.lag, told.latency, told.delay, told.command_loss])
+        numbers = np.array([model.plan.dt, model.uncertainty.lag, told.latency, told.delay, told.command_loss])
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
         again = (
@@ -198,23 +222,36 @@ class OffsetFree(Controller):
         return self._law.coordinates
 
 
-def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
+def _told_of(model: PlanModel, share: float) -> PlanModel:
+    """The model with a share of its lag."""
+    told = model.uncertainty
+    return replace(model, uncertainty=replace(told, lag=share * told.lag))
+
+
+def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.0) -> PlanModel:
     """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
 
     Args:
       model: the model with the uncertainty as stated.
       memory: seconds, or infinity, as of an `OffsetFree`.
       effort: effort of the controls, (m,).
+      doubt: of the lag; see `lag_margin.py`.
     """
-    stated, space = model.uncertainty, model.dynamics.state_coordinates
+    stated, space, controls = model.uncertainty, model.dynamics.state_coordinates, model.dynamics.control_coordinates
     told = stated.as_steady if memory == np.inf else stated.steady(memory)
     moved = unit_means(space.units, reach_of(model, effort, 2)[2])
-    control = per_entry("Uncertainty: control", stated.control, model.dynamics.control_coordinates)
+    control = per_entry("Uncertainty: control", stated.control, controls)
     lost = stated.command_loss
     control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # for the filter expects the mean
     error = per_entry("Uncertainty: model_error", stated.model_error, space)
+    behind = doubt * Lag.of(stated.lag, model.plan.dt).mean * effort
+    directly = [
+        Unknown(OFFSET + name, float(std), time_constant=0.0)
+        for name, std in zip(controls.names, behind, strict=True)
+        if std
+    ]
     assumed = replace(
-        told, control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+        told, unknowns=(*told.unknowns, *directly), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
         model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
     )  # fmt: skip
     return replace(model, uncertainty=assumed)

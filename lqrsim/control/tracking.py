@@ -25,6 +25,7 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
+from lqrsim.results.goal import scale_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 
@@ -71,19 +72,39 @@ def choose_tolerances(
       at_end: as in `track`.
       moments: predicts the moments under the laws of C weights and the limits of the controls.
     """
+    tried, space = tolerances_to_try(model, effort, at_end), solution.policy.control_coordinates
+    found = moments(tried, (np.array(space.low), np.array(space.high)))
+    told = predictions(problem, solution, uncertainty, model, found)
+    worth = worth_of(told, narrowest(model, told))
+    return tried.pick(min(reversed(range(len(worth))), key=worth.__getitem__))  # of equals the gentlest
+
+
+def tolerances_to_try(model: PlanModel, effort: Array, at_end: float) -> Weights:
+    """Weights for each number of periods that a deviation may take to decay, the tightest first."""
     longest = max(model.plan.steps // 2, PERIODS[0])
     reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
     tried = [unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest]
     each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
-    all_weights = Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
-    surroundings, space = Surroundings.of(problem, uncertainty.obstacles), solution.policy.control_coordinates
-    found = zip(*moments(all_weights, (np.array(space.low), np.array(space.high))), strict=True)
-    told = [prediction_of(model, *one, surroundings, solution.goal_radius) for one in found]
-    # A thousandth of the plan's extent is narrow enough.
+    return Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
+
+
+def predictions(
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, moments: StateMoments
+) -> list[Prediction]:
+    """The predictions for C laws with these moments."""
+    surroundings = Surroundings.of(problem, uncertainty.obstacles)
+    return [prediction_of(model, *one, surroundings, solution) for one in zip(*moments, strict=True)]
+
+
+def narrowest(model: PlanModel, told: list[Prediction]) -> float:
+    """The width of the narrowest tube; a thousandth of the plan's extent is narrow enough."""
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
-    narrowest = max(min(one.width for one in told), 1e-3 * extent)
-    worth = [one.chance + FRAGILE * one.saturation**2 + NARROW * max(one.width / narrowest, 1.0) for one in told]
-    return each[min(reversed(range(len(each))), key=worth.__getitem__)]  # of equals the gentlest
+    return max(min(one.width for one in told), 1e-3 * extent)
+
+
+def worth_of(told: list[Prediction], least: float) -> list[float]:
+    """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
+    return [one.chance + FRAGILE * one.saturation**2 + NARROW * max(one.width / least, 1.0) for one in told]
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
@@ -107,24 +128,39 @@ def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
 
 def prediction_of(
     model: PlanModel, mean: Array, covariance: Array, across: Array, saturation: float, surroundings: Surroundings,
-    radius: float | None,
+    solution: Solution,
 ) -> Prediction:  # fmt: skip
-    """The prediction for a law's moments.
-
-    Args:
-      radius: radius of the goal, in metres; None without one.
-    """
+    """The prediction for a law's moments."""
     plan = model.plan.states
     place = list(model.dynamics.state_coordinates.position)
     collide = collision_chance(plan + mean, covariance, across, surroundings)[1]
-    miss, scale = 0.0, np.maximum(np.ptp(plan, axis=0), 1.0)
-    if place:
-        scale = np.ones(len(place))
-        if radius is not None:
-            widest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[-1][place][:, place])[-1], 0.0)))
-            miss = 2 * float(ndtr(-radius / max(widest, 1e-12)))
-    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, place or list(range(plan.shape[1]))] / scale**2
-    return Prediction(collide + miss, float(np.sqrt(variances.sum(axis=1).mean())), float(saturation))
+    scale = np.ones(len(place)) if place else scale_of(plan)
+    counts = place or list(range(plan.shape[1]))
+    squares = (np.diagonal(covariance, axis1=1, axis2=2)[:, counts] + mean[:, counts] ** 2) / scale**2
+    width = float(np.sqrt(squares.sum(axis=1).mean()))
+    return Prediction(collide + _miss(mean[-1], covariance[-1], solution), width, float(saturation))
+
+
+def _miss(mean: Array, covariance: Array, solution: Solution) -> float:
+    """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
+
+    Of a position it is that of its most uncertain direction. Without one, each state that counts has its own bound.
+    """
+    target, radius = solution.target, solution.goal_radius
+    if place := target.places:
+        widest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[place][:, place])[-1], 0.0)))
+        off = float(np.linalg.norm(mean[place]))
+        return 0.0 if radius is None else float(_beyond(radius, off, widest))
+    radius = target.radius(None, None, None) if radius is None else radius
+    counts = np.isfinite(target.state)
+    bounds, std = radius * scale_of(solution.trajectory.states), np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    return float(1 - np.prod(1 - _beyond(bounds, np.abs(mean), std)[counts]))
+
+
+def _beyond(bound: Array | float, off: Array | float, std: Array | float) -> Array:
+    """The chance that normal numbers with these means exceed a bound in size."""
+    std = np.maximum(std, 1e-12)
+    return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
 def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array]) -> StateMoments:

@@ -60,6 +60,15 @@ class Weights:
         end[last] *= check_number("at_end", at_end, above=0.0)
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
+    @property
+    def alone(self) -> "Weights":
+        """These as those of one to compare."""
+        return Weights(self.state[None], self.control, self.end[None])
+
+    def pick(self, i: int) -> "Weights":
+        """Those of one of C."""
+        return Weights(self.state[i], self.control, self.end[i])
+
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
     """Return the tolerated effort of each control, (m,); by default a share of its range.

@@ -38,7 +38,8 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
 
     Left out are disturbances whose strength depends on the robot or the plan: latency and delay, which come in whole
     control periods, while the 6 to 7 ms of motion capture are less than half of one; pushes, whose time and direction
-    matter; and the loss of an actuator, which a quadrotor does not survive.
+    matter; and the loss of an actuator, which a quadrotor does not survive. There is no `MotorLag` on a robot whose
+    actuators have states of their own: its MJCF has their lag, and a second one is not theirs.
 
     Args:
       name: calm, light, moderate, strong or severe.
@@ -56,6 +57,7 @@ def _light(plant: Plant) -> list[Disturbance]:
     """All disturbances at strength 1, in the order in which they act."""
     space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
     ranges = np.subtract(controls.high, controls.low)
+    lag = MotorLag(0.024)  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
     return [
         InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
         DisplacedObstacles(0.01),  # our choice: the accuracy of a map
@@ -69,7 +71,7 @@ def _light(plant: Plant) -> list[Disturbance]:
         MeasurementDropouts(0.01),  # our choice
         CommandDropouts(0.01),  # our choice: the same link
         ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
-        MotorLag(0.024),  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
+        *([] if plant.robot.activations else [lag]),
         ForceNoise(0.01 * plant.weight),  # our choice: 1 % of the weight
         Dryden("light", altitude=2.0),
     ]

@@ -1,0 +1,104 @@
+"""A margin against a lag that is stated and is not there.
+
+A filter and a law that are told of a lag make up for it: the law asks for more, and the filter takes what it did not
+expect for actuators that run ahead of their commands. Without the lag, both are too much. Such a loop may be unstable
+with any tolerances, and the robot leaves its plan even undisturbed. So a design is predicted without the lag, too. If
+that is much worse, milder designs compete with it: the filter assumes noise on the controls that does not pass through
+the actuators, which is what an unknown lag looks like, and it may be told of a part of the lag only. Chosen is the
+least chance of failure if the lag may be there, or not, among those that stay about as near to the plan where it is
+there. A lag of several control periods leaves little choice: then a robot without it keeps near its plan, but may miss
+a goal that asks for more.
+
+Where a design does well without its lag, as those of the quadrotor do, nothing is changed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.control.kalman import KalmanFilter, kalman_filter
+from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.tracking import Prediction, StateMoments, narrowest, predictions, with_filter, worth_of
+from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.errors import Array
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Solution
+
+# What a failure without the lag counts, relative to one with it. A choice of ours: with more, designs give up what they
+# have with the lag.
+ABSENT = 0.3
+# How much worse a design may be without the lag before others compete with it, as a chance of failure; a tube of six
+# times the width is as bad.
+CLIFF = 0.1
+# What milder filters are told: a share of the stated lag; and noise that does not pass through the actuators, relative
+# to the tolerated effort and to the lag's share of it.
+MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
+# How much wider the tube may be where the lag is there, relative to the narrowest.
+WIDER = 1.25
+GONE = Prediction(chance=1.0, width=1e30, saturation=1.0)  # of a loop whose moments are not finite
+
+
+class Design(NamedTuple):
+    """A filter with the weights of the law that follows it.
+
+    Attributes:
+      model: the model that the filter assumes. filter: its gains and covariances. weights: of the law, or of C laws.
+    """
+
+    model: PlanModel
+    filter: KalmanFilter
+    weights: Weights
+
+
+def with_margin(
+    problem: Problem, solution: Solution, stated: PlanModel, design: Design, tried: Weights,
+    assumed: Callable[[float, float], PlanModel],
+) -> Design:  # fmt: skip
+    """The design, or a milder one if it is much worse without the lag.
+
+    Args:
+      stated: model of the true system, with a lag.
+      tried: weights of C laws that may be chosen.
+      assumed: model for a filter that is told of this share of the lag, with this much doubt.
+    """
+    told, space = stated.uncertainty.as_steady, solution.policy.control_coordinates
+    limits = np.array(space.low), np.array(space.high)
+    present, absent = (replace(stated, uncertainty=replace(told, lag=lag)) for lag in (told.lag, 0.0))
+
+    def predicted(truth: PlanModel, one: Design) -> list[Prediction]:
+        found, lost = _moments(truth, one, limits)
+        shown = predictions(problem, solution, told, stated, found)
+        return [GONE if gone else own for gone, own in zip(lost, shown, strict=True)]
+
+    own = design._replace(weights=design.weights.alone)
+    with_lag = predictions(problem, solution, told, stated, with_filter(*own, limits))
+    least = narrowest(stated, with_lag)
+    if worth_of(predicted(absent, own), least)[0] <= worth_of(with_lag, least)[0] + CLIFF:
+        return design
+    models = [assumed(share, doubt) for share, doubt in MILDER]
+    designs = [design._replace(weights=tried), *(Design(model, kalman_filter(model), tried) for model in models)]
+    found = [(predicted(present, one), predicted(absent, one)) for one in designs]
+    least = narrowest(stated, [one for with_lag, _ in found for one in with_lag])
+    worth = np.array([np.add(worth_of(one, least), ABSENT * np.array(worth_of(other, least))) for one, other in found])
+    worth[np.array([[each.width > WIDER * least for each in with_lag] for with_lag, _ in found])] = np.inf
+    i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
+    return designs[i]._replace(weights=tried.pick(int(j)))
+
+
+def _moments(
+    truth: PlanModel, design: Design, limits: tuple[Array, Array]
+) -> tuple[StateMoments, npt.NDArray[np.bool_]]:
+    """Moments of the true system under the laws of C weights, and which of them are not finite, (C,): zeros instead."""
+    gain, offset = tracking_laws(design.model, design.weights)
+    n = truth.n
+    with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
+        found = LinearLoop(truth, gain, offset, design.filter.gain, *limits, design.model).moments()
+        lost = np.asarray(~np.isfinite(found.covariance).all(axis=(1, 2, 3)))
+        parts = found.mean[..., :n], found.covariance[..., :n, :n], found.across, found.saturation.mean(axis=(1, 2))
+    for part in parts:
+        part[lost] = 0.0
+    return StateMoments(*parts), lost
