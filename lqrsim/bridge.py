@@ -1,12 +1,12 @@
-"""A controller and its robot as two programs that exchange messages of ROS 2, by DDS; needs the extra `ros`.
+"""Run a controller and its robot as two programs that exchange ROS 2 messages over DDS. Needs the extra `ros`.
 
     import lqrsim.bridge
 
     ran = lqrsim.bridge.run(solution, odometry="/odom", commands="/rotors/commands", safe=[0, 0, 0, 0])
 
-`run` is the controller's side: it reads states, and publishes the commands of one control period after the other. Its
-messages have the names, types and bytes of ROS 2, so that nodes see them as any other; ROS 2 itself is not needed.
-`SimulatedRobot` is the robot's side for a try-out, with MuJoCo as the robot.
+`run` is the controller's side: it reads states and publishes the commands, period by period. The messages have the
+names, types and bytes of ROS 2, so ROS 2 nodes treat them like any others. ROS 2 itself is not needed.
+`SimulatedRobot` is the robot's side for a test: MuJoCo takes the place of the robot.
 
 States come from `nav_msgs/msg/Odometry`, from `sensor_msgs/msg/JointState`, or from both. Commands go out as
 `std_msgs/msg/Float64MultiArray`, in the order of the policy's controls and in their units, as the controllers of
@@ -57,7 +57,7 @@ Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveRepla
 
 @dataclass(frozen=True, kw_only=True)
 class Bridged:
-    """What a run of a controller was, until the safe command.
+    """The record of a controller's run, up to the safe command.
 
     Attributes:
       completed: whether all periods were run.
@@ -135,7 +135,7 @@ def run(
     states, controls = law.coordinates
     safe = check_array("safe", safe, (len(controls),))
     if (safe < controls.low).any() or (safe > controls.high).any():
-        raise InputError(f"safe: got {excerpt(safe.tolist())}, want it within {controls.low} and {controls.high}")
+        raise InputError(f"safe: got {excerpt(safe.tolist())}, want numbers from {controls.low} to {controls.high}")
     lockstep, patience = check_flag("lockstep", lockstep), check_number("patience", patience, above=0.0, at_most=1e6)
     longest = patience if lockstep else LATE * dt
     if lost_after is not None:
@@ -300,19 +300,19 @@ def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:
 
 def _checked_topic(topic: object) -> str:
     if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic):
-        raise InputError(f"topic: got {excerpt(topic)}, want a name of ROS 2, such as /odom")
+        raise InputError(f"topic: got {excerpt(topic)}, want a ROS 2 topic name, such as /odom")
     return topic
 
 
 def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
     found = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
     if not found:
-        raise InputError("odometry: got no topic of states, want one, or joints=")
+        raise InputError("odometry: got none, want a topic of states in odometry=, in joints=, or in both")
     return found
 
 
 def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
-    """What the states are called in messages."""
+    """The names of the states in messages."""
     given = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
     if unknown := set(given) - set(states.names):
         raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
@@ -336,7 +336,8 @@ class _Inlet:
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
             raise InputError(
-                f"odometry: got no {', '.join(sorted(self._lacking - known))} in it, want joints= or names="
+                f"odometry: got no {', '.join(sorted(self._lacking - known))} in its messages, want a topic in joints="
+                " that has them, or other names="
             )
         self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
         self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
@@ -509,7 +510,7 @@ class _Reader:
 
 @functools.cache
 def _ros() -> SimpleNamespace:
-    """What is used of cyclonedds, and the messages. Raises InputError if it is not installed."""
+    """The parts of cyclonedds that are used, and the messages. Raises InputError if cyclonedds is not installed."""
     try:
         from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
         from cyclonedds.domain import DomainParticipant

@@ -5,7 +5,7 @@ evenly spaced along the segment, are inside it. Between two balls, `spacing` apa
 
     radius - sqrt(radius^2 - spacing^2 / 4)
 
-and a distance to the balls overestimates that to the capsule by at most as much.
+so the distance to the balls exceeds the distance to the capsule by at most this amount.
 """
 
 import itertools

@@ -432,7 +432,7 @@ def npy(array: np.ndarray) -> bytes:
     [
         ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got it twice, want it once"),
         ("meta.npy", npy(np.array("{}")), "'meta': got it twice"),
-        ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays only"),
+        ("readme.txt", b"hello", "'readme.txt': got a part that is no array, want arrays only"),
         ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got an array in another format"),
         (
             "multipliers.0.values.npy",
@@ -440,7 +440,7 @@ def npy(array: np.ndarray) -> bytes:
             "'multipliers.0.values': got an array in another format",
         ),
         ("multipliers.0.values.npy", npy(np.zeros((151, 1))), "sha256: got another hash than that of the content"),
-        ("clearance ", b"", "got a part of that name"),
+        ("clearance ", b"", "got a part that is no array"),
     ],
 )
 def test_other_members_are_refused(saved: Path, name: str, data: bytes, message: str) -> None:

@@ -156,7 +156,7 @@ def test_what_was_edited_with_all_its_hashes_has_no_shards(folder: Path, name: s
         (lambda m: m["campaign"].update(scenario=None), "scenario: got None, want a reference"),
         (lambda m: m["campaign"].update(policies=["best"]), "policies: got 'best', want one of: smooth"),
         (lambda m: m["campaign"].update(sweeps=[]), "sweeps: got {}, want at least one"),
-        (lambda m: m["campaign"]["sweeps"].update(gusts=[1]), "digest: got one that does not fit"),
+        (lambda m: m["campaign"]["sweeps"].update(gusts=[1]), "digest: got a hash that does not fit"),
         (lambda m: m["campaign"].update(time_limit=float("nan")), "time_limit: got nan, want a finite"),
         (lambda m: m.update(campaign=None), "campaign: got None, want a dictionary by name"),
         (lambda m: m.update(cells={}), "cells: got some that are not the campaign's"),

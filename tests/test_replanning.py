@@ -435,7 +435,7 @@ class TestLive:
         """Within the block and after it; another run of the same re-planner begins at the first plan."""
         replanner = ls.Replanner(stated, solution, every=DT, horizon="moving")
         planner = replanner.live(clock=lambda: 0.0)
-        again = "LiveReplanner: got entered twice, want one `with replanner.live"
+        again = "LiveReplanner: got a second `with` on it, want a new replanner.live"
         with planner:
             for i in range(3):
                 planner.step(solution.trajectory.states[i], i * DT)

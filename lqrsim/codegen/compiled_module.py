@@ -284,7 +284,7 @@ class Call:
                     f"got {type(argument).__name__}, want a structured array of float64: {', '.join(kind.fields)}"
                 )
             if not argument.flags.c_contiguous:
-                raise TypeError("got a structured array that is not contiguous, want numpy.ascontiguousarray of it")
+                raise TypeError("got an array that is not contiguous, want numpy.ascontiguousarray(array)")
             self._words[place] = argument.ctypes.data
 
 

@@ -2,7 +2,8 @@
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
 that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else
-(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing of it is cached.
+(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing derived from it is
+cached.
 """
 
 import dis

@@ -118,7 +118,7 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
 
 @functools.lru_cache(maxsize=256)  # a problem that is stated repeatedly has the same sources
 def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
-    """What is wrong with a text, as a message; empty if nothing is."""
+    """A message that says what is wrong with a text; empty if the text is valid."""
     try:
         tree = ast.parse(source)
     except Exception as error:  # SyntaxError, or others for deep nesting, null characters and the like

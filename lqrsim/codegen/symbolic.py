@@ -1,4 +1,4 @@
-"""Trace Python functions of symbols, and write the source of compiled ones. SymPy is imported only when needed."""
+"""Trace Python functions with symbols, and write the source to compile. SymPy is imported only when needed."""
 
 import contextlib
 import functools

@@ -260,7 +260,7 @@ class UserFunction:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
             raise InputError(
-                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {first_numbers(x)}"
+                f"{self.name}: got {type(error).__name__} ({error}), want no exception at x = {first_numbers(x)}"
             ) from error
         return written or [self._vector(returned)]
 
@@ -325,11 +325,11 @@ class UserFunction:
 
     @property
     def raised(self) -> BaseException | None:
-        """The exception that it raised in this thread when called back; it is not called again before `forget`."""
+        """The exception that the function raised in this thread. Until `forget`, the function is not called again."""
         return getattr(self._thread, "raised", None)
 
     def forget(self) -> None:
-        """Forget the exception, so that it is called again."""
+        """Forget the exception, so that the function is called again."""
         self._thread.raised = None
 
     def adapter(self) -> tuple[str, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The command that controls a robot by messages of ROS 2, or is that robot."""
+"""The command that controls a robot through ROS 2 messages, or simulates such a robot."""
 
 from dataclasses import dataclass
 from pathlib import Path

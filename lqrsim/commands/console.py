@@ -1,4 +1,4 @@
-"""Shared by the commands: output, progress, and an early check whether the results can be written."""
+"""Functions that the commands share: output, progress, and an early check that the results can be written."""
 
 import contextlib
 import os
@@ -118,7 +118,7 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
 
 @contextlib.contextmanager
 def keeping(write: Callable[[Any], object]) -> Iterator[None]:
-    """A block after which `write` is called with what Ctrl-C left, if it did (see `process.keeping`)."""
+    """Run a block. If Ctrl-C ends it and leaves a partial result, call `write` with that; see `process.keeping`."""
     try:
         yield
     except KeyboardInterrupt as stop:

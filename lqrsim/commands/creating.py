@@ -1,4 +1,4 @@
-"""The commands that write source files: of a new robot, and a policy as C."""
+"""Commands that write source files: a new robot, or a policy as C."""
 
 import builtins
 import importlib.util
@@ -30,7 +30,7 @@ class New:
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """Name of the robot, as Python can import it: small letters, digits and underscores."""
+    """Name of the robot, a name that Python can import: lower-case letters, digits and underscores."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path(".")
     """Folder in which the robot's folder is made."""
 
@@ -83,7 +83,7 @@ class Export:
     interpolate: bool = False
     """Blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
     name: str = "policy"
-    """Name of the files and the functions: small letters, digits and underscores."""
+    """Name of the files and the functions: lower-case letters, digits and underscores."""
     json: Json = False
 
     def run(self) -> int:
@@ -107,7 +107,7 @@ def check_robot_name(name: str) -> None:
     """Raise InputError unless the name can be that of a new module."""
     from lqrsim.errors import InputError, excerpt
 
-    wanted = "small letters, digits and underscores, a letter first, such as my_robot"
+    wanted = "lower-case letters, digits and underscores, beginning with a letter, such as my_robot"
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise InputError(f"name: got {excerpt(name)}, want {wanted}")

@@ -110,14 +110,14 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
 
 
 def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
-    """What an earlier call saved. Raises InputError if it cannot be read, or is of a run of another size."""
+    """The results that an earlier call saved. Raises InputError if they cannot be read, or if the size differs."""
     try:
         saved = json.loads(file.read_text(encoding="utf-8"))
         other = saved["quick"] is not quick
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
     if other:
-        raise InputError(f"--keep: got results {'without' if quick else 'with'} --quick in {file}, want the same")
+        raise InputError(f"--keep: got {file}, written {'without' if quick else 'with'} --quick, want the same option")
     return saved
 
 

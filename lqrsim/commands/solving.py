@@ -111,7 +111,7 @@ class Solve:
             "--paper-start": self.paper_start,
         }
         if self.solver != "smooth" and (wrong := [name for name, given in of_smooth.items() if given]):
-            raise InputError(f"{', '.join(wrong)}: got it for {self.solver}, want it with --solver smooth")
+            raise InputError(f"{', '.join(wrong)}: got --solver {self.solver}, want --solver smooth")
         given = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
         options = {"stop": self.stop, **{name: value for name, value in given.items() if value is not None}}
         if self.finish == "none":

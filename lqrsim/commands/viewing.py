@@ -1,6 +1,4 @@
-"""Commands that render and view runs.
-
-The command that verifies runs from pixels."""
+"""Commands that render and view runs, and that verify runs from pixels."""
 
 import contextlib
 import os

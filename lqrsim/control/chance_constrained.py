@@ -1,11 +1,11 @@
-"""Plans that keep so far from obstacles, step by step, that they collide no more often than is asked.
+"""Plans whose chance of collision is bounded, by a clearance from obstacles at each step.
 
-The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
-for all steps. It is chosen such that the chance of any collision, as `collision_chance.py` computes it, is the
-requested one. A plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+The clearance at a step is a multiple of the standard deviation of the robot's predicted position. The multiple is the
+same for all steps. It is chosen so that the chance of any collision, as `collision_chance.py` computes it, equals the
+requested one. Each plan has its own tube, so the multiple is found by solving again a few times.
 
-Where no such clearance is safe enough, or there is no room for it, obstacles cost more and more instead. Such plans use
-all the room that there is, where a constraint says only that it is too little.
+If no clearance is safe enough, or there is no room for it, the weights of the obstacles are raised instead. Such plans
+use all the room that there is. A constraint would only report that there is too little.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -109,20 +109,20 @@ def smooth_chance_constrained(
 ) -> SafePlan:
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
-    It ends when the chance is between half of the requested one and the requested one, or when the plan without any
-    clearance is safe enough. If no clearance is safe enough, the problem's obstacles get 10 to 3000 times their weight.
-    If that does not do either, it returns the safest plan found, with `success` False: print(plan) says how far it got;
-    allow a higher chance, estimate better, or permit another way round.
+    The search ends when the predicted chance is between half the requested chance and the requested chance, or when the
+    plan without any clearance is safe enough. If no clearance is safe enough, the weights of the problem's obstacles
+    are multiplied by 10 to 3000. If that fails too, the safest plan found is returned, with `success` False.
+    `print(plan)` then shows how close it came. Allow a higher chance, improve the estimation, or permit another route.
 
     Args:
       problem: a problem with obstacles in its costs or constraints.
       uncertainty: the uncertainty in a run; see `uncertainty_of`.
       chance: chance of collision, between 0 and 1.
-      controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
-        OffsetFree for the uncertainty, with tolerances chosen for the second plan.
-      rounds: plans with clearances to solve for, at most.
-      progress: called with the plans that are done, the most that there may be, with margins and then with heavier
-        obstacles, and what the last one found as text.
+      controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
+        an OffsetFree for the uncertainty, with tolerances chosen for the second plan.
+      rounds: the largest number of plans with clearances.
+      progress: called with the number of plans that are done, the largest possible number of plans, and a text about
+        the last one. The largest number counts plans with margins and plans with heavier obstacles.
 
     Returns:
       The SafePlan.

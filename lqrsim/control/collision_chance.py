@@ -2,8 +2,8 @@
 
 The clearance of each obstacle is linearised about the mean, so that it is normally distributed. A collision is counted
 when it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring
-steps are nearly the same number, so to add up or to multiply the chances of single steps would count each collision
-many times.
+steps are nearly the same number, so adding or multiplying the chances of single steps would count each collision many
+times.
 """
 
 from dataclasses import dataclass

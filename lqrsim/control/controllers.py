@@ -1,7 +1,7 @@
 """Controllers of a run: a policy, a function or a `Controller`; and the state of one run.
 
-Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone. `AffinePolicy`
-has the same law in NumPy, for a robot; its module's docstring says why there are two.
+Affine laws run compiled, for many trials at once. Each trial gets bit-identical controls to those it would get alone.
+`AffinePolicy` implements the same law in NumPy, for a robot; its module's docstring says why there are two.
 """
 
 import abc
@@ -94,7 +94,7 @@ class ControllerRun(abc.ABC):
 
 
 class Controller(abc.ABC):
-    """Decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
+    """Computes the controls. Subclass it for your own controller, unless a function of state and time is enough.
 
     Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
@@ -123,7 +123,7 @@ class Controller(abc.ABC):
 
     @property
     def plan(self) -> Plan | None:
-        """The plan that it follows, if it has one of its own: then `simulate` needs no other."""
+        """The controller's own plan, or None. A controller with its own plan can be simulated without another."""
         return None
 
 

@@ -1,8 +1,9 @@
-"""The Kalman filter about a plan, in square-root form: its gains depend on no measurement, so they are computed ahead.
+"""The Kalman filter about a plan, in square-root form, with gains that are computed in advance.
 
-The filter propagates square roots of its covariances by orthogonal transformations, and never subtracts covariances.
-They stay positive semidefinite, and the standard deviation of each entry keeps its own relative precision, whether
-sensors are exact, measure the same twice, or unknowns are nearly the same.
+The gains can be computed in advance because they do not depend on the measurements. The filter propagates square roots
+of its covariances by orthogonal transformations, and never subtracts covariances. The covariances stay positive
+semidefinite, and each standard deviation keeps its own relative precision. This holds even if sensors are exact, if two
+sensors measure the same quantity, or if two unknowns are nearly identical.
 """
 
 from typing import NamedTuple

@@ -3,7 +3,7 @@
 The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
 law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: for u normal with
 mean mu and std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
-Of commands that get lost it has the exact moments, those of a mixture; their distribution is not Gaussian.
+For lost commands the moments are exact, those of a mixture; the distribution itself is not Gaussian.
 """
 
 from dataclasses import dataclass

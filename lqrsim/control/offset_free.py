@@ -1,6 +1,6 @@
 """Output feedback without steady errors, by the linear model.
 
-A Kalman filter estimates the state, the actuators' outputs and the unknowns; a tracking law acts on all of it.
+A Kalman filter estimates the state, the actuators' outputs and the unknowns. A tracking law acts on all the estimates.
 """
 
 from dataclasses import replace
@@ -37,7 +37,7 @@ HELD = 0.3
 
 
 class OffsetFree(Controller):
-    """Keeps to a plan with estimates of the state, the actuators and the unknowns.
+    """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
@@ -59,10 +59,10 @@ class OffsetFree(Controller):
       memory: in s, by default 5 s, or the plan's horizon where that is shorter. np.inf takes the uncertainty as it is
         stated: constants do not change, what varies has the mean zero, and a steady disturbance leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
-      replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
-        without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
-        the horizon is solved from there. If the solve fails, the law stays in force. By default, no checks. Costs that
-        depend on the step's number are then not supported.
+      replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
+        simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the
+        goal without a collision, the rest of the horizon is solved from that state. If the solve fails, the law stays
+        in force. Costs that depend on the step's number are not supported with re-planning.
       replan_always: whether to solve at each of these times without a check.
 
     A run of it, which is a rollout's `controller_run`, has these attributes:
@@ -77,7 +77,7 @@ class OffsetFree(Controller):
       solves went, as of a `Replanner`.
 
     Attributes:
-      model: the linear model about the plan, with z = (state, what the actuators have reached, unknowns).
+      model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan.
       gain: gain of the law, (T, m, Z).
@@ -126,7 +126,7 @@ class OffsetFree(Controller):
         late = self.uncertainty.latency, self.uncertainty.delay
         if any(late):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
-            raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
+            raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty with neither")
         problem = replace(self.problem, dynamics=self.model.dynamics)
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 

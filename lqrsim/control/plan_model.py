@@ -1,11 +1,12 @@
-"""The linear model about a plan that tracking laws, filters and tubes are made of.
+"""The linear model about a plan, on which tracking laws, filters and tubes are based.
 
 A deviation from the plan is z = (e, a, d): of the state (n), of the actuators' states (m if they lag, else none), and
 the states of the unknowns (D). With u the deviation of the command,
 
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 
-c is the effect of the lag on a plan made without it: nominally the actuators are where the planned controls take them.
+c is the effect of actuator lag on a plan that was made without lag. The nominal states of the actuators are those to
+which the planned controls drive them.
 If commands get lost, F, G and c are means: those of a command that arrives, and of one that is lost, where the
 actuators stay as they are.
 """

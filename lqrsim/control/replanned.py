@@ -1,12 +1,12 @@
 """Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
-At each of these steps, and for each trial, the law is simulated with the model from the estimated state, with the
-unknown constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved
-from there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower
-cost, and goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their
-difference from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of
-the controls and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no
-time in the simulation.
+At each check, and for each trial, the law is simulated with the model, from the estimated state and with the unknown
+constants at their estimated values. If the simulated run collides or misses the goal, the rest of the horizon is solved
+from that state, and the law and the filter are recomputed about the new plan. Otherwise a new plan would do harm: it
+would have a lower cost, and go as close to obstacles as its constraints permit. The estimates continue unchanged. The
+law acts on their difference from the values that the new plan assumes. Some disturbances are left to the law: gusts,
+because they pass and plans do not model them; and gains and offsets of the controls and the lag of the actuators,
+because they are not parameters of the model. A solve takes no time in the simulation.
 """
 
 from collections.abc import Mapping

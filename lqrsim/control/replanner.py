@@ -87,7 +87,7 @@ class LiveReplanner:
     def __enter__(self) -> Self:
         """Start the thread that solves."""
         if self._thread is not None:
-            raise InputError("LiveReplanner: got entered twice, want one `with replanner.live() as live:` for each run")
+            raise InputError("LiveReplanner: got a second `with` on it, want a new replanner.live() for each run")
         self._thread = threading.Thread(target=self._work, name="lqrsim re-planner", daemon=True)
         self._thread.start()
         return self
@@ -195,7 +195,7 @@ Computing = float | str | Callable[[np.random.Generator], float]
 
 
 class Replanner(Controller):
-    """Solves again and again from where the robot will be when the answer comes; until then the previous law continues.
+    """Solves repeatedly, from where the robot will be when the solve ends. Until then the previous law stays in force.
 
         rollout = ls.simulate(plant, controller=replanner)  # in a simulation
 
@@ -218,8 +218,8 @@ class Replanner(Controller):
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default one control period, or as long as `computing` takes, where that is a number and longer.
       horizon: "shrinking", the rest of the first plan's, or "moving", always as long as the first plan's.
-      predict: whether to solve from where the law in force leads by the deadline, by the model. Without it, plans begin
-        where the robot was, not where it is.
+      predict: whether to solve from the state that the model predicts for the deadline, under the law in force. If
+        False, a plan begins where the robot was when the solve began.
       changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
         goals, obstacles or parameters. dt, steps, states and controls cannot change, nor anything that would have to be
         compiled.

@@ -1,9 +1,9 @@
-"""Trials of a closed loop by the model that its filter predicts with, and the chance of collision that they show.
+"""Trials of a closed loop, simulated with the filter's prediction model, and the chance of collision that they show.
 
-The moments of `linear_loop.py` are those of small deviations. A robot whose commands stay at their limits leaves its
-plan, where its dynamics are others. Here the nonlinear dynamics run, with limits, lag, delays, and lost commands and
-measurements, without MuJoCo. A seed draws the same numbers for all plans and laws, so that two of them are compared on
-the same trials.
+The moments of `linear_loop.py` are valid for small deviations. A robot whose commands stay at their limits leaves its
+plan, and far from the plan its dynamics differ. These trials run the nonlinear dynamics without MuJoCo, with limits,
+lag, delays, and lost commands and measurements. A seed draws the same numbers for all plans and laws, so that two of
+them are compared on the same trials.
 """
 
 from collections import deque

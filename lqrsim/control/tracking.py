@@ -6,7 +6,7 @@ state may deviate by as much as random controls of the tolerated effort move it 
 and no state is held much more tightly than the controls can hold it. Weights that are tuned one by one can have better
 predictions, but only of the linear model that they are tuned for.
 
-The linear model is wrong where controls are often at their limits, so saturation counts against a law, too.
+The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law.
 """
 
 from collections.abc import Callable
@@ -234,15 +234,15 @@ def track(
       problem: the problem that was solved.
       solution: its solution, or any with a plan of the same system.
       tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
-        the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
-        under the uncertainty.
-      effort: the most that may be added to each control to return to the plan; by default a quarter of its range.
-      at_end: the tolerances of the position at the plan's end, relative to before; of all states if there is no
+        the ratios to one another and to `effort` matter. By default, the tolerances with which the robot is least
+        likely to fail under the uncertainty.
+      effort: the largest change of each control for returning to the plan; by default a quarter of its range.
+      at_end: factor on the tolerances of the position at the end of the plan; on those of all states if there is no
         position.
-      uncertainty: the uncertainty in a run, as from `uncertainty_of`, for choosing tolerances, and for what a lost
-        command leaves in force.
-      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise along the plan;
-        above 0 it penalises large deviations more. Tolerances must then be given.
+      uncertainty: the uncertainty in a run, as from `uncertainty_of`. It serves for choosing tolerances, and for the
+        effect of lost commands.
+      risk: theta: minimise (1/theta) log E exp(theta/2 * sum of squares) under the problem's noise along the plan. A
+        theta above 0 penalises large deviations more. Tolerances must then be given.
 
     Returns:
       The policy.

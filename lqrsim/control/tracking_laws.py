@@ -8,8 +8,9 @@ M_t d is the control that cancels the unknowns' effect on the next state as far 
 otherwise a steady disturbance would leave a steady error. For the same reason a law assumes that the current
 disturbance continues: a law that expects a wind to abate yields to one that does not.
 
-If commands get lost, it is the expected sum, over which of them do (Schenato 2009: LQG with a hold). What a lost
-command leaves in force may be large, which makes the law gentle; the effort of a lost command does not count.
+If commands get lost, the law minimises the expected sum over the losses (Schenato 2009: LQG with a hold). When a
+command is lost, the previous one is held. It may be large, which makes the law gentle. The effort of a lost command
+does not count.
 """
 
 from dataclasses import dataclass

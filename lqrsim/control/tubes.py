@@ -1,8 +1,8 @@
 """Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion. The chance of collision is that of
-these moments as far as trials of the nonlinear model do not refute it; `sampled_loop.py` has them.
+are jointly Gaussian, and their distribution is known before any run; `linear_loop.py` has the recursion. The chance of
+collision follows from these moments, unless trials of the nonlinear model refute it; see `sampled_loop.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -99,7 +99,7 @@ class Tube:
         if not self.state_coordinates.position:
             raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan than that of the tube, want a run of the tube's plan")
+            raise InputError("rollout: got one of another plan, want a run of the tube's plan")
         return replace(rollout, tube=self.position_covariance, collision_chance=self.step_chance)
 
 
@@ -123,7 +123,7 @@ def predict_tube(
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
         written in plain Python, and with distances by MuJoCo.
-      seed: of these.
+      seed: seed of these trials.
 
     Returns:
       The Tube.
@@ -155,7 +155,7 @@ def predict_tube(
         affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
         samples = 0 if slow or not (surroundings.kept or late) else affordable
     if samples and surroundings.by_mujoco:
-        raise InputError(f"predict_tube: samples: got {samples} and distances by MuJoCo, want 0")
+        raise InputError(f"predict_tube: samples: got {samples} for distances by MuJoCo, want 0: trials lack them")
     if late and not samples:
         raise InputError(
             f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"

@@ -1,7 +1,7 @@
-"""The uncertainty in a run that its plan does not know, in numbers: the basis of filters, tracking laws and tubes.
+"""The uncertainty in a run that its plan ignores, in numbers: the basis of filters, tracking laws and tubes.
 
-All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one from the disturbances of `simulate`; for a robot
-of your own you can state one.
+All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes an `Uncertainty` from the disturbances of `simulate`.
+For your own robot you can also state one directly.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that the plan takes for granted and that is not so: a stationary Gaussian process about that value.
+    """A quantity that differs from the value that the plan assumes: a stationary Gaussian process about that value.
 
     Args:
       of: a parameter or a disturbance of the dynamics ("mass", "wind_x"), or "gain of <control>", of which 0.1 is 10 %
@@ -141,7 +141,7 @@ class Uncertainty:
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
                 check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
             if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
-                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want a number, or one for each")
+                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
         keep(self, lag=check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
             keep(self, **{name: check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)})
@@ -273,7 +273,7 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
         fresh = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
         return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std))
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
-    # The integral of e^As b b' e^A's over the period. I - F F' is the same and cancels if the period is short.
+    # The integral of e^As b b' e^A's over the period. It equals I - F F', but that form cancels if the period is short.
     nodes, weights = np.polynomial.legendre.leggauss(32)
     length = min(step, 40.0)
     s = 0.5 * length * (nodes + 1)
@@ -321,8 +321,6 @@ def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
         if not isinstance(one, Mapping) and np.ndim(one) == 0 and one == 0:
             return other
     if isinstance(first, Mapping) or isinstance(second, Mapping):
-        raise InputError(
-            f"Uncertainty: {name}: got two by name or unit, {excerpt(first)} and {excerpt(second)}, want one"
-        )
+        raise InputError(f"Uncertainty: {name}: got two dictionaries, {excerpt(first)} and {excerpt(second)}, want one")
     both = np.hypot(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     return float(both) if both.ndim == 0 else tuple(both.tolist())

@@ -6,9 +6,9 @@
     env = gymnasium.make("lqrsim/Quadrotor-v0", disturbances="moderate")
     env = lqrsim.gym.make_env("my_robot.py:hallway")
 
-Importing this registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. Programs that only
-have a name to give, such as a trainer's configuration, import it by that: "lqrsim.gym:lqrsim/Quadrotor-v0". Gymnasium
-reads no entry points since its version 1.0.
+Importing this module registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. Where only a
+name can be given, as in a trainer's configuration, "lqrsim.gym:lqrsim/Quadrotor-v0" imports the module, too. Gymnasium
+has not read entry points since version 1.0.
 """
 
 from typing import Any

@@ -165,7 +165,7 @@ class Expert:
         seen = vectors_of("observation", observation, size)
         rows = np.atleast_2d(seen)
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
-            raise InputError(f"observation: got {excerpt(rows[:, -1])} for the time, want a share of the horizon")
+            raise InputError(f"observation: got {excerpt(rows[:, -1])} as its time, want fractions of the horizon")
         step = round(float(rows[:, -1].max()) * self._steps)
         if step == 0 or self._run is None:
             self._run = self._law.start(len(rows))
@@ -217,7 +217,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin all episodes. Raises InputError for more than one seed, or an invalid option."""
         if isinstance(seed, Sequence) and not isinstance(seed, str):
-            raise InputError(f"seed: got {len(seed)} of them, want one: episodes are trials 0, 1, 2, ... of it")
+            raise InputError(f"seed: got {len(seed)} seeds, want one: the episodes are its trials 0, 1, 2, ...")
         seed, options = None if seed is None else check_seed("seed", seed), reset_options(options)
         mask = options.pop("reset_mask", None)
         if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
@@ -241,7 +241,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
 
     def render(self) -> NoReturn:
         """Raises InputError: a batch has no pictures of its own; `lqrsim.render` draws its rollout."""
-        raise InputError("render: got a batch, want an Environment, or lqrsim.render(rollout()) with frames=True")
+        raise InputError("render: got a batch, want an Environment; or frames=True and lqrsim.render(rollout(), path)")
 
     def _info(self, episode: Episode) -> dict[str, Any]:
         numbers = episode.first + np.arange(self.num_envs)

@@ -1,13 +1,13 @@
 """Distances to obstacles minus the required ones: values of a constraint. The kernels' subset.
 
-The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
-Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
+The robot is a point at its position, or a set of balls. For balls, `value` and `slope` take the centres and their
+Jacobian in place of state and control; see `augmented_lagrangian.py`.
 
 From AT on, `data` has the number of steps with margins, the number of margins per step, the number of obstacles, and
 the number of steps with a table of obstacles; then each ball's radius, the margins and the tables, step by step. The
-last margins and the last table hold from their step on. A row is an obstacle, for the first ball, then for the next; it
-has margin number `row` modulo the margins per step. AT is 0 for a point, and for balls what `places` reads comes
-before.
+last margins and the last table hold from their step on. There is a row for each obstacle, first for the first ball,
+then for the next. Its margin has the index `row` modulo the number of margins per step. AT is 0 for a point. For balls,
+the entries before AT are those that `places` reads.
 """
 
 from lqrsim.kernels.declarations import ROW, N, stack

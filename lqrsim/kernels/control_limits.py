@@ -1,9 +1,9 @@
 """Limits of the controls. The kernels' subset.
 
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
-The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the
-forward pass fixes the same ones; and wherever a control is applied, it is clamped. Where that settles, each control
-minimises the remaining cost within its limits: the first-order conditions, up to rounding, without a penalty or a
+The backward pass determines which controls are fixed, by minimising within the limits at the expected state. The
+forward pass fixes the same controls. Every control that is applied is clamped. At convergence each control minimises
+the remaining cost within its limits: the first-order conditions hold, up to rounding, without a penalty or a
 multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 

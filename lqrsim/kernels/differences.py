@@ -1,7 +1,7 @@
-"""Derivatives by central differences, for functions that come without. The kernels' subset.
+"""Central differences, for functions that come without derivatives. The kernels' subset.
 
-First derivatives step by the cube root of the machine precision: truncation and rounding then both cost some 1e-10 of
-the function's size. Second derivatives of values step by its fourth root.
+The step for first derivatives is the cube root of the machine precision: truncation and rounding errors are then both
+about 1e-10 of the function's size. The step for second derivatives of values is its fourth root.
 """
 
 from lqrsim.kernels.declarations import M, N, W, noise_values, places, rate, stack, value, zeros

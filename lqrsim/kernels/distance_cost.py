@@ -1,7 +1,7 @@
 """The cost of obstacles at distances from a model. The kernels' subset.
 
-It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
-from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has the data of the
+The cost is `weight * sum of exp(-sharpness * distance)` for distances below a cutoff D, and 0 beyond it. The tangent at
+D is subtracted, so that neither the cost nor its slope jumps there. `data` has the data of the
 distances, and from AT on the sharpness, the weight and D. `places` and `places_jacobian` are the distances here.
 """
 

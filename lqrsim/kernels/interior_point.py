@@ -1,7 +1,7 @@
 """The evaluations of an interior-point iteration, and its step. The kernels' subset.
 
-The plan need not satisfy the dynamics: between where a step leads and the next state there is a gap, which the
-iterations close. `solvers/interior_point.py` has the method.
+The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
+iterations. `solvers/interior_point.py` describes the method.
 """
 
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control

@@ -1,8 +1,8 @@
 """Iterations of LQR smoothing and of iLQR, all in compiled code. The kernels' subset.
 
 Each function runs the iterations `first` to `last` - 1, and can be called again to continue: its state is in its
-arrays. The log gets a row per iteration. All return the number of iterations so far, the outcome (a name in
-`declarations.py`), and for a pass that failed whether it was the backward one, and its step, else -1.
+arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the outcome
+(a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or -1.
 """
 
 from math import inf, isnan, nan

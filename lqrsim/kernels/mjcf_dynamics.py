@@ -1,13 +1,13 @@
-"""Dynamics that are MuJoCo's own control period: `mj_step` and its parts, called at their addresses.
+"""MuJoCo's own steps as dynamics: a control period by `mj_step` and its parts, called at their addresses.
 
-States are tangent coordinates: for each degree of freedom a position (of a ball or free joint's rotation three numbers
-of a rotation vector), then the velocities, then the actuators' own states. `p` has the wrench on the robot's body, then
+States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
+states. The rotation of a ball or free joint is three numbers, a rotation vector. `p` has the wrench on the body, then
 addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
 each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads, a slot also has
 a model of its own.
 
-A step and what helps it are compiled apart. What does arithmetic here is therefore `outline` and `exact`: LLVM would
-reorder sums by where they are inlined, and bits would depend on the thread.
+A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and
+`exact`. Otherwise LLVM would reorder sums depending on where they are inlined, and bits would depend on the thread.
 """
 
 from math import atan2, cos, nan, pi, sqrt

@@ -1,8 +1,8 @@
 """How far a site of an MJCF is from a place, and how far it is turned from an orientation. The kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the site's body, its place and axes (3 x 3) in those of the
-body, and the place and axes where it is wanted. The rows are three of the place, in the world's axes, and three of the
-rotation vector that turns the wanted axes to the site's; either or both.
+body, and the desired position and axes. The rows are three for the position, in world axes; or three for the rotation
+vector from the desired axes to the site's; or both.
 """
 
 from math import atan2, sqrt

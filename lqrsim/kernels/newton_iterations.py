@@ -1,9 +1,9 @@
 """Newton's method from the plan that smoothing has found. The kernels' subset.
 
-A pass is that of differential dynamic programming: iLQR's, with the true Hessians of the costs, not projected, and
-those of the dynamics times the costate. Where a control block is not positive definite, the pass is repeated with a
-smaller share of the second order, down to none, which is iLQR's. Near an optimum with enough curvature, convergence is
-quadratic.
+A pass is the backward pass of differential dynamic programming. It is that of iLQR with two changes: the Hessians of
+the costs are not projected, and the Hessians of the dynamics times the costate are added. If a control block is not
+positive definite, the pass is repeated with a smaller share of these second-order terms, down to none, which is iLQR's
+pass. Near an optimum with enough curvature, convergence is quadratic.
 """
 
 from math import isnan, nan
@@ -30,9 +30,9 @@ from lqrsim.kernels.rollouts import copy_plan, differential_pass, initial_step, 
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
 ARMIJO = 1e-4  # share of the predicted decrease that a step must achieve
 SMALLEST = 1e-3  # fraction of a step that the line search tries
-ROUNDING = 1e-12  # relative, of a merit
-SMALL, WEIGHTS = 1e-10, 8  # first weight on changes of controls, relative to the merit; how many, times 1000 each
-MORE = 3  # further steps at most, while the smoothed states are not at the plan
+ROUNDING = 1e-12  # rounding error of a merit, relative to the merit
+SMALL, WEIGHTS = 1e-10, 8  # first weight on control changes, relative to the merit; number of weights, each times 1000
+MORE = 3  # largest number of further steps while the smoothed states are not at the plan
 
 
 def newton_iterations(first, last, settings, model, work, memory, log):

@@ -1,6 +1,6 @@
 """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
 
-The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the
+The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on, `data` has the
 sharpness, the weight, the number of obstacles, the number of steps with a table of obstacles, of which the last holds
 from its step on, the radius of each ball (of a point, one), and the tables. What `places` reads comes before AT.
 """

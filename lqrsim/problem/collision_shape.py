@@ -1,6 +1,6 @@
-"""What of a robot must stay clear of obstacles: a ball at its position, several balls, or the geoms of an MJCF.
+"""The collision shape of a robot: a ball at its position, several balls, or the geoms of an MJCF.
 
-`ShapeInWorld` is such a shape among obstacles, with all that plans, chances of collision and simulations ask of it.
+`ShapeInWorld` is such a shape among obstacles, with the methods that plans, chances of collision and simulations need.
 """
 
 import abc
@@ -42,7 +42,7 @@ class GeomDistances(Term):
     moved: int
 
     def filling(self, kernel: Source) -> Source:
-        """A kernel of costs or constraints, with the distances as what it calls places."""
+        """A kernel of costs or constraints whose open function `places` is filled with the distances."""
         return kernel.filled(places=(self.code, "distances"), places_jacobian=(self.code, "distances_jacobian"))
 
 

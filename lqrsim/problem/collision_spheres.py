@@ -1,4 +1,4 @@
-"""Robots that are several balls: where each is, as a function of the state, and how large."""
+"""Robots made of several balls: the centre of each as a function of the state, and its radius."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -99,10 +99,10 @@ class CollisionSpheres:
 
         ls.CollisionSpheres(rotors, [0.12] * 4)
 
-    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear. The `balls` of a
-    `Robot` are its collision shape in simulation; without any it is one ball at its position. `Capsule` makes chains.
+    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all balls clear. The `balls` of a `Robot`
+    are its collision shape in simulation; a robot without balls is one ball at its position. `Capsule` makes chains.
 
-    To place balls otherwise, subclass it and write `bind`.
+    To compute the centres in another way, subclass this class and write `bind`.
 
     Args:
       places: `places(x, p)`, stated at one of the three levels of `Dynamics`; returns the middle of each of K balls.

@@ -72,7 +72,7 @@ class ConstraintTerm(Term):
         for name in ("uses_control", "equality", "final_only"):
             keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
-            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
+            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
         keep(self, shared=check_count("ConstraintTerm: shared", self.shared, at_least=0))
         super().__post_init__()
 
@@ -98,13 +98,14 @@ class SymbolicConstraint(OfFunction, Constraint):
 
         ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 
-    One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
-    the last, too, but not at a start that is given exactly, which cannot change.
+    A constraint that depends on the control acts at all steps that have a control, so not at the last knot. A
+    constraint on the state alone acts at the last knot, too. It does not act at a start that is given exactly, because
+    that cannot change.
 
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
-        must be nonnegative. All of them depend on u, or none does. They are solved for to one tolerance, so their units
-        are best such that numbers about 1 matter.
+        must be nonnegative. Either all of them depend on u, or none does. All are solved to the same tolerance, so
+        choose units in which values of about 1 matter.
       parameters: name -> value, as in `Dynamics`.
       equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
       at: "all" steps, or only the "final" one, where it must not depend on u.
@@ -215,15 +216,15 @@ class GoalState(Constraint):
 
 
 class StateBounds(Constraint):
-    """Bounds on states, `low <= x_t <= high`, at each step; only at a start that is given exactly they do not act.
+    """Bounds on states, `low <= x_t <= high`, at each step except a start that is given exactly.
 
         ls.StateBounds(height=(0.1, 2.0), velocity=(-np.inf, 1.5))
 
-    Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
+    At the end, the bounds do not act on a state that a GoalState fixes. A goal may therefore lie on a bound.
 
     Args:
-      bounds: a dictionary of name or unit of a state: (low, high), in its unit; an infinite one is none. A name wins
-        over a unit.
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit. An infinite number means no bound. A
+        name takes precedence over a unit.
       **named: name of a state -> (low, high), which says the same as a dictionary.
 
     Raises:
@@ -273,7 +274,7 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
         for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
             if goals.setdefault(i, number) != number:
                 name = dynamics.state_coordinates.names[i]
-                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one")
+                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one goal")
     return goals
 
 
@@ -345,7 +346,7 @@ def by_name(
 def _bound(field: str, given: object) -> tuple[float, float]:
     """(low, high), one of them finite."""
     if isinstance(given, (int, float)):
-        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); an infinite one is none")
+        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); infinite for no bound")
     low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
     if not low < high or not np.isfinite([low, high]).any():
         raise InputError(f"{field}: got {low:g} to {high:g}, want low below high, and one of them finite")

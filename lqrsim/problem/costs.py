@@ -110,7 +110,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         return False
 
     def _stated(self) -> Mapping[str, object]:
-        """What it was made of, by name."""
+        """The arguments that it was made from, by name."""
         return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
     def __repr__(self) -> str:
@@ -175,7 +175,7 @@ class CostSum(Cost):
         return " + ".join(map(repr, self.terms))
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        raise InputError("cost: got a sum to bind, want its terms one by one")
+        raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
 
 
 def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
@@ -232,7 +232,7 @@ class _SquareCost(Cost):
     @property
     def _known(self) -> tuple[Array, Array]:
         if self._numbers is None:
-            raise InputError(f"{self.name}: got numbers by name, want the one of a Problem, as problem.final_cost")
+            raise InputError(f"{self.name}: got numbers by name, want the cost from a Problem: problem.final_cost")
         return self._numbers
 
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
@@ -289,8 +289,8 @@ class ControlCost(_SquareCost):
     Args:
       weight: (m, m) symmetric positive definite, or its diagonal (m,), or a dictionary of name or unit of a control:
         number, with one for each control.
-      about: (m,) the nominal control, where it is zero, or a dictionary of name or unit: number; the solvers start from
-        it unless told otherwise. By default, and for controls without a number, 0.
+      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. The solvers
+        start from it unless told otherwise. By default 0, also for controls that the dictionary leaves out.
     """
 
     controls = True
@@ -334,16 +334,17 @@ class LimitCost(Cost):
 class ObstacleCost(KeepsClear, Cost):
     """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
 
-    Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
-    the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
+    Paper: Sec. VI-A, with the sharpness made explicit. The cost does not act at t = 0, where the state is given. For a
+    robot in the plane (two position coordinates), the world is seen from above or cut by the plane; see
+    `World.seen_by`.
 
-    For a robot of several balls it is also the sum over the balls. The Hessian is then that in the balls' places, taken
-    to the states by the first derivatives of the places; their second derivatives are left out.
+    For a robot of several balls, the cost is summed over the balls, too. Its Hessian is then computed in the centres of
+    the balls and mapped to the states by the Jacobian of the centres. Second derivatives of the centres are left out.
 
     Args:
       world: the obstacles.
       radius: radius of the robot at its position, in metres.
-      balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
+      balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
       geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances: the sum is over its
         bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. Give one of radius, balls
         and geoms.
@@ -484,7 +485,7 @@ class FunctionCost(OfFunction, Cost):
         self.level = level_of(function, level)
         if self.level == "symbolic":
             if level is not None:
-                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
+                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled' or 'plain'; or use SymbolicCost")
             self.level = "plain"
         self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
         if self.depends_on == ():  # a constant: nothing to minimise

@@ -55,15 +55,15 @@ class Dynamics:
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
-      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed; p has the parameters as
-        attributes, and so have x and u states and controls where they are symbols: `x.speed` is `x[1]`.
+      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed. The parameters are attributes
+        of p. If x and u are symbols, states and controls are attributes, too: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: quantities unknown when planning, such as a wind or the remaining share of a motor's force: name ->
-        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants and are
-        not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
-        knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
+        the value that the plan assumes, usually 0 or 1. To f they are parameters. For planning they are constants, so
+        they cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows the
+        names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
       plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they are
@@ -188,7 +188,7 @@ class Dynamics:
 
     @cached_property
     def disturbed(self) -> "Dynamics":
-        """The same dynamics with the disturbances as parameters, too; at their planned values it moves the same way."""
+        """The same dynamics with the disturbances as parameters, too. At their planned values nothing changes."""
         if self.disturbances.keys() <= self.parameters.keys():
             return self
         other = copy.copy(self)
@@ -249,13 +249,13 @@ class Dynamics:
         return iter(())
 
     def contact_modes(self, dt: float) -> "ContactModes | None":
-        """What acts in control periods, for dynamics that are smooth only as long as the same does.
+        """The contact modes of control periods, for dynamics that are smooth only within one mode.
 
         Args:
           dt: the control period in seconds.
 
         Returns:
-          None, except for an MJCF in which all that switches is known.
+          None, except for an MJCF whose switches are all known.
         """
         return None
 
@@ -472,5 +472,5 @@ def _parameters_of(
     own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
     twice = own.keys() & unknown.keys()
     if twice:
-        raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
+        raise InputError(f"disturbances: got {min(twice)!r}, which is also a parameter, want another name")
     return (own if level == "symbolic" else own | unknown), unknown

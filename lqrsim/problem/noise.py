@@ -1,4 +1,4 @@
-"""Noise that dynamics are driven by, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
+"""Process noise, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
 
 The same object serves for planning, as `Problem(noise=...)`, and in trials, as one of the disturbances of `simulate`.
 """
@@ -78,13 +78,13 @@ class Noise:
     the square root of dt: with half the dt, divide M by sqrt(2).
 
     Args:
-      function: `function(x, u, p)` as in `Dynamics`: returns n rows of k entries, formulas of SymPy symbols, whose
-        derivatives follow; or numbers, of a numba or (level="plain") any Python function of arrays, whose derivatives
-        are central differences. Or the matrix itself, (n, k), if it is constant.
+      function: `function(x, u, p)` as in `Dynamics`; returns n rows of k entries. For SymPy symbols the entries are
+        formulas, whose derivatives follow. For a numba function, or with level="plain" any Python function, of arrays
+        they are numbers, whose derivatives are central differences. A constant M may be given as a matrix (n, k).
       size: k; not with a matrix.
       parameters: name -> value, as in `Dynamics`: to the function p has them as attributes. Values are data.
       depends_on: names of the states and controls that M depends on, for numba and plain functions; all by default.
-        Fewer are faster. For formulas they are found automatically.
+        The fewer, the faster. For formulas they are found automatically.
       level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
 
     Raises:

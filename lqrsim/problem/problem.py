@@ -67,7 +67,7 @@ class FixedState:
     def numbers(self) -> Array:
         """The state (n,). Numbers by name are in no order before a Problem has it."""
         if isinstance(self.state, Mapping):
-            raise InputError("FixedState: got numbers by name, want that of a Problem, as problem.initial")
+            raise InputError("FixedState: got numbers by name, want the state from a Problem: problem.initial")
         return np.asarray(self.state)
 
     def _in(self, dynamics: Dynamics) -> "FixedState":
@@ -84,26 +84,26 @@ class Problem:
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
 
     Attributes:
-      dynamics: whose Runge-Kutta step over `dt`, control held, is g.
+      dynamics: the dynamics. g is their Runge-Kutta step over `dt` with the control held.
       dt: the control period in seconds.
       steps: T, the number of them.
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
-        (lowest, highest); by default the actuators' range. Infinite ones plan as if there were none. Plan and policy
-        keep them exactly, and the policy keeps the actuators', too.
+        (lowest, highest); by default the actuators' range. Infinite limits mean that the plan has none. Plan and policy
+        respect these limits exactly; the policy also respects those of the actuators.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
       begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
-      noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
-        worked out to second order about the plan. None for none.
+      noise: process noise: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation, to second order
+        about the plan. None for a problem without noise.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
         risk-averse, below 0 risk-seeking; 0 is the expectation.
-      duration: (shortest, longest) in s: the final time is free. A solve begins with `dt` and `steps`; the solution has
-        as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is. None for the
-        duration that dt and steps say.
-      time_weight: cost of a second of a free duration. It is not in the solution's cost, whose duration is settled.
+      duration: (shortest, longest) in s, for a free final time. A solve begins with `dt` and `steps`. The solution has
+        the same number of steps, and its own dt. The stage cost still counts once per step, whatever dt is. None for
+        the fixed duration steps * dt.
+      time_weight: cost per second of a free duration. The cost of a solution does not include it.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -176,7 +176,7 @@ class Problem:
 
     @property
     def moving(self) -> bool:
-        """Whether it changes with the time at which it begins: whether obstacles move."""
+        """Whether the problem depends on the time at which it begins, because obstacles move."""
         return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
@@ -299,7 +299,7 @@ class Problem:
 
     @property
     def applied_coordinates(self) -> Coordinates:
-        """The same with limits that are also the actuators', as a policy keeps them."""
+        """The same, with limits narrowed to the actuators', as a policy respects them."""
         return self._controls[1]
 
     @property
@@ -417,7 +417,7 @@ class Problem:
         elif self.moving:
             why = "obstacles that move"
         if why:
-            raise InputError(f"duration: got {low:g} to {high:g} s beside {why}, want None, or a problem without")
+            raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot is in an obstacle where it starts."""

@@ -1,7 +1,7 @@
 """Arrays by name and one JSON text in a file: NumPy's .npz, with a hash of its content.
 
-A file may come from anyone. Nothing in it is run, nothing is unpacked before its size is known to fit the shape that it
-states, and whatever a parser raises becomes one line.
+A file may come from anyone. Nothing in it is run. Nothing is unpacked before its size is known to fit the stated shape.
+Every exception of a parser becomes a one-line error.
 """
 
 import contextlib
@@ -142,14 +142,14 @@ class Archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             if name == member.filename or member.orig_filename != member.filename:
-                raise InputError(f"{excerpt(member.orig_filename)}: got a part of that name, want arrays only")
+                raise InputError(f"{excerpt(member.orig_filename)}: got a part that is no array, want arrays only")
             if name in self._members:
                 raise InputError(f"{excerpt(name)}: got it twice, want it once")
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or member.flag_bits & 0x1:
-                raise InputError(f"{excerpt(name)}: got another compression, want deflated or stored")
+                raise InputError(f"{excerpt(name)}: got an array in another compression, want it deflated or stored")
             self._members[name] = member
         if META not in self._members:
-            raise InputError(f"{META}: got none, want it")
+            raise InputError(f"{META}: got none, want a file that lqrsim wrote, which has one")
         if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
             raise InputError(f"size: got {total:,} bytes, want at most {_limit(size):,} in a file of {size:,}")
         self.headers = {name: self._header(name) for name in self._members if name != META}
@@ -189,7 +189,7 @@ class Archive:
         with self._archive.open(self._members[name]) as file:
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
             if file.read(1):  # reads to the end, where zipfile compares the check sum
-                raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want as many")
+                raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want exactly as many")
         return array
 
 

@@ -236,7 +236,7 @@ class Coordinates:
     def _by_name(
         self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
     ) -> dict[int, _Value]:
-        """What is given by name or by unit, by the index of the entry; a name wins over a unit.
+        """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit.
 
         Args:
           field: of the message.

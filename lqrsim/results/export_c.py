@@ -28,7 +28,7 @@ TEMPLATES = Path(__file__).parent.parent / "templates" / "c"
 PREFIX = "my_policy"  # in the templates
 STATIC = ("CMakeLists.txt", "main.c", "stm32f405.c", "stm32f405.ld")
 LARGEST = 32767  # of 16 bits
-# What main.c allows, relative to the largest sum of magnitudes in a command: well above rounding, which is about 1e-15
+# The tolerance of main.c, relative to the largest sum of magnitudes in a command: well above rounding, about 1e-15
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
 SHARES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
 NUMBERS, GAINS = ("float", "double"), ("full", "int16")
@@ -85,10 +85,10 @@ def export_c(
       policy: of a solution; of `track`; or with a filter, as `OffsetFree(...).policy`. A controller that solves while
         it runs, or a function, cannot be exported.
       folder: for the files. Files of these names are replaced.
-      number: "float" or "double", of all but the time.
+      number: the type of all numbers except the time, "float" or "double".
       gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
       interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
-      name: of the files and the functions: small letters, digits and underscores, a letter first.
+      name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter.
 
     Raises:
       InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
@@ -100,7 +100,7 @@ def export_c(
     folder, number = check_path("folder", folder, "the path of a folder"), check_name("number", number, NUMBERS)
     gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
-        raise InputError(f"name: got {excerpt(name)}, want small letters, digits and underscores, such as policy")
+        raise InputError(f"name: got {excerpt(name)}, want lower-case letters, digits and _, such as policy")
     law = policy.policy if isinstance(policy, Solution) else policy
     if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")

@@ -1,6 +1,6 @@
 """HTML of results for notebooks: a heading, a table and a drawing. NumPy only.
 
-All text is escaped, for names come from files that anyone may have written.
+All text is escaped, because names come from files that anyone may have written.
 """
 
 from collections.abc import Iterable, Sequence

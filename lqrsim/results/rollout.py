@@ -48,7 +48,7 @@ class BallRecord:
         """
         body, *place = self.anchors[-1].tolist()
         if not np.isfinite(body):
-            raise InputError("balls: got no site for the last of them, want one among the sites= of CollisionSpheres")
+            raise InputError("balls: got no site for the last ball, want one in sites= of CollisionSpheres")
         return int(body), np.array(place)
 
 

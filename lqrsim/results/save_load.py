@@ -77,7 +77,7 @@ def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
         _record(kind, tree, "", dict(arrays))
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
-        raise InputError(f"result: got a {name}, {reason}, want one as lqrsim makes it") from None
+        raise InputError(f"result: got a {name}, {reason}, want an unchanged result of lqrsim") from None
     return arrays, {"format": f"lqrsim {name}", "version": version, **tree}
 
 
@@ -114,7 +114,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         arrays, tree = archive.arrays(), {name: one for name, one in archive.meta.items() if name not in outside}
         record = _record(kind, tree, "", arrays)
         if arrays:
-            raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
+            raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
         return record
 
 

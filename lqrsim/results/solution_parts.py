@@ -209,7 +209,7 @@ class Iteration:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactCertificate:
-    """What is beside a plan that keeps to its contact modes, by rollouts of its policy with other offsets.
+    """The costs around a plan that keeps to its contact modes, from rollouts of its policy with other offsets.
 
     A *switch* is where a contact, a limit or an edge of friction begins to act or lets go: the cost jumps there or has
     a kink. All costs are relative to the plan's.

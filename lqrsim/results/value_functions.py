@@ -24,7 +24,7 @@ def _invertible(what: str) -> Iterator[None]:
     try:
         yield
     except np.linalg.LinAlgError as error:
-        raise InputError(f"{what}: got a singular matrix ({error}), want invertible ones") from None
+        raise InputError(f"{what}: got a singular matrix ({error}), want an invertible one") from None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Robot(abc.ABC):
-    """Subclass it to add a robot; see `quadrotor.py` for an example and `docs/adding_a_robot.md` for the steps.
+    """A robot. Subclass it to add your own; `quadrotor.py` is an example, `docs/adding_a_robot.md` lists the steps.
 
     Attributes:
       name: its name on the command line.
@@ -26,10 +26,10 @@ class Robot(abc.ABC):
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
-      radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
-      balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
-        None by default. The radius then is the robot's size in pictures, and the distance within which it has reached
-        its goal.
+      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball.
+      balls: the colliding balls, in place of `radius`, for a robot of more than one ball or without a position. None by
+        default. With balls, the radius is the size of the robot in pictures, and the distance from the goal within
+        which the robot has reached it.
       geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
         None by default.
     """
@@ -61,12 +61,12 @@ class Robot(abc.ABC):
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
 
-        Angles come out in the representative nearest to `near` (..., n), if given. Without the `activations`.
+        The states of the `activations` are not included.
 
         Args:
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
-          near: (..., n), to which angles are taken nearest; None for any representative.
+          near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
         """
 
     @abc.abstractmethod

@@ -45,7 +45,7 @@ _LISTED = 12  # names in a line of what is printed
 
 
 class MjcfRobot(Robot):
-    """All that moves in an MJCF, as one robot.
+    """Everything that moves in an MJCF, as one robot.
 
     A cart-pole, from hanging to standing:
 
@@ -73,18 +73,18 @@ class MjcfRobot(Robot):
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
-      body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
-        that moves and has mass, itself or by bodies that are fixed to it.
+      body: name of the body on which disturbances act, and whose position is the robot's. By default the first moving
+        body that has mass, either its own or that of bodies fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
         MuJoCo's kinematics. () for none.
       radius: radius of a ball about the body's origin that contains everything that may collide; by default the
         smallest guaranteed one.
-      outline: whether there are `balls`, fixed to the bodies, about all that collides; by default where there is no
-        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. Pictures follow them,
-        and they are cheap bounds of the colliding geoms.
+      outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
+        it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
+        balls are cheap bounds of the colliding geoms, and pictures follow them.
       floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
-      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. Geoms
-        that are not obstacles collide by MuJoCo's contacts, in the plan, too.
+      obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
+        none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
 
     Attributes:
       scene: the scene that it moves in.
@@ -197,9 +197,9 @@ class MjcfRobot(Robot):
         return self._dynamics
 
     def with_parameters(self, **values: float) -> "MjcfRobot":
-        """The robot with other numbers in its MJCF, also for a plant: `robot.with_parameters(mass=0.6)`.
+        """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
 
-        `dynamics.numbers` has their names and values; `dynamics.with_parameters` is the same for a plan alone.
+        `dynamics.numbers` has the names and values. `dynamics.with_parameters` changes the numbers for a plan alone.
 
         Args:
           **values: number of the MJCF, as in `dynamics.numbers` -> value.
@@ -208,7 +208,7 @@ class MjcfRobot(Robot):
           An MjcfRobot.
 
         Raises:
-          InputError: as there.
+          InputError: as `dynamics.with_parameters` does.
         """
         changed = self.dynamics.with_parameters(**values)
         model = checked_model(changed.xml, self.name)
@@ -219,10 +219,10 @@ class MjcfRobot(Robot):
         """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
 
         Args:
-          state: (n,), whose velocities do not count; nor do activations, which take the values that hold it, too.
+          state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
 
         Returns:
-          (m,), within their limits; where nothing holds it, those with the least sum of squared forces left.
+          (m,), within the limits. If no controls hold the robot, those with the least sum of squared remaining forces.
 
         Raises:
           InputError: the state is not (n,) finite numbers.
@@ -230,10 +230,10 @@ class MjcfRobot(Robot):
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
     def settled(self, state: npt.ArrayLike) -> Array:
-        """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
+        """A nearby state in which the robot stands at rest. Joints without actuators, such as a free base, move to it.
 
-        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
-        Activations of actuators take the values that hold it.
+        Legs keep their angles. The base moves to where the contacts, which are springs, carry it. The robot must touch
+        its support at the given state. Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -249,8 +249,8 @@ class MjcfRobot(Robot):
         place, left = settled(model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
             raise InputError(
-                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches"
-                " what is to carry it"
+                f"state: got one with no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
+                " robot touches its support"
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
@@ -274,13 +274,13 @@ class MjcfRobot(Robot):
         limits: float = 100.0,
         clearance: float | None = None,
     ) -> Problem:
-        """Make a problem: from one state to another, within the actuators' limits, clear of obstacles at a cost.
+        """Make a problem: from one state to another, within the actuators' limits, with costs on obstacles.
 
-        Joints keep off their limits at a cost, too: MuJoCo's step is discontinuous where a limit is just reached, and
-        plans along one do not converge.
+        Joint limits have a cost, too. MuJoCo's step is discontinuous where a limit is just reached, and plans that move
+        along a limit do not converge.
 
-        The cost of the controls is about those that hold the robot still at the start; if it can be held at the goal,
-        too, about the mean of both. Solvers start from these controls.
+        The control cost is zero at the controls that hold the robot still at the start. If it can also be held at the
+        goal, the cost is zero at the mean of both. Solvers start from these controls.
 
         Args:
           start: (n,), a state.
@@ -289,11 +289,12 @@ class MjcfRobot(Robot):
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
             that are not named then have none.
-          effort: weights of the controls, likewise; by default 1 over the square of a control's largest size, so that
-            one that is off by that much costs 1/2: by its limits, else those of its force, else 1.
+          effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
+            so that a deviation of that size costs 1/2. The largest value is that of the control limits, else that of
+            the force limits, else 1.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
-          limits: weight of what a joint is closer to its limits, at each step, than 0.1 rad or m, 5 % of its range, or
-            start and goal are.
+          limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
+            it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
           clearance: constrains the distance to all obstacles to at least this, in metres, as `lqrsim solve --clearance`
             does; by default obstacles only add cost.
 
@@ -362,7 +363,7 @@ class MjcfRobot(Robot):
         return "\n".join(lines)
 
     def _amiss(self) -> dict[str, list[str]]:
-        """What a plan from the MJCF's rest has to do with from its first step: joints past limits, and contacts."""
+        """Problems of a plan that starts from the MJCF's rest: joints past their limits, and contacts."""
         model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
         past = [
             f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
@@ -387,8 +388,8 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        Joints that an equality constraint couples to others follow these, unless they are named. Activations of
-        actuators are those that hold the robot there, unless they are named or the keyframe's.
+        A joint that an equality constraint couples to another follows it, unless it is named. Activations of actuators
+        are those that hold the robot, unless they are named or given by the keyframe.
 
         Args:
           keyframe: its name; None for the MJCF's rest.

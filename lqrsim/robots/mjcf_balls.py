@@ -1,4 +1,4 @@
-"""The outline of a robot of an MJCF: balls along what collides, where MuJoCo's kinematics has them."""
+"""The outline of a robot from an MJCF: balls that cover the colliding geoms, placed by MuJoCo's kinematics."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Dynamics that are MuJoCo's: where a control period leads, by its own steps."""
+"""MuJoCo as dynamics: the state after a control period, computed by MuJoCo's own steps."""
 
 import contextlib
 import copy

@@ -1,4 +1,4 @@
-"""Sites of an MJCF as what costs and constraints are about: a gripper at a place, and turned as it should be."""
+"""Costs and constraints on sites of an MJCF, such as a gripper at a desired position and orientation."""
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,7 @@ class _Pose:
         if orientation is not None:
             quaternion = check_array(f"{what}: orientation", orientation, (4,))
             if not np.linalg.norm(quaternion) > 1e-9:
-                raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a quaternion (w, x, y, z)")
+                raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a nonzero (w, x, y, z)")
             self.axes = axes_of(quaternion / np.linalg.norm(quaternion))
 
     @property
@@ -66,11 +66,11 @@ class SiteCost(Cost):
 
     Args:
       site: its name in the MJCF.
-      position: (3,) where it is wanted, in the world, in metres; None for anywhere.
-      orientation: (4,) the quaternion (w, x, y, z) of how it is wanted in the world; None for any. The angle is that of
-        the turn from there, less than half a turn.
-      weight: weight of the place, a number or one an axis of the world, (3,).
-      turn_weight: weight of the turn, a number or one an axis of what is wanted, (3,).
+      position: (3,) the desired position in the world, in metres; None for any.
+      orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. The angle is
+        that of the rotation from the desired orientation, less than half a turn.
+      weight: weight of the position error: one number, or one per world axis, (3,).
+      turn_weight: weight of the orientation error: one number, or one per axis of the desired orientation, (3,).
     """
 
     def __init__(

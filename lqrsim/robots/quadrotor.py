@@ -28,7 +28,7 @@ class Quadrotor(Robot):
       drag: in N s/m, against the velocity; the paper's k_v.
       gravity: in m/s^2.
       max_force: in N, of a rotor.
-      min_force: likewise, the least.
+      min_force: in N, the least force of a rotor.
       radius: in m, of the collision sphere.
 
     Raises:

@@ -1,9 +1,9 @@
-"""What acts at each physics step of a control period of an MJCF, its contact mode, and how far another mode is.
+"""The contact mode of an MJCF, that is, what acts at each physics step of a control period; and the distance to others.
 
-A contact or a limit begins to act where its distance passes zero, and one that acts lets go, or an edge of its friction
-cone does, where its force passes zero. Each of these *switches* is a number that changes its sign there. As long as
-none does, a control period is a smooth function of its state and control. Where a distance changes its sign, a period
-is in general discontinuous; where a force does, it has a kink.
+A contact or a limit begins to act when its distance crosses zero. An active one, or an edge of its friction cone, lets
+go when its force crosses zero. Each of these *switches* is a number that changes sign at the event. As long as no
+switch changes sign, a control period is a smooth function of its state and control. Where a distance changes sign, the
+period is in general discontinuous. Where a force changes sign, it has a kink.
 """
 
 import copy

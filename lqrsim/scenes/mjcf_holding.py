@@ -34,7 +34,7 @@ class Holding:
 
 
 class _Levels:
-    """What each actuator's force is affine in: its control or, where it has one, its activation.
+    """The variable in which each actuator's force is affine: its control or, if it has one, its activation.
 
     A filter's and a muscle's activation comes to rest at the control, an integrator's anywhere, with a control of zero.
     """

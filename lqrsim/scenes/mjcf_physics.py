@@ -153,7 +153,7 @@ def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
     model.geom_contype[listed] = model.geom_conaffinity[listed] = 0
     for geom in np.intersect1d(listed, [model.pair_geom1, model.pair_geom2])[:1]:
         who = model.geom(int(geom)).name
-        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype and conaffinity")
+        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
     option, flags = model.opt, mujoco.mjtDisableBit
     option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)

@@ -9,10 +9,10 @@ contype or conaffinity is not zero, and contacts are not switched off by a flag.
   to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
 - plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out. A robot
   from an MJCF has MuJoCo's distances, to all types;
-- a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
+- a cylinder or capsule counts as infinite if both ends lie on or behind planes, because nothing can reach them.
 
-`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out geoms that are not in
-the way of that robot.
+`obstacles=` of `load_scene` chooses other obstacles, by names or by a function. `MjcfRobot` leaves out geoms that are
+not in the way of that robot.
 """
 
 import contextlib
@@ -206,7 +206,7 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
             return [geom for geom in fixed if obstacles(model.geom(geom))]
         except Exception as error:  # whatever a user's function may raise becomes one line
             raise InputError(
-                f"{what}: obstacles: got {type(error).__name__} ({error}), want a rule for geoms"
+                f"{what}: obstacles: got {type(error).__name__} ({error}), want a function of a geom that does not fail"
             ) from error
     wanted = "True, False, names of geoms or bodies, or a function of a geom"
     if isinstance(obstacles, str):

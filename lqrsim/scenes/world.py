@@ -1,4 +1,4 @@
-"""Obstacles as primitives, and the world of them; `kernels/signed_distance.py` has the distance to each."""
+"""Obstacles as geometric primitives, and the world, a set of them. `kernels/signed_distance.py` has the distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,9 +1,9 @@
 """The definition of a collision: the first moment at which the robot of a trial touches an obstacle.
 
-It touches one if the signed distance of its position, or of one of its balls or geoms, minus the radius is negative; or
-if MuJoCo detects a contact. Detection uses states without obstacle contacts, so that it is bit-identical whether an
-obstacle then stops the robot or not. It checks the knots, the parts of a control period that `Physics` has, and
-straight lines between them.
+The robot touches an obstacle if MuJoCo detects a contact, or if a signed distance minus the radius is negative. The
+distance is that of the robot's position, or of one of its balls or geoms. Detection uses states without obstacle
+contacts, so its result is bit-identical whether or not an obstacle then stops the robot. It checks the knots, the parts
+of a control period that `Physics` has, and straight lines between them.
 """
 
 import numpy as np
@@ -53,7 +53,7 @@ class Collisions:
             if len(self.plant.world):
                 self._search_line(step, part, parts, self.shape.places(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
-        # A time in the period may be rounded to beyond its end.
+        # Rounding may put a time in the period past the period's end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
         return found
 

@@ -115,7 +115,7 @@ class SimulatorPhysics(Physics):
 
     def multiply(self, parameter: str, factors: Array) -> None:
         if parameter not in self._simulator.parameters:
-            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, which cannot change it")
+            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, want one that can")
         self._factors[parameter] = self._factors.get(parameter, 1.0) * factors
 
     def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:

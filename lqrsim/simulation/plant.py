@@ -1,6 +1,6 @@
 """A robot in a scene: the MuJoCo model of both, and the places of the robot's states and actuators in it.
 
-With a `Simulator` the robot moves as that says; the MuJoCo model then has the obstacles and the pictures.
+With a `Simulator`, the simulator moves the robot. The MuJoCo model then provides the obstacles and the pictures.
 """
 
 import copy
@@ -51,7 +51,7 @@ class Plant:
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
-        do not fit these; or its position is not that of its body in MuJoCo. The simulator cannot simulate the robot.
+        do not fit these; its position is not that of its body in MuJoCo; or the simulator cannot simulate the robot.
     """
 
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
@@ -65,9 +65,7 @@ class Plant:
         self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, instead of the MJCF's
         if robot.geoms is not None and not robot.geoms.of_scene(scene):
-            raise InputError(
-                f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles"
-            )
+            raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
         if self.shape.centers is not None and not self.shape.in_plane:
             near = _in_the_way(robot, scene)
@@ -91,7 +89,7 @@ class Plant:
             if self.obstacles != self.world.names:
                 raise InputError(
                     f"simulator: got {simulator.name} for robot {robot.name}, which has neither a position nor balls to"
-                    f" find its collisions by, want one that has"
+                    f" find its collisions by, want a robot that has one"
                 )
             simulator.check(robot)
 
@@ -119,7 +117,7 @@ class Plant:
           InputError: it cannot.
         """
         if self.simulator is not None and parameter not in self.simulator.parameters:
-            raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, which cannot have it")
+            raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
     def for_period(self, period: float) -> "Plant":
         """The same plant with the longest physics step, up to its own, that divides a control period.

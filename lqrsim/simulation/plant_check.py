@@ -195,7 +195,7 @@ def _checked(problem: Problem, robot: Robot) -> Problem:
     for what in ("state_coordinates", "control_coordinates"):
         found, own = getattr(problem.dynamics, what).names, getattr(robot.dynamics, what).names
         if found != own:
-            raise InputError(f"problem: got one of {excerpt(found)}, want one of the robot's {excerpt(own)}")
+            raise InputError(f"problem: got one with {excerpt(found)}, want one with {excerpt(own)}, as the robot has")
     return problem
 
 
@@ -282,7 +282,7 @@ def _in_simulator(
         if not np.isfinite(after).all():
             raise InputError(
                 f"{simulator.name}: got a state that is not finite, from x = {np.array2string(state, precision=3)},"
-                f" u = {np.array2string(control, precision=3)}, want a simulator that starts there"
+                f" u = {np.array2string(control, precision=3)}, want a finite state after each step"
             )
         states.append(after)
     before = dynamics.state_coordinates.nearest(states[1], state)

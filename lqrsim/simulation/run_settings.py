@@ -1,4 +1,4 @@
-"""The options of `simulate`, checked, also whether controller, plan and plant fit together."""
+"""The options of `simulate`, with checks that they are valid and that controller, plan and plant fit together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -139,7 +139,7 @@ def _check_plan(given: Plan, plant: Plant) -> None:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
-        raise InputError(f"plan: got one of {shapes}, want {n} and {m}")
+        raise InputError(f"plan: got one with {shapes}, want {n} states and {m} controls, as the robot has")
     if not plan.finite:
         raise InputError(f"plan: got one that is not finite ({given.status.name}), want one that can be run")
 

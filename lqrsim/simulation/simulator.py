@@ -1,7 +1,7 @@
-"""The physics of a plant that is not MuJoCo's: the class to subclass for another simulator.
+"""The base class for simulators other than MuJoCo.
 
-The scene is MuJoCo's all the same: obstacles, distances to them and pictures are of its MJCF. A robot that another
-simulator moves passes through obstacles; its first collision is found from its states, as in `collisions.py`.
+The scene is still MuJoCo's: obstacles, distances to them and pictures come from its MJCF. A robot that another
+simulator moves passes through obstacles. Its first collision is found from its states, as in `collisions.py`.
 """
 
 import abc
@@ -102,7 +102,7 @@ class Simulator(abc.ABC):
         Raises:
           InputError: it cannot.
         """
-        raise InputError(f"StateNoise: got a plant simulated by {self.name}, which does not override `place`")
+        raise InputError(f"StateNoise: got a plant simulated by {self.name}, want one that overrides `place`")
 
 
 def states_of(simulator: Simulator, simulations: Any, shape: tuple[int, ...]) -> Array:

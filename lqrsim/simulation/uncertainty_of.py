@@ -1,4 +1,4 @@
-"""Disturbances as filters, tracking laws and predicted tubes take them: as numbers."""
+"""Disturbances as numbers, in the form that filters, tracking laws and predicted tubes use."""
 
 from collections.abc import Sequence
 

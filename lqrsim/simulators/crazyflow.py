@@ -1,4 +1,4 @@
-"""crazyflow's identified Crazyflies as plants: their curves of thrust, their rotors' lag and momentum, their drag."""
+"""crazyflow's identified Crazyflies as plants: their thrust curves, rotor lag and momentum, and drag."""
 
 import warnings
 from collections.abc import Mapping

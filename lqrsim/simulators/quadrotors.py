@@ -1,7 +1,8 @@
-"""What simulators of quadrotors share: their vehicle in the terms of `Quadrotor`, and its states in theirs.
+"""Code shared by the quadrotor simulators: their vehicle as a `Quadrotor`, and conversions between the states of both.
 
-Both have rotors between the axes of the body. `Quadrotor` has them on its axes, so its body is turned against theirs
-about the vertical one, and rotors are numbered from its x axis, counterclockwise from above.
+Both simulators place the rotors between the axes of the body, in an X configuration. `Quadrotor` places them on its
+axes, in a plus configuration. Its body axes are therefore turned about the vertical relative to theirs. Rotors are
+numbered from its x axis, counterclockwise seen from above.
 """
 
 import contextlib
@@ -48,7 +49,7 @@ class Frame:
         corners = angles[first] + np.pi / 2 * np.arange(4)
         square = arm * np.stack([np.cos(corners), np.sin(corners)], axis=1)
         if np.abs(places[order, :2] - square).max() > TWIST or not np.array_equal(turning[order], [1, -1, 1, -1]):
-            raise InputError(f"{name}: got rotors at {places.tolist()}, want those of a square, turning alternately")
+            raise InputError(f"{name}: got rotors at {places.tolist()}, want a square with alternating spin")
         return cls(float(angles[first]), order, arm)
 
     def theirs(self, states: Array) -> tuple[Array, Array, Array, Array]:
@@ -82,10 +83,10 @@ def package(module: str, extra: str) -> Any:
     """A module of a package that an extra installs. Raises InputError with that extra if it is not there."""
     name = module.partition(".")[0]
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx says there what it can do without
+        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which optional packages it lacks
             return importlib.import_module(module)
     except ImportError:
-        raise InputError(f"{name}: got none, want it installed: pip install 'lqrsim[{extra}]'") from None
+        raise InputError(f"{name}: got no such package, want it installed: pip install 'lqrsim[{extra}]'") from None
     except RuntimeError as error:
         if "SCIPY_ARRAY_API" not in str(error):
             raise

@@ -6,8 +6,8 @@ zero. Pivoting finds the others: rows with a multiplier of the wrong sign are re
 neighbouring steps only the worst, since holding one usually keeps them all. Where the number of wrong rows does not
 fall, they change one at a time, which terminates for convex models.
 
-Second-order models have a minimum only with the right rows held. Where the known rows do not suffice, convex models
-choose the rows first; the step itself uses the largest share of the second order that leaves a minimum.
+Second-order models have a minimum only if the right rows are held. If the known rows are not enough, convex models
+choose the rows first. The step itself uses the largest share of the second-order terms with which a minimum exists.
 """
 
 import time

@@ -71,7 +71,7 @@ def assemble(
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """What would help in this case, or where nothing is known, what helps others that end so; empty for a success."""
+    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success."""
     status = found.status
     if status.success:
         return ""

@@ -1,12 +1,13 @@
 """Constraints by the method of multipliers: from the optimum without them to one that keeps them.
 
-The smoother minimises the augmented Lagrangian, roughly; then the multipliers are updated, and the penalty grows where
-the violation has not halved; and again. Updating after every iteration would make plans that slide along an obstacle
-swing to and fro, since the model leaves out how an obstacle curves. Where undamped iterations do not settle, the
-safeguard's damped ones minimise each augmented Lagrangian.
+The smoother minimises the augmented Lagrangian approximately. Then the multipliers are updated, and the penalty grows
+where the violation has not halved. Both steps are repeated. With an update after every iteration, plans that slide
+along an obstacle would oscillate, since the model leaves out the curvature of obstacles. If undamped iterations do not
+settle, the damped ones of the safeguard minimise each augmented Lagrangian.
 
-It serves problems that the interior point does not take: noise with constraints, an MJCF's dynamics, `finish=None`; and
-is one rung of the ladder among obstacles, see `strategy.py`. The compiled part is `kernels/augmented_lagrangian.py`.
+The method serves problems that the interior point does not take: noise with constraints, the dynamics of an MJCF, and
+`finish=None`. Among obstacles it is also one of the attempts in `strategy.py`. The compiled part is in
+`kernels/augmented_lagrangian.py`.
 """
 
 import dataclasses

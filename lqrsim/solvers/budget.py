@@ -1,4 +1,4 @@
-"""The budget of a solve: time, iterations, and how it learns that the caller wants it to end."""
+"""The budget of a solve: time, iterations, and requests by the caller to stop."""
 
 import contextlib
 import logging

@@ -407,7 +407,7 @@ def optimality_in_mode(
 
 
 def surroundings(problem: Problem, model: ModeModel, plan: CostedPlan, pulls: Sequence[Switches]) -> ContactCertificate:
-    """What the true cost is beside a plan: across each switch that it is pressed against, and at random."""
+    """The true cost near a plan: across each switch that the plan is pressed against, and at random samples."""
     pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
     plans = [beyond(problem, plan, model, which) for which in pressed]
     cheapest = min((one.cost for one in plans if one is not None), default=np.inf)

@@ -166,11 +166,11 @@ def smooth_continuous(
             " the primal form has no other start"
         )
     if problem.constraints:
-        raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
+        raise InputError("constraints: got some, want none in continuous time; use `smooth`, which keeps them")
     if problem.noise is not None:
-        raise InputError("noise: got some, want none in continuous time: noise is per control period; smooth takes it")
+        raise InputError("noise: got some, want none in continuous time; use `smooth`: noise is per control period")
     if problem.dynamics.discrete:
-        raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
+        raise InputError(f"dynamics: got {problem.dynamics.name}, which has no rate xdot; use `smooth`")
     limits = _Limits(
         check_number("tolerance", tolerance, above=0.0),
         check_number("gap_tolerance", gap_tolerance, above=0.0),

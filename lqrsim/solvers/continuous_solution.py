@@ -1,4 +1,4 @@
-"""What a solve in continuous time returns: policy and value functions as functions of time."""
+"""The result of a solve in continuous time: policy and value functions as functions of time."""
 
 from dataclasses import dataclass, field
 from typing import Annotated

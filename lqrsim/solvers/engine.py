@@ -135,13 +135,13 @@ def iterate(
     """Run a loop of `kernels/iterations.py` until it ends, there are `last` rows, or the budget is over.
 
     Args:
-      problem: whose functions may raise meanwhile.
+      problem: the problem, whose functions may raise exceptions during the run.
       run: runs the iterations from its first argument up to its second, or fewer.
       rows: (any,) `LOG`, where `run` writes.
       first: the row that comes next. last: how many rows there are to be, as far as the budget allows.
       budget: whose log the iterations join. Compiled code returns after each iteration where there is a callback, a
         deadline or a constraint to look at, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
-        an iteration are the average of those between two returns.
+        an iteration are averaged over the iterations between two returns.
       violation: violation of the constraints by the last result of `run`.
     """
     functions, stop = functions_of(problem), budget.stop

@@ -122,7 +122,7 @@ def _check(problem: Problem, settings: Settings) -> None:
     if isinstance(settings.start, InitialPrior):
         raise InputError(_NO_PRIOR)
     if problem.duration is not None:
-        raise InputError("duration: got one, want None for ilqr; smooth solves for it")
+        raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
     if problem.constraints:
         raise InputError(
             "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"

@@ -1,12 +1,12 @@
 """Evidence that constraints are infeasible near a plan: the violation is stationary.
 
 The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the
-problem's own functions, on a code path that the solvers do not use. Rows that are just kept balance it with multipliers
-from 0 to 1, which the restoration finds; controls at their limits balance it by themselves. Where everything cancels,
-no plan nearby violates the constraints less.
+problem's own functions, on a code path that the solvers do not use. Rows that are just satisfied balance the gradient
+with multipliers from 0 to 1, which the restoration finds. Controls at their limits balance it by themselves. If the sum
+is zero, no plan nearby violates the constraints less.
 
-The augmented Lagrangian's evidence is a violation that does not fall while its penalty grows. Either says that the
-constraints are infeasible only if two starts lead to the same violation.
+With the augmented Lagrangian, the evidence is a violation that does not fall while the penalty grows. Either evidence
+counts as infeasibility only if two starts lead to the same violation.
 """
 
 from collections.abc import Sequence

@@ -109,7 +109,7 @@ StartLike = Beginning | Callable[[Problem], Beginning]
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """What the first pass starts from.
+    """The initial guess of a solve, from which the first pass starts.
 
     Attributes:
       gain, offset: (T, m, n) and (T, m), the policy to begin with.

@@ -2,15 +2,15 @@
 
 Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
 the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
-falls by Mehrotra's rule where the last step was long and the measures come down, and otherwise when its own problem is
-nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); corrections with the same
-models then reduce the residuals of a long step. Where a model has no minimum, the Hessian is mixed with that of the
-projected cost until it has.
+parameter is reduced by Mehrotra's rule if the last step was long and the measures decrease. Otherwise it is reduced
+when the barrier problem is nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006).
+Corrections with the same models then reduce the residuals of a long step. If a model has no minimum, the Hessian is
+mixed with that of the projected cost until it has one.
 
-A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
-between a lowest and a highest one, `d = s - p` has two slacks: s, whose product with y - lowest is the barrier's
-parameter, and p, whose product with highest - y is. An inequality has 0 for the lowest; without a highest there is no
-p. A highest multiplier is the price, in cost a unit, for which a constraint may be missed: then it is elastic.
+A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
+row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the
+barrier parameter, and so is the product of p and upper - y. For an inequality, the lower bound is 0. Without an upper
+bound there is no p. An upper bound is the price of a violation, in cost per unit: the constraint is then elastic.
 """
 
 from collections.abc import Callable
@@ -309,7 +309,7 @@ class InteriorPoint:
 
     @property
     def _state(self) -> tuple[Point, Array, Array, Measures]:
-        """What an iteration changes of the iterate."""
+        """The parts of the iterate that an iteration changes."""
         return self.point, self._force, self._costates, self.measures
 
     def _go_back(self, point: Point, force: Array, costates: Array, measures: Measures) -> None:

@@ -1,8 +1,8 @@
 """The interior point as part of a run: from a plan to a result with a policy, within the run's budget.
 
-A plan that converges is finished by Newton's method on the augmented Lagrangian with the multipliers found, whose
-minimum it is: that puts controls exactly at their limits, and gives a policy and value functions. Any other plan is
-rolled out.
+A plan that converges is a minimum of the augmented Lagrangian with the multipliers found. Newton's method on that
+function finishes the plan. This puts controls exactly at their limits, and gives a policy and value functions. Any
+other plan is rolled out.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""The starts of `smooth` without one from the caller, and the choice among several starts.
+"""The starts that `smooth` tries if the caller gives none, and the choice among them.
 
 A homotopy draws the first iteration along a smooth path from start to goal, without obstacles, and then raises the
 obstacles' cost to its full weight. It ends in a good optimum far more often than a start from the nominal control does.
@@ -21,13 +21,13 @@ from lqrsim.solvers.parallel import workers
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows the gain from each of these choices.
 STARTS = 7
-ASIDE = 3  # the same where a constraint is to be passed
+ASIDE = 3  # number of starts for passing a constraint on another side
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
 PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
 FOLD = 0.9  # the same for the states that move collision spheres: an arm must fold up before it passes an obstacle
-# What contacts hold, such as the tilt of a robot on a floor, is drawn to its start: the weight relative to the path's
-# for a state that moves by 1, and the least range of a state, relative to the largest of its unit.
+# States that contacts hold, such as the tilt of a robot on a floor, are drawn to their start. HOLD is the weight,
+# relative to the path's, for a state that moves by 1. LEAST is the least range, relative to the largest of the unit.
 HOLD, LEAST = 0.01, 1e-3
 HALVE, CHOOSE = 3, 4  # iterations after which half of the starts remain, and one
 # Motions along paths, where constraints have no plan yet: how many, the weight of the path relative to a plan's cost,
@@ -116,7 +116,7 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
 def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[str, InitialPrior]:
     """Starts whose first iterations follow paths from start to goal, by name; none without two such ends.
 
-    Smoothed, they are motions on one side of an obstacle or another, where a path alone is none.
+    After smoothing they are feasible motions on one side of an obstacle or the other; a path alone is not feasible.
 
     Args:
       moving: the states that paths are of. cost: typical of a plan.
@@ -175,8 +175,8 @@ def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is asked for where there is nothing to go round."""
     if count is not None and count > 1 and pull(problem) == 0 and not (any(passable(problem)) and detours(problem)):
         raise InputError(
-            f"starts: got {count}, want 1 without a start and a goal some way apart, and an ObstacleCost or a"
-            " constraint of states between them: there is nothing to go round; or give a start"
+            f"starts: got {count}, want 1: there is nothing to go round. More starts need a start and a goal apart from"
+            " each other, and an ObstacleCost or a constraint on states between them"
         )
 
 

@@ -1,9 +1,10 @@
-"""Restoration: from a motion to one that violates constraints least, by descent on an exact penalty.
+"""Restoration: descent on an exact penalty, to a plan that violates the constraints least.
 
-A violated constraint costs its size times a price, smoothed by a logarithmic barrier whose parameter falls; a barrier
-of their own keeps controls within their limits. Steps are those of Newton's method in the Riccati recursion, and are
-rolled out in closed loop, so that every plan is a motion, and each has a lower merit than the one before. Far from a
-solution this is more reliable than the interior point, whose states may leave the dynamics; near to one it is slower.
+A violation costs its size times a price, smoothed by a logarithmic barrier with a decreasing parameter. A separate
+barrier keeps controls within their limits. Steps are those of Newton's method in the Riccati recursion, and are rolled
+out in closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit than the one before. Far
+from a solution this is more reliable than the interior point, whose states need not satisfy the dynamics. Near a
+solution it is slower.
 
 Far from feasibility the penalty is linear in the constraint. It has no curvature, so the minimum of a quadratic model
 may be anywhere. The curvature of the parabola that touches the penalty from above is added, and changes of controls are
@@ -47,7 +48,7 @@ class Restored:
 
 
 class Penalty:
-    """What violated rows (K,) cost, smoothed by a barrier. Limits of controls have no price, but their own barrier.
+    """The cost of violated rows (K,), smoothed by a barrier. Control limits have no price, but their own barrier.
 
     Attributes:
       size, equality, limit: of each row. highest: the price of a unit; lowest: the least multiplier.

@@ -1,4 +1,4 @@
-"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. What they try is in `strategy.py`."""
+"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. `strategy.py` describes what they try."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -58,8 +58,8 @@ def smooth(
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
       form: "dual" has the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's.
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
-        From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
-        which cannot, it runs forwards.
+        From controls, "backward" runs the dynamics backwards in time, from the minimiser of the final cost. The
+        dynamics of an MJCF cannot run backwards, and are run forwards.
       safeguard: where the method fails, continue from the best plan so far with steps that lower its cost; see
         `kernels/damped_iterations.py`. Where that, too, does not converge among contacts or joint limits of an MJCF,
         and there is no start, plan for softer ones and go on from there; see docs/mjcf_robots.md. Where the method
@@ -70,7 +70,7 @@ def smooth(
         1e-4 without Newton's method.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
-        has as many, also those that are tried where no plan keeps the constraints yet.
+        may use that many, including the further starts that are tried while no plan satisfies the constraints.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. An iteration that would end later, if it took as long as the last, is not begun.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
@@ -97,7 +97,7 @@ def smooth(
       risk: replaces the problem's own; see `Problem`.
       threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
-        What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.
+        An exception in it ends the solve, as Ctrl-C does; it is raised again, with the best plan so far as `solution`.
 
     Returns:
       A Solution. A hard problem does not raise: the status says how it ended and what to try.

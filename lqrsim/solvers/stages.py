@@ -1,8 +1,8 @@
 """The stages of a problem as quadratic models about a plan, and the step to the minimum of these models.
 
 All constraints and limits of the controls are rows of numbers: an inequality's are to be >= 0, an equality's = 0. The
-plan need not satisfy the dynamics; a step closes the gaps between its states. What is done with the rows is the matter
-of those who use the stages: the interior point, the active set, and the restoration.
+plan need not satisfy the dynamics; a step closes the gaps between its states. The users of the stages decide what to do
+with the rows: the interior point, the active set, and the restoration.
 """
 
 from collections.abc import Sequence

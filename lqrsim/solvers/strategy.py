@@ -1,18 +1,19 @@
-"""What `smooth` tries, top to bottom, until something converges.
+"""The attempts of `smooth`, in order, until one converges.
 
 `solve`
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
      With constraints, the others follow as long as they may cost less.
-  2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
-     ways round by heavier obstacles and goal; without an ObstacleCost, motions along other paths and oscillating
+  2. If the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
+     routes, found with larger weights of obstacles and goal; without an ObstacleCost, other paths and oscillating
      controls (`Search.widen`).
-  3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
+  3. If the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
-  4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
-  5. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and
-     on to the true ones from there (`Search.soften`).
-  6. Where that ends at a jump or a kink: a descent that keeps to the contacts that act (`Search.keep_modes`).
-  A free duration is found around all of that (`free_duration.py`).
+  4. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
+     (`Search.retry_without_risk`).
+  5. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
+     step by step to the true ones (`Search.soften`).
+  6. If that ends at a jump or a kink: a descent that keeps the active contacts (`Search.keep_modes`).
+  A free duration is found in an outer loop around these steps (`free_duration.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
@@ -369,7 +370,7 @@ class Search:
         found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
         return (*found, *self._softer) if len(found) > 1 else ()
 
-    # What the steps above are made of.
+    # Helper methods of the steps above.
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""

@@ -230,7 +230,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(f"{field}: got {excerpt(value)}, want {excerpt(was)}, as in {folder}, or another folder")
     for field, what in (("model", "MJCF or simulator"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
-            raise InputError(f"scenario: got another {what} than {folder} was begun with, want another folder")
+            raise InputError(f"scenario: got a {what} other than the one {folder} was begun with, want another folder")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / GIVEN
@@ -279,7 +279,9 @@ def _is_intact(results: Results, shard: Shard) -> bool:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
         except OSError as problem:
-            raise InputError(f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror})") from None
+            raise InputError(
+                f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror}), want it removed"
+            ) from None
         _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
         return False
     return True

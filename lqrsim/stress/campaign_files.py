@@ -218,7 +218,7 @@ def _check(manifest: dict[str, Any]) -> None:
     _check_names("manifest", manifest, _Manifest)
     _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
-        raise InputError("sha256: got one that does not fit the content, want a file that has not been changed")
+        raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
     campaign = manifest["campaign"]
     _check_names("campaign", campaign, Campaign)
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
@@ -229,7 +229,7 @@ def _check(manifest: dict[str, Any]) -> None:
         if hashes.keys() != {"digest", "sha256"}:
             raise InputError(f"policies: {policy}: got {excerpt(dict(hashes))}, want digest and sha256")
     if manifest["digest"] != digest_of_rows(manifest):
-        raise InputError("digest: got one that does not fit the campaign, want a file that has not been changed")
+        raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
 
 
 def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:

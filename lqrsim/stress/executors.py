@@ -245,7 +245,7 @@ def connected(address: str) -> Iterator[Any]:
         import distributed
     except ImportError:
         raise InputError(
-            "scheduler: got one without dask, want it installed: pip install 'lqrsim[distributed]'"
+            "scheduler: got an address without dask, want dask installed: pip install 'lqrsim[distributed]'"
         ) from None
     try:
         client = distributed.Client(address, timeout=10, set_as_default=False)
@@ -255,7 +255,7 @@ def connected(address: str) -> Iterator[Any]:
         try:
             versions_there: Any = client.run(versions)
         except Exception as error:  # a worker may raise anything
-            raise InputError(f"scheduler: got {address}, whose workers do not run lqrsim ({error})") from None
+            raise InputError(f"scheduler: got {address}, want workers that can run lqrsim ({error})") from None
         if not versions_there:
             raise InputError(f"scheduler: got {address}, which has no workers, want at least one")
         for worker, theirs in versions_there.items():
@@ -295,9 +295,9 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
                     _restart_worker(client, future, started[shard][0])
                     yield shard, job.failed(shard, f"took longer than {time_limit:g} s, and was stopped")
     except (CancelledError, asyncio.CancelledError):
-        raise InputError(f"scheduler: got one that lost its tasks or was restarted, {RESUME}") from None
+        raise InputError(f"scheduler: got a scheduler that lost its tasks or was restarted, {RESUME}") from None
     except OSError as error:  # dask's connection errors are OSErrors, too
-        raise InputError(f"scheduler: got no answer any more ({error}), {RESUME}") from None
+        raise InputError(f"scheduler: got no answer ({error}), {RESUME}") from None
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have ended
             client.unsubscribe_topic(job.run)

@@ -119,7 +119,7 @@ class ReliabilityProblem:
             failure=FAILURES[self.failure],
         )
         if score.size == 0:
-            raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want one that draws numbers")
+            raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want a random disturbance")
         return score
 
     @cached_property
@@ -216,7 +216,7 @@ class ReliabilityProblem:
         if score(np.zeros((1, score.size)))[0] > 0:
             raise InputError(
                 f"scenario: got {self.scenario}, where {self.policy} fails with all random numbers at zero, want a"
-                " policy that fails only with others"
+                " policy that succeeds when undisturbed"
             )
 
         def found(point: DesignPoint) -> SmallestFailure:
@@ -354,7 +354,7 @@ _ASKED = (
 
 
 def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
-    """What the names of a problem stand for now: disturbances, model and policy."""
+    """The present meaning of the names in a problem: disturbances, model and policy."""
     score = problem.score
     law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
     described = tuple(one.describe(score.plant) for one in problem.disturbances)

@@ -61,7 +61,7 @@ def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
         if high > MOST_TRIALS:
             raise InputError(
                 f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
-                f" {MOST_TRIALS:,} trials, want one of them smaller"
+                f" {MOST_TRIALS:,} trials, want a smaller one of the three"
             )
     low = failures  # trials that all fail
     while high - low > 1:

@@ -140,7 +140,7 @@ def failure_probability(
     if progress is not None:
         progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
     if found is None:
-        raise NoFailure(f"particles: got {particles}, of which none failed, want more")
+        raise NoFailure(f"particles: got {particles}, none of which failed, want more of them")
     return found
 
 
@@ -207,7 +207,9 @@ def _pilot_run(
             b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
         levels.append(level)
         step_sizes.append(b)
-    raise NoFailure(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
+    raise NoFailure(
+        f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none exist"
+    )
 
 
 def _repetition(

@@ -104,7 +104,7 @@ def solve(
         solutions[policy] = plans[solver].open_loop() if policy == "open_loop" else plans[solver]
     for solver, plan in plans.items():
         if not np.isfinite(plan.trajectory.states).all():
-            raise InputError(f"policies: got those of {solver}, whose plan is not finite ({plan.status.name})")
+            raise InputError(f"policies: got a plan of {solver} that is {plan.status.name}, want a finite one")
         for remark in solving.remarks(scenario, plan):
             _log.warning("the solution of %s %s", solver, remark)
     if "track" in policies:

@@ -115,7 +115,7 @@ def smooth_safest(
     if not found and first.success:
         found.append(("the search's own", first))
     if not found:
-        raise InputError(f"problem: got one without any converged plan ({first.status.name}), want one that has some")
+        raise InputError(f"problem: got no converged plan ({first.status.name}), want a problem that can be solved")
 
     def reached(solution: Solution, begin: int) -> npt.NDArray[np.bool_]:
         run = simulate(

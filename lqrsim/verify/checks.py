@@ -295,8 +295,8 @@ def verify_video(
     """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
 
     Args:
-      path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
-        move in space both, whatever else is in the picture.
+      path: a video by `lqrsim render`, whatever else it shows. It needs the camera `top`; for a robot in a vertical
+        plane the camera `side`; for a robot that moves in space both.
       rollout: the run that the video shows.
       trial: row of the rollout; by default the first that the video shows.
       solution: as for `verify_run`.

@@ -1,6 +1,6 @@
 """What a picture shows, and where: overlays, qualities and views by name; parts of runs, and panes in a part.
 
-Light, for the command line.
+This module imports nothing heavy, so that the command line starts fast.
 """
 
 from dataclasses import dataclass

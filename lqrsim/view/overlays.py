@@ -1,4 +1,4 @@
-"""Overlays of pictures, drawn as geoms of MuJoCo beside those of the model: lines, forces, tubes, funnels, the mark."""
+"""Overlays of pictures, drawn as MuJoCo geoms in addition to the model's: lines, forces, tubes, funnels, the mark."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

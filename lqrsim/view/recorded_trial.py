@@ -106,7 +106,7 @@ class RecordedTrial:
         return float(np.interp(time, self.times, values))
 
     def ending(self, time: float) -> str:
-        """What ended the trial before this time, as text; empty if nothing did."""
+        """The event that ended the trial before this time, as text; empty if there was none."""
         run, k = self.rollout, self.trial
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
             return ""
@@ -145,7 +145,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
 
 
 def with_sky(xml: str) -> str:
-    """The MJCF with a light sky where it has none, in place of a black one."""
+    """The MJCF, with a light sky if it has none: MuJoCo would draw a black one."""
     if "skybox" in xml or "</mujoco>" not in xml:
         return xml
     sky = (

@@ -50,7 +50,7 @@ def encoder(
             metadata.embed(container)
         stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        # Without a stated colour matrix players guess differently.
+        # If the file states no colour matrix, players guess one, and not all guess the same.
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = 1
 
         def encode(pixels: Pixels) -> None:
@@ -218,8 +218,8 @@ def render_still(
 ) -> PictureFile:
     """Write a picture (png) of one moment.
 
-    With `every`, the robot is drawn also where it was at each multiple of that many seconds, as in the paper's figures.
-    The rest, and what is raised, is as in `render`.
+    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures. All else,
+    exceptions included, is as in `render`.
 
     Args:
       runs: one rollout, or several to be shown side by side.

@@ -1,4 +1,4 @@
-"""Viewers: a moving model with its plan and trace, and a person who interferes."""
+"""The common part of the viewers: a moving model with its plan and trace, and interaction by a person."""
 
 import abc
 import copy

@@ -1,4 +1,4 @@
-"""Presets: named sets of disturbances, from calm to severe, as far as a plant can have them."""
+"""Presets: named sets of disturbances, from calm to severe. A plant gets only those that it supports."""
 
 import numpy as np
 

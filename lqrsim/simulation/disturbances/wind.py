@@ -36,8 +36,8 @@ class Wind(Disturbance):
     def check(self, plant: Plant) -> None:
         if not plant.robot.drag > 0 and not (plant.simulator and plant.simulator.wind):
             raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag for wind to act through, want"
-                " one with a `drag` in N s/m"
+                f"{type(self).__name__}: got robot {plant.robot.name}, which wind cannot push without drag, want one"
+                " with a `drag` in N s/m"
             )
 
     def blow(self, plant: Plant, wind: Array) -> Effect:
