@@ -189,7 +189,7 @@ def test_factors_of_an_effect_are_checked() -> None:
 
 
 def test_a_missing_package_is_named_with_its_extra() -> None:
-    with pytest.raises(ls.InputError, match=r"^no_such_simulator: got no such package, want it .* pip install 'lqrsim\["):
+    with pytest.raises(ls.InputError, match=r"^no_such_simulator: got no such package, want it .*'lqrsim\["):
         package("no_such_simulator.vehicles", "rotorpy")
 
 

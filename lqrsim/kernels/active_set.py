@@ -1,4 +1,4 @@
-"""The evaluations of an iteration with an active set, and its pivots. The kernels' subset.
+"""The evaluations of an iteration with an active set, and its pivots. Written in the kernels' subset.
 
 The rows are those of all constraints, then the limits of the controls; the active set holds some of them at zero.
 `solvers/active_set.py` has the method.

@@ -1,4 +1,4 @@
-"""Certification of a plan, computed from the problem on a short path of its own. The kernels' subset.
+"""Certification of a plan, computed from the problem on a short path of its own. Written in the kernels' subset.
 
 It uses only the problem's functions, their derivatives and a Cholesky factor: nothing from the passes, rollouts and
 line searches that found the plan. The cost is the value that comes with the derivatives, not what rollouts added up.

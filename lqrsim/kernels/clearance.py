@@ -1,4 +1,4 @@
-"""Distances to obstacles minus the required ones: values of a constraint. The kernels' subset.
+"""Distances to obstacles minus the required ones: values of a constraint. Written in the kernels' subset.
 
 The robot is a point at its position, or a set of balls. For balls, `value` and `slope` take the centres and their
 Jacobian in place of state and control; see `augmented_lagrangian.py`.

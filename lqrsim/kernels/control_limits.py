@@ -1,4 +1,4 @@
-"""Limits of the controls. The kernels' subset.
+"""Limits of the controls. Written in the kernels' subset.
 
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
 The backward pass determines which controls are fixed, by minimising within the limits at the expected state. The

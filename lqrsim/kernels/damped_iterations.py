@@ -1,6 +1,6 @@
 """The safeguard: damped LQR smoothing near the best plan so far, for when undamped smoothing fails.
 
-The kernels' subset. Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost
+Written in the kernels' subset. Rollouts on the way to an optimum can cost any multiple of the first, so a rising cost
 does not mean that the method will fail. It runs undamped until a pass fails or the lowest cost no longer falls; see
 `no_progress`. Damped iterations are to LQR smoothing what Levenberg-Marquardt is to Gauss-Newton.
 """

@@ -1,4 +1,4 @@
-"""Distances from a model, minus margins. The kernels' subset.
+"""Distances from a model, minus margins. Written in the kernels' subset.
 
 `data` has the data of the distances. From AT on it has the number of steps with margins (the last ones hold from there
 on), the number of margins at a step, the number of each row's obstacle, and the margins, step by step.

@@ -1,4 +1,4 @@
-"""The cost of obstacles at distances from a model. The kernels' subset.
+"""The cost of obstacles at distances from a model. Written in the kernels' subset.
 
 The cost is `weight * sum of exp(-sharpness * distance)` for distances below a cutoff D, and 0 beyond it. The tangent at
 D is subtracted, so that neither the cost nor its slope jumps there. `data` has the data of the

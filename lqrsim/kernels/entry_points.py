@@ -1,4 +1,4 @@
-"""The functions that Python calls: one for each solver, and single passes and rollouts. The kernels' subset.
+"""The functions that Python calls: one for each solver, and single passes and rollouts. Written in the kernels' subset.
 
 All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
 """

@@ -1,4 +1,4 @@
-"""The evaluations of an interior-point iteration, and its step. The kernels' subset.
+"""The evaluations of an interior-point iteration, and its step. Written in the kernels' subset.
 
 The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
 iterations. `solvers/interior_point.py` describes the method.

@@ -1,4 +1,4 @@
-"""Iterations of LQR smoothing and of iLQR, all in compiled code. The kernels' subset.
+"""Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
 
 Each function runs the iterations `first` to `last` - 1, and can be called again to continue: its state is in its
 arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the outcome

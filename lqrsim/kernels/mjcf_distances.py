@@ -1,4 +1,4 @@
-"""Distances between the geoms of a robot and those of obstacles, by MuJoCo's `mj_geomDistance`. The kernels' subset.
+"""Distances between a robot's geoms and obstacle geoms, by MuJoCo's `mj_geomDistance`. Written in the kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
 of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's geom, how far both

@@ -1,4 +1,4 @@
-"""How far a site of an MJCF is from a place, and how far it is turned from an orientation. The kernels' subset.
+"""Errors of the position and orientation of a site of an MJCF. Written in the kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the site's body, its place and axes (3 x 3) in those of the
 body, and the desired position and axes. The rows are three for the position, in world axes; or three for the rotation

@@ -1,4 +1,4 @@
-"""Calls of a problem's functions by their addresses: dynamics, costs, constraints, noise. The kernels' subset.
+"""Calls of a problem's functions by address: dynamics, costs, constraints, noise. Written in the kernels' subset.
 
 Passes and iterations are thereby compiled once for a size, and serve all problems of that size. See
 `records.ProblemModel`; the C signatures are in `codegen/compiled_module.py`.

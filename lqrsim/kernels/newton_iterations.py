@@ -1,4 +1,4 @@
-"""Newton's method from the plan that smoothing has found. The kernels' subset.
+"""Newton's method from the plan that smoothing has found. Written in the kernels' subset.
 
 A pass is the backward pass of differential dynamic programming. It is that of iLQR with two changes: the Hessians of
 the costs are not projected, and the Hessians of the dynamics times the costate are added. If a control block is not

@@ -1,4 +1,4 @@
-"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
+"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. Written in the kernels' subset.
 
 The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on, `data` has the
 sharpness, the weight, the number of obstacles, the number of steps with a table of obstacles, of which the last holds

@@ -1,4 +1,4 @@
-"""The nearest positive-semidefinite matrix. The kernels' subset."""
+"""The nearest positive-semidefinite matrix. Written in the kernels' subset."""
 
 from math import sqrt
 

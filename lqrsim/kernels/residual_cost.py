@@ -1,4 +1,4 @@
-"""`1/2 sum of weight * error^2` for errors from a model. The kernels' subset.
+"""`1/2 sum of weight * error^2` for errors from a model. Written in the kernels' subset.
 
 `data` has the data of the errors, and from AT on a weight for each. `places` and `places_jacobian` are the errors here.
 """

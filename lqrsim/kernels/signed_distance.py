@@ -1,4 +1,4 @@
-"""Signed distances to obstacles, and their derivatives: the only place where these formulas are. The kernels' subset.
+"""All formulas of signed distances to obstacles, and their derivatives. Written in the kernels' subset.
 
 An obstacle is ROW numbers of a flat table, which begin at index `row`.
 """

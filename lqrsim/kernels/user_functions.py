@@ -1,4 +1,4 @@
-"""A user's own functions, called at their addresses. The kernels' subset.
+"""A user's own functions, called at their addresses. Written in the kernels' subset.
 
 The data of each function begin with its address and, where one is given, that of its derivatives; its parameters
 follow. Outputs are NaN where the user's function does not write them. `differences.py` has derivatives by differences.
