@@ -1,6 +1,7 @@
 """The dual form: a Kalman filter for the moments of the cost-to-come, in which the control acts as process noise.
 
 Written in the kernels' subset.
+
 The cost-to-come is `1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero
 at a fixed start; neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient
 of the cost-to-go at the smoothed state, leads from each step to the one before (the modified Bryson-Frazier smoother).
