@@ -26,13 +26,13 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution
 
 MEMORY = 5.0  # s
-# The least errors that a filter assumes, relative to the tolerated effort: of each control; and of each state's
-# prediction, as if so much effort had moved it. A model is never exact: what acts does not act evenly over a control
-# period, integration has errors, and the gains are those about the plan. With exact sensors a filter that does not
-# know this reads unknowns from the last digits of its prediction errors.
+# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
+# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
+# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
+# without this assumption would infer unknowns from the last digits of its prediction errors.
 INEXACT = 0.02
-# By how much the command in force may differ from the one that got lost, relative to the tolerated effort. A choice of
-# ours: up to a loss of one half nothing between 0.3 and 1 does better.
+# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
+# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
 HELD = 0.3
 
 
@@ -40,15 +40,16 @@ class OffsetFree(Controller):
     """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
-    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
-    `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
-    winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
+    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
+    is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
+    so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
+    and predicted
     states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` is the uncertainty that it
     assumes.
 
     Args:
       problem: the problem that was solved.
-      solution: its solution, or any with a plan of the same system.
+      solution: its solution, or another solution with a plan of the same system.
       uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
         and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
@@ -56,8 +57,8 @@ class OffsetFree(Controller):
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
-      memory: in s, by default 5 s, or the plan's horizon where that is shorter. np.inf takes the uncertainty as it is
-        stated: constants do not change, what varies has the mean zero, and a steady disturbance leaves an error.
+      memory: time in s; by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as
+        stated: constants do not change, varying unknowns have the mean zero, and a steady disturbance leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
       replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
         simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the
@@ -65,16 +66,16 @@ class OffsetFree(Controller):
         in force. Costs that depend on the step's number are not supported with re-planning.
       replan_always: whether to solve at each of these times without a check.
 
-    A run of it, which is a rollout's `controller_run`, has these attributes:
+    Its run, a rollout's `controller_run`, has these attributes:
 
-    - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot: NaN
-    at knots whose measurement was not used: the last one, and one more for each period of latency. Their errors
-      have the covariances `filter.corrected`. Else None.
-    - `innovations`: likewise the differences of measurements from their predictions, (T+1, K, Y), of the covariances
-      `filter.innovation`; NaN where a measurement got lost, too. Both covariances are of the first plan: with
-      `replan_every` they are those of a run up to its first solve.
-    - with `replan_every`, `plans`: the new plans of each trial, by the step that they begin at; and `log`, how the
-      solves went, as of a `Replanner`.
+    - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot; else
+    None. They are NaN at knots whose measurement was not used: the last knot, and one more for each period of latency.
+    The covariances of their errors are `filter.corrected`.
+    - `innovations`: with `record`, the differences between measurements and predictions, (T+1, K, Y), with the
+      covariances `filter.innovation`. They are also NaN where a measurement got lost. Both covariances belong to the
+      first plan: with `replan_every` they hold up to a run's first solve.
+    - with `replan_every`, `plans`: the new plans of each trial, by the step at which they begin; and `log`, the log of
+      the solves, as in a `Replanner`.
 
     Attributes:
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
@@ -160,7 +161,7 @@ class OffsetFree(Controller):
         """Return the closed loop about the plan as matrices, under the uncertainty as stated.
 
         Raises:
-          InputError: with `replan_every`, which makes other plans.
+          InputError: with `replan_every`, which leads to other plans.
         """
         self._check_one_plan("loop")
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
@@ -199,19 +200,19 @@ class OffsetFree(Controller):
 
 
 def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
-    """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
+    """The model that a filter assumes: see `Uncertainty.steady`. It includes the least errors that a filter assumes.
 
     Args:
       model: the model with the uncertainty as stated.
-      memory: seconds, or infinity, as of an `OffsetFree`.
-      effort: effort of the controls, (m,).
+      memory: seconds, or infinity, as for an `OffsetFree`.
+      effort: tolerated effort of the controls, (m,).
     """
     stated, space = model.uncertainty, model.dynamics.state_coordinates
     told = stated.as_steady if memory == np.inf else stated.steady(memory)
     moved = unit_means(space.units, reach_of(model, effort, 2)[2])
     control = per_entry("Uncertainty: control", stated.control, model.dynamics.control_coordinates)
     lost = stated.command_loss
-    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # for the filter expects the mean
+    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
     error = per_entry("Uncertainty: model_error", stated.model_error, space)
     assumed = replace(
         told, control=tuple(np.maximum(control, INEXACT * effort).tolist()),

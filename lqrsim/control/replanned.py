@@ -34,16 +34,16 @@ class ReplannedRun(ControllerRun):
 
     Args:
       rule: the periods in which to check whether a solve is needed.
-      law: to begin with.
-      trials: K.
-      records: as of `FilterRun`, of all trials.
+      law: the law at the beginning.
+      trials: K, the number of trials.
+      records: as for `FilterRun`, of all trials.
       always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
-      plans: plans of each trial, by the step that they begin at; without the first.
-      log: how the solves went.
-      estimates: as of `FilterRun`.
-      innovations: likewise.
+      plans: plans of each trial, by the step at which they begin; without the first plan.
+      log: the log of the solves.
+      estimates: as in `FilterRun`.
+      innovations: as in `FilterRun`.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ReplannedRun(ControllerRun):
         return near and (clearance is None or bool(clearance.min() >= 0))
 
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:
-        """Replace the law of a trial by one about a new plan, if needed and found."""
+        """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
         law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
         granted = np.where(_constant_parameters(model), z[n + model.lagging :], 0.0)
@@ -116,13 +116,13 @@ class ReplannedRun(ControllerRun):
             return
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
-        # The filter begins with a measurement that is taken in already.
+        # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 
 def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:
-    """Which of the unknowns' states are constant, to the end of the horizon, and change only parameters, (D,)."""
+    """Flags (D,) of the unknowns' states that are constant to the end of the horizon and change only parameters."""
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
     found = (model.output != 0).any(axis=0) & ~beyond
     for one, own in zip(model.remembered, model.own_states, strict=True):

@@ -31,7 +31,7 @@ class Clearance(KeepsClear, Constraint):
       balls: the robot's balls, as for an ObstacleCost.
       geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
         obstacle.
-      margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
+      margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 
     def __init__(

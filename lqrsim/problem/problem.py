@@ -39,11 +39,11 @@ class FixedState:
         ls.FixedState(x=1.0, heading=np.pi)
 
     Args:
-      state: (n,) in the states' units, or a dictionary of name or unit: number; states without one are 0.
-      **named: name of a state -> number, which says the same as a dictionary.
+      state: (n,) in the states' units, or a dictionary of name or unit: number; states without a number are 0.
+      **named: name of a state -> number, in place of a dictionary.
 
     Attributes:
-      state: the numbers, by name until a Problem has it.
+      state: the numbers; they may be by name until a Problem has the state.
 
     Raises:
       InputError: not finite numbers (n,), none at all, or a state that is named twice.
@@ -86,8 +86,8 @@ class Problem:
     Attributes:
       dynamics: the dynamics. g is their Runge-Kutta step over `dt` with the control held.
       dt: the control period in seconds.
-      steps: T, the number of them.
-      initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
+      steps: T, the number of control periods.
+      initial: c_0, the cost of starting elsewhere than desired (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
@@ -107,7 +107,7 @@ class Problem:
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits out of order or with nothing of the actuators' range, or a
+        cost that depends on the control, control limits that are out of order or outside the actuators' range, or a
         start that collides.
     """
 
@@ -171,7 +171,7 @@ class Problem:
 
     @property
     def times(self) -> Array:
-        """The times of its knots, (T+1,) in s; see `begin`."""
+        """The times of the knots, (T+1,) in s; see `begin`."""
         return self.begin + self.dt * np.arange(self.steps + 1)
 
     @property
@@ -189,14 +189,14 @@ class Problem:
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
         """The rest of the problem after some steps, from a state that is given exactly.
 
-        Unlike a problem that is stated, it may begin within an obstacle: the plan then leads out of it.
+        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it.
 
         Args:
           state: (n,).
-          after: how many steps are over.
+          after: number of steps that are over.
 
         Raises:
-          InputError: the state is not one, or no step is left.
+          InputError: the state is not (n,) finite numbers, or no step is left.
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
@@ -213,7 +213,7 @@ class Problem:
         return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
-        """The same with other costs. Like this one, it may begin within an obstacle; see `from_state`.
+        """The problem with other costs. It may begin inside an obstacle if this one does; see `from_state`.
 
         Args:
           stage_cost: the stage cost, or None for the present one.
@@ -228,10 +228,10 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later beginning: moving obstacles are where they are then.
+        """The same problem with a later beginning: moving obstacles are at their positions at that time.
 
         Args:
-          seconds: how much later, in seconds.
+          seconds: the delay in seconds.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
         return other._bound_anew() if self.moving else other
@@ -244,7 +244,7 @@ class Problem:
         return self._with(_terms=self._terms | {"stage_cost": terms}, _constraint_terms=constraints)
 
     def _with(self, **changed: Any) -> "Problem":
-        """The same with other parts, without a check.
+        """The problem with other parts, without checks.
 
         Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
         """
@@ -254,13 +254,13 @@ class Problem:
 
     @property
     def bytes_per_step(self) -> int:
-        """The least memory that a solver takes for a step, from one start: value functions, laws and trajectories."""
+        """The least memory in bytes of a solver for a step, from one start: value functions, laws and trajectories."""
         n, m = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates)
         return 8 * (3 * n * n + 3 * m * n + 10 * n + 7 * m)
 
     @property
     def start(self) -> Array | None:
-        """The state (n,) that the initial cost or FixedState asks for; None where it names none."""
+        """The state (n,) that the initial cost or FixedState specifies; None if neither does."""
         if isinstance(self.initial, FixedState):
             return self.initial.numbers
         abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
@@ -268,13 +268,13 @@ class Problem:
 
     @property
     def goal(self) -> Array | None:
-        """The state (n,) that the final cost and GoalStates ask for; None where they name none."""
+        """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
         abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
         return self._with_goal_states(abouts[0] if len(abouts) == 1 else None)
 
     @property
     def weighed_goal(self) -> Array | None:
-        """The goal, NaN in states that have neither a weight nor a GoalState; None where it names no state."""
+        """The goal, with NaN for states that have neither a weight nor a GoalState; None if all of it is NaN."""
         abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
         goal = np.full(len(self.dynamics.state_coordinates), np.nan)
         if len(abouts) == 1:
@@ -283,7 +283,7 @@ class Problem:
         return None if goal is None or np.isnan(goal).all() else goal
 
     def _with_goal_states(self, goal: Array | None) -> Array | None:
-        """The goal with what GoalStates ask for; None where some of it is still unknown."""
+        """The goal, completed by the GoalStates; None if some entries are still unknown."""
         stated = goals_of(self.constraints, self.dynamics)
         if goal is None and len(stated) < len(self.dynamics.state_coordinates):
             return None
@@ -294,7 +294,7 @@ class Problem:
 
     @property
     def control_coordinates(self) -> Coordinates:
-        """Names, units and limits of the controls, as they are planned with."""
+        """Names, units and limits of the controls, as used for planning."""
         return self._controls[0]
 
     @property
@@ -304,7 +304,7 @@ class Problem:
 
     @property
     def nominal_control(self) -> Array:
-        """u*, where the control cost is zero, (m,); zeros where there is none."""
+        """u*, (m,), at which the control cost is zero; zeros if there is no control cost."""
         abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
         return abouts[0] if abouts else np.zeros(len(self.dynamics.control_coordinates))
 
@@ -396,7 +396,7 @@ class Problem:
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_duration(self) -> None:
-        """Raises InputError if the duration is not as described, or a problem of its kind cannot have one."""
+        """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""
         keep(self, time_weight=check_number("time_weight", self.time_weight, at_least=0.0))
         if self.duration is None:
             if self.time_weight:
@@ -420,7 +420,7 @@ class Problem:
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
     def _check_start_clear(self) -> None:
-        """Raises InputError if the robot is in an obstacle where it starts."""
+        """Raises InputError if the robot starts inside an obstacle."""
         found = None if self.start is None else self._inside(self.obstacle_costs, self.start, self.begin)
         if found is not None:
             where, advice = found
@@ -428,8 +428,8 @@ class Problem:
 
     @property
     def goal_inside(self) -> str:
-        """The place of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if it is clear, or
-        is no place.
+        """The position of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if the goal is
+        clear, or is no position.
         """
         goal, end = self.weighed_goal, self.begin + self.steps * self.dt
         found = None if goal is None else self._inside(self.kept_clear, goal, end)

@@ -37,11 +37,11 @@ from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obst
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
-_SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touches one: 2 % of it at 8 cm
-_ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off its limits, the smaller one
-_REST = 1e-6  # m/s^2, by which something at rest may accelerate
-_PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
-_LISTED = 12  # names in a line of what is printed
+_SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
+_ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
+_REST = 1e-6  # m/s^2, largest acceleration at rest
+_PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
+_LISTED = 12  # largest number of names in a printed line
 
 
 class MjcfRobot(Robot):
@@ -60,11 +60,11 @@ class MjcfRobot(Robot):
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
-    `<name>_` where the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
+    `<name>_` if the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
     angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
-    name in the MJCF get one, such as `unnamed_joint_0`.
+    name in the MJCF get a name, such as `unnamed_joint_0`.
 
-    Where the file has no camera, or no light, it gets one named overview.
+    If the file has no camera, or no light, a camera or light named overview is added.
 
     Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
     and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
@@ -75,8 +75,8 @@ class MjcfRobot(Robot):
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
       body: name of the body on which disturbances act, and whose position is the robot's. By default the first moving
         body that has mass, either its own or that of bodies fixed to it.
-      position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
-        MuJoCo's kinematics. () for none.
+      position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
+        kinematics. () for none.
       radius: radius of a ball about the body's origin that contains everything that may collide; by default the
         smallest guaranteed one.
       outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
@@ -87,13 +87,14 @@ class MjcfRobot(Robot):
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
 
     Attributes:
-      scene: the scene that it moves in.
+      scene: the scene that the robot moves in.
       dynamics: MuJoCo's steps.
       geoms: its colliding geoms. balls: an outline of it, or None.
 
     Raises:
-      InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: equality constraints except those that couple joints linearly, delays, plugins with states.
+      InputError: no such file, body or state; nothing moves, or nothing has an actuator; or the MJCF has elements that
+        states do not describe: equality constraints, except those that couple joints linearly; delays; plugins with
+        states.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class MjcfRobot(Robot):
         self._numbers = np.array([one.number for one in actuators], dtype=np.intp)
         self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
-        turned = {"free": 3, "ball": 0}  # where among a joint's coordinates a rotation vector begins
+        turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
         place, plane = self._position(position, names, mjcf_joints.position_of(model, number), who)
         states = Coordinates(
             names=names, units=units, position=place, plane=plane,
@@ -187,7 +188,7 @@ class MjcfRobot(Robot):
         return tuple(found), plane if len(found) == 2 else ""
 
     def _balls_at(self, state: Array) -> Array:
-        """Places of the balls, (K, 3), by MuJoCo's bindings."""
+        """Centres of the balls, (K, 3), by MuJoCo's bindings."""
         assert isinstance(self.balls, MjcfBalls)
         outline = self.balls.outline
         return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)
@@ -295,8 +296,8 @@ class MjcfRobot(Robot):
           damping: weight of the velocities of hinges, slides and ball joints at each step.
           limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
-          clearance: constrains the distance to all obstacles to at least this, in metres, as `lqrsim solve --clearance`
-            does; by default obstacles only add cost.
+          clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
+            default obstacles only add cost.
 
         Returns:
           The Problem.
@@ -333,7 +334,7 @@ class MjcfRobot(Robot):
         )  # fmt: skip
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
-        """Least and largest positions of joints, by name: some way off their limits, if both states are."""
+        """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
         names, low, high = self.dynamics.state_coordinates.names, {}, {}
         for one in self._joints:
             if one.limits is not None:
@@ -377,10 +378,10 @@ class MjcfRobot(Robot):
 
     @property
     def joint_limits(self) -> StateBounds:
-        """The joints' ranges as constraints for a problem; in MuJoCo they are springs that push back.
+        """The joints' ranges as constraints for a problem. In MuJoCo, joint limits are springs that push back.
 
         Raises:
-          InputError: no joint has any.
+          InputError: no joint has limits.
         """
         names = self.dynamics.state_coordinates.names
         return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
@@ -454,11 +455,11 @@ class MjcfRobot(Robot):
 
 
 def _weights(field: str, given: PerEntry, size: int) -> PerEntry:
-    """Weights by name as they are, or one for each of `size` entries."""
+    """Weights by name unchanged; other weights as one number for each of `size` entries."""
     return given if isinstance(given, Mapping) else check_weights(field, given, size)
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names in a line, of many the first."""
+    """Names in a line; only the first ones if there are many."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(names[:_LISTED]) + more if names else "none"

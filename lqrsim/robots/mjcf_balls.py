@@ -18,7 +18,7 @@ class MjcfBalls(CollisionSpheres):
     """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
 
     Args:
-      outline: bodies, places and radii. place: where they are, plainly, at a state (n,): (K, 3).
+      outline: bodies, positions on them, and radii. place: the centres (K, 3) at a state (n,), in plain Python.
     """
 
     def __init__(self, outline: Outline, place: Callable[[Array], Array]) -> None:

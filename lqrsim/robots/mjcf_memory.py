@@ -1,4 +1,4 @@
-"""MuJoCo's memory, for compiled code that works with it."""
+"""MuJoCo's memory, for compiled code."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 
 
 class MjcfMemory(UserFunction):
-    """The address that kernels call p, in the place of a function's: they find MuJoCo's memory there."""
+    """The address that kernels call p, in place of a function's address. MuJoCo's memory is there."""
 
     @classmethod
     def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":
-        """That of these dynamics."""
+        """The address for these dynamics."""
         memory = cls(
             function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
             offset=1, values=1, with_control=False, is_memory=True,
@@ -22,7 +22,7 @@ class MjcfMemory(UserFunction):
         return memory
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """That of the dynamics in the other process."""
+        """The address for the dynamics in the other process."""
         return MjcfMemory.of, (vars(self)["of_what"],)
 
 

@@ -17,10 +17,10 @@ _AXES = "xyz"
 
 
 class _Pose:
-    """The wanted place of a site, checked.
+    """The desired position and orientation of a site, checked.
 
     Args:
-      what: messages call it. site: name of it. position: (3,) or None. orientation: (4,) or None.
+      what: its name in messages. site: name of the site. position: (3,) or None. orientation: (4,) or None.
     """
 
     def __init__(self, what: str, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
@@ -42,7 +42,7 @@ class _Pose:
         return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
 
     def bind(self, dynamics: Dynamics) -> tuple[Source, Array, MjcfMemory, int]:
-        """The errors' source, what they read, MuJoCo's memory, and of how many states they are. Raises InputError."""
+        """The source of the errors, their data, MuJoCo's memory, and the number of states. Raises InputError."""
         if not isinstance(dynamics, MjcfDynamics):
             raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
         model = dynamics.physics.model
@@ -62,10 +62,10 @@ class SiteCost(Cost):
 
         ls.SiteCost("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0), weight=1e4, turn_weight=1e3)
 
-    As a stage cost it acts at each step, as a final cost at the end.
+    As a stage cost it acts at each step; as a final cost, at the end.
 
     Args:
-      site: its name in the MJCF.
+      site: name of the site in the MJCF.
       position: (3,) the desired position in the world, in metres; None for any.
       orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. The angle is
         that of the rotation from the desired orientation, less than half a turn.
@@ -103,12 +103,12 @@ class SiteCost(Cost):
 
 
 class SiteConstraint(Constraint):
-    """A site of a robot from an MJCF is exactly at a place, or turned as wanted, or both.
+    """A site of a robot from an MJCF has exactly a desired position, or a desired orientation, or both.
 
         ls.SiteConstraint("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0))
 
     Args:
-      site: its name in the MJCF.
+      site: name of the site in the MJCF.
       position: (3,) as in a SiteCost.
       orientation: (4,) as in a SiteCost.
       at: "final", or "all" steps except a start that is given exactly.

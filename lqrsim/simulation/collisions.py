@@ -13,7 +13,7 @@ from lqrsim.errors import Array
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
-FINEST = 0.02  # smallest step along a line, relative to the radius; a step is the clearance if that is larger
+FINEST = 0.02  # smallest step along a line, relative to the radius; a larger clearance is itself the step
 MOST = 1000  # steps along a line
 
 
@@ -68,7 +68,7 @@ class Collisions:
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Check the lines from the robot's last places to these, (K, B, 2 or 3) or (K, 1, n)."""
+        """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
         length = self.shape.travel(last, there)

@@ -49,7 +49,8 @@ class Effects:
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._kicks = self._hooks("kick")
-        # To which of force, torque and wind each adds, and times what. Without a wind of a simulator it is a force.
+        # For each effect: whether it adds to force, torque or wind, and its factor. Wind is a force if the simulator
+        # has none.
         blown = plant.simulator is not None and plant.simulator.wind
         wind = (slice(6, 9), 1.0) if blown else (slice(0, 3), plant.robot.drag)
         self._pushes = [(slice(3, 6), 1.0, *hook) for hook in self._hooks("torque")]
@@ -64,11 +65,11 @@ class Effects:
 
     @property
     def alters_models(self) -> bool:
-        """Whether a trial has a model of its own."""
+        """Whether any trial has its own model."""
         return bool(self.displaced.any()) or any(effect.alter or effect.factors for _, effect in self._effects)
 
     def initial_states(self, states: Array) -> Array:
-        """The first states of the trials (K, n), from those of the plan. Raises InputError unless they are finite."""
+        """The first states of the trials (K, n), given the plan's. Raises InputError unless they are finite."""
         shape = states.shape
         for name, effect in self._effects:
             if effect.initial_states is not None:
@@ -90,7 +91,7 @@ class Effects:
             physics.displace(self.displaced)
 
     def measure(self, step: int, states: Array) -> Array:
-        """The measured states (K, n), from the true ones."""
+        """The measured states (K, n) for the true states."""
         measured = states.copy()
         for name, measure in self._measures:
             measured = shaped(name, measure(step, measured), measured.shape)
@@ -142,10 +143,10 @@ class _Streams(Sequence[np.random.Generator]):
 
 
 def seeded(seed: int) -> MakeGenerator:
-    """The generators of a seed: (trial, number of the disturbance) -> a generator of its own."""
+    """The generators of a seed: (trial, number of the disturbance) -> its own generator."""
 
     def make(trial: int, stream: int) -> np.random.Generator:
-        # The quickest of NumPy's generators, which shows in the time of the loop.
+        # The fastest of NumPy's generators; it makes the loop measurably faster.
         return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
 
     return make

@@ -37,12 +37,12 @@ class Plant:
     Attributes:
       robot: the robot, with its dynamics and limits.
       scene: the scene, with its MJCF and obstacles.
-      simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
+      simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
       shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
-      world: the obstacles for it; none for a robot that has neither geoms nor balls nor a position.
-      obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
-        balls in space, all that the MJCF lets it touch, except level planes on which a free joint, or a slide that is
-        not level, lets it stand.
+      world: the obstacles for this shape; none for a robot that has neither geoms nor balls nor a position.
+      obstacles: names of the obstacles that the robot can collide with: by default those of `world`. A robot without a
+        position, or with balls in space, can collide with all that the MJCF lets it touch, except level planes on which
+        a free joint, or a slide that is not level, lets it stand.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body.
       qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
@@ -63,7 +63,7 @@ class Plant:
             check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)
         plant_validation.check_names(robot, scene)
         self.robot, self.scene, self.simulator = robot, scene, simulator
-        self._step: float | None = None  # s, instead of the MJCF's
+        self._step: float | None = None  # s, in place of the timestep of the MJCF
         if robot.geoms is not None and not robot.geoms.of_scene(scene):
             raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
@@ -120,7 +120,7 @@ class Plant:
             raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
     def for_period(self, period: float) -> "Plant":
-        """The same plant with the longest physics step, up to its own, that divides a control period.
+        """The plant with the longest physics step that divides a control period and does not exceed the present step.
 
         A plan with a free duration has a period that the MJCF cannot know.
 
@@ -167,12 +167,12 @@ class Plant:
 
     @cached_property
     def without_contacts(self) -> mujoco.MjModel:
-        """The same model, but the robot passes through obstacles, and contacts are not sensed."""
+        """A copy of the model in which the robot passes through obstacles, and contacts are not sensed."""
         return self._compile(contacts=False)
 
     @cached_property
     def enclosed(self) -> bool:
-        """Whether all parts of the robot that collide are within its radius, so that it touches nothing before.
+        """Whether all colliding parts of the robot are within its radius, so that no part touches an obstacle earlier.
 
         For balls and geoms this is not known.
         """
@@ -186,8 +186,8 @@ class Plant:
         Args:
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
-          act: (..., na), activations of the actuators.
-          near: (..., n), for angles in the nearest representative; None for any representative.
+          act: (..., na), the activations of the actuators.
+          near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
 
         Returns:
           (..., n).
@@ -198,9 +198,9 @@ class Plant:
         return np.concatenate([state, vectors_of("act", act, self.robot.activations)], axis=-1)
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
-        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls the least of all.
+        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls, the least over all.
 
-        For geoms it is that of the nearest one, by MuJoCo.
+        For geoms, the distance of the nearest geom, by MuJoCo.
 
         Args:
           states: (..., n).
@@ -225,7 +225,7 @@ class Plant:
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
 
-        A robot with neither balls nor a position has one about what of it is farthest out.
+        A robot with neither balls nor a position is represented by a ball about its outermost part.
 
         Args:
           planned: states (T+1, n).
@@ -252,7 +252,7 @@ class Plant:
         return BallRecord(driven=places, planned=planned, radii=balls.radii, anchors=anchors)
 
     def _places_on(self, number: int, place: Array, states: Array) -> Array:
-        """Where a point of a body is, (k, 1, 3), in these states (k, n)."""
+        """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
         data, found = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
         for k, qpos in enumerate(self.robot.configuration(states)[0]):
             data.qpos[self.qpos] = qpos
@@ -310,14 +310,14 @@ class Plant:
 
 
 def extent(plant: Plant) -> float:
-    """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
+    """An upper bound of the distance from its position at which the robot can touch an obstacle, in m; exact for balls.
 
-    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places that
-    their joints allow without limits.
+    The distance is seen from above for a robot that is seen from above; else it is the distance in space, for any
+    plane. Moving parts count in all positions that their joints would allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
     space, rng = dynamics.state_coordinates, np.random.default_rng(0)
-    axes = [0, 1] if space.from_above else [0, 1, 2]  # of the world, for distances
+    axes = [0, 1] if space.from_above else [0, 1, 2]  # axes of the world that count for distances
     off, states = 0.0, rng.standard_normal((9, len(space)))
     states[-1] = 0.0  # the last state, for the geoms below
     for state in states:
@@ -326,7 +326,7 @@ def extent(plant: Plant) -> float:
         place = space.in_world(state[list(space.position)])
         off = max(off, float(np.linalg.norm((data.xpos[plant.body] - place)[axes])))
     obstacles = [model.geom(name).id for name in plant.obstacles]
-    thick = model.geom_margin + model.geom_gap  # at which MuJoCo sees a contact
+    thick = model.geom_margin + model.geom_gap  # distance at which MuJoCo detects a contact
     thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True

@@ -35,12 +35,12 @@ Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]
 
 @dataclass(kw_only=True)
 class RunSettings:
-    """The arguments of `simulate`, and what follows from them.
+    """The arguments of `simulate`, and values derived from them.
 
     Attributes:
       law: the controller; by default the plan's policy.
-      followed: the plan of the run: the given one, or else the controller's own.
-      states, controls: coordinates of the controller, with limits that are within the robot's.
+      followed: the plan of the run: the given plan, or else the controller's own.
+      states, controls: coordinates of the controller, with limits within the robot's limits.
       radius: distance from the goal within which it counts as reached, in `Target.unit`.
       substeps: physics steps per control period.
 
@@ -106,7 +106,7 @@ class RunSettings:
 
 
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """The coordinates of the controller's states and controls. Raises InputError unless they are the plant's."""
+    """The coordinates of the controller's states and controls. Raises InputError unless they match the plant's."""
     dynamics = plant.robot.dynamics
     wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     kind = type(controller).__name__

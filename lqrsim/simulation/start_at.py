@@ -1,7 +1,7 @@
 """Runs that begin at a knot of the plan in given states: the rest of a run that followed the plan until then.
 
-Before the run begins, disturbances and controller are called with the plan, period by period, so that a delay has its
-past, a filter its estimate, and what happens at a given time happens at that time. The physics begins at the knot.
+Before the run begins, disturbances and controller are called with the plan, period by period. A delay then has its
+past, a filter its estimate, and events occur at their given times. The physics begins at the knot.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +34,7 @@ def simulate_from(
 ) -> Rollout:
     """Run the rest of a plan after `knot` periods, one trial from each of the states (K, n).
 
-    Until the knot, states and measurements are taken to be those of the plan.
+    Until the knot, states and measurements are assumed to be the plan's.
 
     Args:
       plant, plan, controller: as in `simulate`.
@@ -138,7 +138,7 @@ class _LaterController(Controller):
 
     def start(self, trials: int) -> ControllerRun:
         run = self.of.start(trials)
-        if not isinstance(self.of, Feedback):  # which has no memory
+        if not isinstance(self.of, Feedback):  # a Feedback has no memory
             for step in range(self.knot):
                 run.control(step, np.tile(self.whole.states[step], (trials, 1)))
         return _LaterRun(run, self.knot)

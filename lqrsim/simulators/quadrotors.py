@@ -19,15 +19,15 @@ from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 
-TWIST = 1e-6  # m, by which rotors may be off the corners of a square
+TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The body axes of `Quadrotor` in those of a simulator.
+    """The body axes of `Quadrotor` relative to the simulator's body axes.
 
     Attributes:
-      turn: angle from their x axis to ours, in rad. order: (4,) the number there of each of our rotors. arm: in m.
+      turn: angle from their x axis to ours, in rad. order: (4,) their number of each of our rotors. arm: length in m.
     """
 
     turn: float
@@ -36,10 +36,10 @@ class Frame:
 
     @classmethod
     def of(cls, name: str, places: Array, turning: Array) -> "Frame":
-        """From the rotors' places (4, 2 or 3) in m, and the signs (4,) of the torque with which each drags on the body.
+        """Make it from the rotors' positions (4, 2 or 3) in m, and the signs (4,) of their drag torques on the body.
 
         Raises:
-          InputError: the rotors are not at the corners of a square about the centre of mass, or turn otherwise than in
+          InputError: the rotors are not at the corners of a square about the centre of mass, or do not turn in
             alternating directions.
         """
         angles = np.arctan2(places[:, 1], places[:, 0])
@@ -58,7 +58,7 @@ class Frame:
         return states[:, :3], states[:, 3:6], turned.as_quat(), about_z(states[:, 9:], self.turn)
 
     def ours(self, position: Array, velocity: Array, attitude: Array, rates: Array) -> Array:
-        """The states (K, 12), NaN where something is not finite."""
+        """The states (K, 12); NaN in rows that are not finite."""
         parts = np.concatenate([position, velocity, attitude, rates], axis=1)
         known, states = np.isfinite(parts).all(axis=1), np.full((len(parts), 12), np.nan)
         if known.any():
@@ -75,12 +75,12 @@ def about_z(vectors: Array, angle: float) -> Array:
 
 
 def check_quadrotor(name: str, robot: Robot) -> None:
-    """Raise InputError unless it has the states and controls of a Quadrotor."""
+    """Raise InputError unless the robot has the states and controls of a Quadrotor."""
     check_kind(f"{name}: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
 
 
 def package(module: str, extra: str) -> Any:
-    """A module of a package that an extra installs. Raises InputError with that extra if it is not there."""
+    """A module of a package that an extra installs. If it is missing, raises InputError that names the extra."""
     name = module.partition(".")[0]
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which optional packages it lacks
