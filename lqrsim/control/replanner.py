@@ -149,7 +149,7 @@ class LiveReplanner:
         return policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
 
     def _due(self, step: int) -> bool:
-        """Whether a solve begins in a control period: also in the first, and in the next one after periods left out."""
+        """Whether a solve begins in a control period. It does in the first, and in the next period after a gap."""
         rule = self._rule
         left = rule.horizon == "moving" or step + rule.delay < rule.problem.steps
         return left and step // rule.periods > self._asked // rule.periods

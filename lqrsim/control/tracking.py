@@ -88,7 +88,7 @@ def choose_tolerances(
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
-    """How far random controls of an effort move each state, (n,), in each number of periods: rms over the plan."""
+    """The motion of each state, (n,), by random controls of an effort, in each number of periods: rms over the plan."""
     n, steps = model.n, model.plan.steps
     A, B = model.jacobian[:, :, :n], model.jacobian[:, :, n:]
     moved, total, reach = B * effort, np.zeros(n), dict[int, Array]()

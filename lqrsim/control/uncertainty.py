@@ -197,7 +197,7 @@ class Uncertainty:
 
     @property
     def as_steady(self) -> "Uncertainty":
-        """This, with the unknowns in the order of `steady`: means that are zero have a standard deviation of 0."""
+        """This uncertainty with unknowns in the order of `steady`: zero means have a standard deviation of 0."""
         return self.steady(np.inf, share=0.0)
 
 

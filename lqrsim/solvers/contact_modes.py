@@ -1,14 +1,16 @@
-"""Plans at the edges of contact modes: descent that keeps to a mode, and what makes such a plan optimal.
+"""Plans at the edges of contact modes: a descent within a mode, and conditions for optimality of such a plan.
 
-A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. Plans
-that lower the cost end at a *switch*, beside a jump or at a kink: a contact that is just not reached, or just lets go.
-The gradient is not zero there, and steps along it go across. Here a switch is an inequality, like a limit of a control:
+A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. A
+descent ends at a *switch*, next to a jump or at a kink: a contact that is just not reached, or just lets go. The
+gradient is not zero there, and steps along it cross the switch. Here a switch is an inequality, like a limit of a
+control:
 
-- The model of the cost is that of iLQR, in the offsets of the policy with its gains held, and derivatives are those of
-  the plan's own mode. The step minimises it with all switches on their sides, linearised: a quadratic program.
-- A step that crosses a switch after all, because it is curved, is pushed back to its own side.
-- Where no such step lowers the cost, each switch that the plan is pressed against is crossed on its own. If the cost is
-  lower there, the descent goes on from there.
+- The model of the cost is that of iLQR, in the offsets of the policy with fixed gains, and derivatives are those of the
+  plan's own mode. The step minimises the model subject to linearised switches, which must keep their sides: a quadratic
+  program.
+- A step that still crosses a switch, because the switch is curved, is pushed back to its side.
+- If no such step lowers the cost, each switch that the plan is pressed against is crossed individually. If the cost is
+  lower on the other side, the descent continues there.
 
 The plan is optimal if neither is possible; `optimality_in_mode` and `surroundings` measure both again.
 """
@@ -31,14 +33,14 @@ from lqrsim.solvers.budget import Budget, Laps
 from lqrsim.solvers.certify import faults
 from lqrsim.solvers.engine import RunResult, SolveRun
 
-MARGIN = 1e-9  # m, rad or m/s^2, by which a plan stays on its side of a switch
-ENOUGH = 0.1  # share of the predicted decrease that a step must bring
+MARGIN = 1e-9  # m, rad or m/s^2, distance that a plan keeps from a switch
+ENOUGH = 0.1  # fraction of the predicted decrease that a step must achieve
 PUSHES = 5  # times that a step is pushed back to its side
-HALVINGS = 8  # of a step that are tried before it is damped more
-DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature where steps fail, at first and at most
-ROUNDS = 50  # of adding switches to a quadratic program
-SMALL = 1e-3  # how far plans beside a plan change a control, as a part of its range
-SAMPLES, RAY = 50, 8  # plans beside a plan; how often the way across a switch doubles
+HALVINGS = 8  # number of halvings of a step before the damping grows
+DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature if steps fail: the first and the largest
+ROUNDS = 50  # largest number of rounds in which switches are added to a quadratic program
+SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its range
+SAMPLES, RAY = 50, 8  # number of sampled neighbouring plans; number of doublings of a ray across a switch
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,9 @@ class ModeModel:
 
     Attributes:
       gain: (T, m, n). hessian, gradient: of the cost, (T m, T m) and (T m,). slopes, values: of K switches, (K, T m)
-        and (K,). sides: +1 or -1. first: (T+1,) where those of each period begin. known: whether their slopes are.
-      responses: (T m, T m) of the controls. low, high: (T, m) room of the controls. periods: the linearised periods.
+        and (K,). sides: +1 or -1. first: (T+1,) index of each period's first switch. known: whether the slopes are
+        known. responses: (T m, T m) responses of the controls. low, high: (T, m) distances of the controls from their
+        limits. periods: the linearised periods.
     """
 
     def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
@@ -115,7 +118,7 @@ class ModeModel:
 class ModeStep:
     """A minimiser of the model, (T m,), and the decrease that it predicts.
 
-    With the multipliers of the switches, (K,), and of the limits of the controls, (T, m), negative for upper ones.
+    Also the multipliers of the switches, (K,), and of the control limits, (T, m), negative for upper limits.
     """
 
     change: Array
@@ -128,7 +131,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
 
     Args:
-      across: a switch that must be on its other side instead, by `depth`; the change is the least one then.
+      across: a switch that must be crossed by `depth` instead; the change is then as small as possible.
     """
     try:
         factor = scipy.linalg.cholesky(curvature, lower=True)
@@ -150,7 +153,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     rows, which, lengths = rows[felt] / lengths[felt, None], which[felt], lengths[felt]
     bounds = bounds[which] / lengths
     free = np.zeros(size) if across is not None else -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
-    # The nearest point to `free` with rows y >= bounds; Lawson and Hanson's way to least distances.
+    # The nearest point to `free` with rows y >= bounds, by Lawson and Hanson's least-distance algorithm.
     short, nearest, weights = bounds - rows @ free, free, np.zeros(len(bounds))
     active = np.flatnonzero(short > 0)
     for _ in range(ROUNDS):
@@ -164,7 +167,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
         except RuntimeError:
             return None
         rest = matrix @ pulls - target
-        if not abs(rest[-1]) > 1e-13:  # they contradict each other
+        if not abs(rest[-1]) > 1e-13:  # the rows contradict each other
             return None
         nearest = free - rest[:size] / rest[-1]
         weights[:] = 0.0
@@ -185,7 +188,7 @@ class Descent:
     """Descent from a plan, mode by mode.
 
     Attributes:
-      plan: the best so far. model: about it.
+      plan: the best plan so far. model: the model about it.
     """
 
     def __init__(
@@ -233,7 +236,7 @@ class Descent:
         return None
 
     def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
-        """The plan after a change of the offsets, corrected until it crosses no switch; or the last one tried."""
+        """The plan after a change of the offsets, corrected until it crosses no switch; or else the last trial."""
         model, wanted, factor = self.model, self.model.values + self.model.slopes @ change, None
         for _ in range(PUSHES):
             if not np.isfinite(there.cost):
@@ -253,7 +256,7 @@ class Descent:
                 missing += (sides * aim - values)[held].tolist()
                 crossed = crossed or bool(across.any())
                 if (across & ~period.switches.forces).any():
-                    break  # what comes after a jump says nothing
+                    break  # the rest of a plan after a jump is meaningless
             if not crossed:
                 break
             factor = scipy.linalg.cho_factor(model.hessian) if factor is None else factor
@@ -266,7 +269,7 @@ class Descent:
         return there
 
     def _crossed(self, step: ModeStep) -> CostedPlan | None:
-        """A cheaper plan across a switch that this one is pressed against; None if there is none."""
+        """A cheaper plan across a switch that the present plan is pressed against; None if there is none."""
         for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
             best = beyond(self._problem, self.plan, self.model, which)
             if best is not None and best.cost < self.plan.cost - self._tolerance * abs(self.plan.cost):
@@ -282,13 +285,13 @@ class Descent:
         return pulls, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: CostedPlan) -> None:
-        """Take a plan, and linearise about it."""
+        """Adopt a plan, and linearise about it."""
         self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)
         self._laps.record("contact modes", plan.cost, optimality=np.nan)
 
 
 def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
-    """A period; where no switch is in sight, by the compiled derivatives, which are as good and quicker."""
+    """A period. If no switch is near, the compiled derivatives are used, which are as good and faster."""
     end, switches = modes.step(state, control)
     if len(switches.names):
         return modes.linearize(state, control)
@@ -326,7 +329,7 @@ def beyond(problem: Problem, plan: CostedPlan, model: ModeModel, which: int) -> 
 
 
 def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
-    """Descend from a plan within its contact modes; certified. None where no switch is in sight of it, or known."""
+    """Descend from a plan within its contact modes; certified. None if no switch is near it, or known."""
     problem, dynamics = run.problem, run.problem.dynamics
     modes = dynamics.contact_modes(problem.dt)
     if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
@@ -364,15 +367,15 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
 def optimality_in_mode(
     problem: Problem, modes: ContactModes, plan: CostedPlan, gain: Array, pulls: Sequence[Switches], limits: Array
 ) -> tuple[float, Quadratic]:
-    """The most that a plan's own mode still allows the cost to fall, relative to it; and the policy's cost-to-go.
+    """A bound on the relative decrease of cost within the plan's own mode, and the policy's cost-to-go.
 
     By duality: half the square of the Lagrangian's gradient in the offsets, weighed as in `kernels/certificate.py`, and
-    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives
-    in a recursion of its own, not the model from which the plan was found.
+    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives in
+    a separate recursion, not the model from which the plan was found.
 
     Args:
-      pulls: multipliers of the switches of each period, by name, not negative. limits: those of the limits of the
-        controls, (T, m), negative for upper ones.
+      pulls: nonnegative multipliers of the switches of each period, by name. limits: multipliers of the control limits,
+        (T, m), negative for upper limits.
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]

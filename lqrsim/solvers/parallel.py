@@ -40,7 +40,7 @@ def solve_all(
             start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
             check_functions(problem, start, resolve(settings.start, problem).offset[0])
             compiled.core(problem, settings.core_form)
-            compiled.arguments(problem)  # compiles numba functions
+            compiled.arguments(problem)  # this compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
     functions = [function for problem in problems for function in functions_of(problem)]
@@ -79,7 +79,7 @@ def check_threads(threads: int | None) -> int:
 
 
 def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
-    """The problems as a list, with noise and risk replaced where they are given. Raises InputError unless it is one."""
+    """The problems as a list, with noise and risk replaced if given. Raises InputError for anything else."""
     listed = list(check_items("problems", problems, object, "a list of Problem"))
     if noise is None and risk is None:
         return listed

@@ -1,4 +1,4 @@
-"""Costs of sampled runs under a problem's noise, with which expected costs can be compared."""
+"""Costs of sampled runs under a problem's noise, for comparison with expected costs."""
 
 import numpy as np
 
@@ -21,13 +21,13 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     trial.
 
     Args:
-      problem: with noise.
-      solution: solution of that problem, or of another one with as many states, controls and steps.
+      problem: a problem with noise.
+      solution: a solution of that problem, or of another with as many states, controls and steps.
       trials: number of runs K.
       seed: seed of the noise.
 
     Returns:
-      (K,) the costs.
+      The costs, (K,).
 
     Raises:
       InputError: the problem has no noise, the solution does not fit it, or an argument is not as described.
