@@ -1,13 +1,12 @@
 """The files of a campaign's folder: its lock, the tables of its trials, and its manifest.
 
-A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written whole or
-not at all. Its metadata names the campaign, the cell and the trials, and has a hash of these and of the columns.
-
-`manifest.json` has specification, versions and hashes. `sha256` covers the whole file, so that an edited one is
-refused. `digest` covers everything that the rows depend on. Each shard has it, too, so that a manifest with new
+A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written all or
+nothing. Its metadata names the campaign, the cell and the trials, and contains a hash of these and of the columns.
+`manifest.json` contains specification, versions and hashes. `sha256` covers the whole file, so that an edited file is
+refused. `digest` covers everything that the rows depend on. It is also in each shard, so that a manifest with new
 settings and a renewed hash does not fit the shards.
 
-The system releases the lock when the process dies, however it dies. The package filelock 4.2 passes the same tests with
+The system releases the lock whenever the process ends. The package filelock 4.2 passes the same tests with
 the same system calls, but it would replace only two functions. On a file system without locks its `FileLock` falls back
 to a file whose existence is the lock, which a killed process leaves behind; here such file systems are refused.
 """
@@ -61,7 +60,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
                 ) from None
             reason = error.strerror or error
             raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
-        with contextlib.suppress(OSError):  # shows people which process has the lock
+        with contextlib.suppress(OSError):  # shows which process has the lock
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
         yield
@@ -73,7 +72,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _lock(handle: int) -> None:
-        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads: locked bytes cannot be read
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that is never read: locked bytes cannot be read
 
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
 else:
@@ -88,7 +87,7 @@ _KEY = b"lqrsim shard"
 
 
 class Damaged(Exception):
-    """A file that differs from what was written."""
+    """The exception for a file that differs from what was written."""
 
 
 def pack(table: Table, shard: Shard, campaign: str) -> bytes:
@@ -120,7 +119,7 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
 
 
 def write(contents: bytes, path: Path) -> None:
-    """Write a file to the disk, whole or not at all. Raises InputError if it cannot, as on a full disk."""
+    """Write a file to the disk, all or nothing. Raises InputError if this fails, as on a full disk."""
     with replacing(path) as unfinished, unfinished.open("wb") as file:
         file.write(contents)
         file.flush()
@@ -158,12 +157,12 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
-_LARGEST = 1 << 26  # bytes
+_LARGEST = 1 << 26  # bytes, largest manifest
 
 
 @dataclass(frozen=True)
 class _Manifest:
-    """The fields of the manifest; `Campaign` checks those of the campaign."""
+    """The fields of the manifest; `Campaign` checks the campaign's fields."""
 
     format: Line
     version: int
@@ -242,7 +241,7 @@ def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:
 
 def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     """Policy, sweep and strength of each cell, in order. Raises InputError if a field of the campaign is invalid."""
-    # Without the disturbances: they may be a user's, whose file is not loaded here.
+    # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
     bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
     return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
@@ -257,7 +256,7 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
-    """Hash of everything that the rows depend on; the same when the same campaign is begun again."""
+    """Hash of everything that the rows depend on. It is the same when the same campaign is begun again."""
     fields = ("cells", "model", "problem", "start", "solution", "code", "versions")
     hashed = {name: manifest[name] for name in fields} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
@@ -267,11 +266,11 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_solution(solution: Solution) -> str:
-    """Hash of everything in a solution that its runs depend on; not of the log of its solve."""
+    """Hash of everything in a solution that its runs depend on, which excludes the log of its solve."""
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
-    if solution.cost_to_go is not None:  # re-planning begins with it, and with the multipliers
+    if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
     arrays += [one.values for one in solution.multipliers]
     return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))
