@@ -25,7 +25,7 @@ class Spread(NamedTuple):
 
     Attributes:
       mean: mean in m, (T+1, O). std: standard deviation in m, (T+1, O). correlation: correlation of each clearance with
-      the same clearance at the previous knot, (T, O).
+        the same clearance at the previous knot, (T, O).
     """
 
     mean: Array
@@ -41,7 +41,7 @@ class Surroundings:
       kept: the costs and constraints that keep the robot away from obstacles, without repetitions.
       shapes: for each of these, the shape of the robot among its obstacles.
       place: the states that are the robot's position. position: the same; with balls or geoms, all states that move
-      these.
+        these.
       std: standard deviation of an obstacle's position, in m.
     """
 
@@ -120,7 +120,7 @@ def collision_chance(
 
     Args:
       states: means, (T+1, n). covariance: (T+1, n, n). across: covariance of each state with the previous state, (T, n,
-      n).
+        n).
     """
     if not surroundings.kept:
         return np.zeros(len(states)), 0.0

@@ -125,7 +125,7 @@ class Lag:
 
     Attributes:
       left: the remaining fraction of the distance to the command at the end of the period. mean: its average over the
-      period.
+        period.
     """
 
     left: float

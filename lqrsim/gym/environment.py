@@ -57,7 +57,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
       actions: "normalized": from -1 to 1, between the limits of each control; "controls": the controls themselves in
         their units, within their limits.
       render_mode: None or "rgb_array". camera, size: camera and size of the pictures; any camera of `render` except
-      "chase".
+        "chase".
 
     Attributes:
       task: the scenario and its plant. solution: the solution with the plan.

@@ -1,4 +1,4 @@
-"""Distances to obstacles minus the required ones: values of a constraint. Written in the kernels' subset.
+"""Constraint values: distances to obstacles minus the required distances. Written in the kernels' subset.
 
 The robot is a point at its position, or a set of balls. For balls, `value` and `slope` take the centres and their
 Jacobian in place of state and control; see `augmented_lagrangian.py`.
@@ -14,12 +14,12 @@ from lqrsim.kernels.declarations import ROW, N, stack
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AT = 0
-BALLS = 0  # 0 for a point
-AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane, whose third coordinate is 0
+BALLS = 0  # number of balls; 0 for a point
+AXES = (0, 1, 2)  # states that are the position of a point; two in a plane, with third coordinate 0
 
 
 def value(x, u, t, row, data):
-    """The distance of one ball to one obstacle, less its radius and the margin."""
+    """The distance of one ball to one obstacle, minus its radius and the margin."""
     a, b, c = place(x, row, data)
     steps, each = int(data[AT]), int(data[AT + 1])
     least = data[AT + 4 + BALLS + min(t, steps - 1) * each + row % each]
@@ -44,7 +44,7 @@ def slope(x, u, t, row, data, gradient):
 
 
 def place(x, row, data):
-    """The centre of the ball that a row is about, or the position of a robot that is a point."""
+    """The centre of a row's ball, or the position of a robot that is a point."""
     if BALLS:
         first = 3 * (row // int(data[AT + 2]))
         return x[first], x[first + 1], x[first + 2]

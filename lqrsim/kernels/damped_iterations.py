@@ -40,21 +40,21 @@ from lqrsim.kernels.rollouts import (
 
 
 def damped_iterations(first, last, settings, model, work, memory, log):
-    """Iterations from the best plan so far that never raise its merit: its cost and the augmented Lagrangian.
+    """Iterations from the best plan so far that never raise its merit: the cost plus the augmented Lagrangian.
 
     The forward pass linearises about the plan, the backward pass a fraction `reach` of the way from the plan to the
-    smoothed states, and a line search by halves follows the new policy. Where a tenth of the step does not lower the
+    smoothed states, and a line search by halves follows the new policy. If a tenth of the step does not lower the
     merit, the next iteration reaches less far. At reach 0 both passes linearise about the plan, and the step is iLQR's:
     a descent direction, unless the plan is stationary or rounding spoils the matrices. If it fails, changes of the
     controls (and of a soft start) get a weight in both passes, relative to the cost's own curvature, which grows
-    tenfold until it helps. After many iterations without convergence, too, reach 0 has its turn, each time for twice as
+    tenfold until it helps. After many iterations without convergence, reach 0 is also used, each time for twice as
     long.
 
     A small change of cost can come from a short step, so two in a row are required. Then one more undamped pass about
-    the plan measures its optimality, and computes the policy and the value functions of the answer. Where the
-    merit falls by nothing but rounding in IDLE steps in a row, as at a kink of the dynamics, it has stalled.
+    the plan measures its optimality, and computes the policy and the value functions of the answer. If the merit falls
+    only by rounding in IDLE steps in a row, as at a kink of the dynamics, the method has stalled.
 
-    With `first` equal to `last`, only these are computed, about the plan as it is. Arguments and results are as for
+    With `first` equal to `last`, only these are computed, about the present plan. Arguments and results are as for
     `smoother_iterations`.
     """
     if first == last:
@@ -67,7 +67,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, negligible)
             shorten_step(settings.steps, fraction, work.plan, work.x_hats)
-            # At reach 0, as in iLQR, the models are those about a rollout, which has no gap.
+            # At reach 0, as in iLQR, the models are about a rollout, which has no gap.
             gap = largest_gap(settings.steps, work.x_hats, work.rollout.states) if reach > 0 else 0.0
             copy_plan(settings.steps, work.rollout, work.plan)
             memory.plan_cost, memory.merit = cost, merit
@@ -95,7 +95,7 @@ def damped_step(settings, model, work, memory):
     """Both passes and the line search.
 
     Returns:
-      The new merit, the new cost, the fraction of the step that was taken, and the cost that is negligible.
+      The new merit, the new cost, the fraction of the step that was taken, and the negligible cost.
     """
     shift, reach = stack(N), memory.reach
     merit, cost, fraction, negligible = inf, inf, 0.0, 0.0
@@ -177,8 +177,8 @@ def relinearize(settings, settled, negligible, model, work, memory, row):
 def value_functions_at_plan(settings, model, work, memory, row):
     """Complete a backward pass about the plan: a policy that reproduces the plan, and the cost-to-come.
 
-    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: where motions are
-    unstable, rounding can spoil the cost-to-come while the rest is right.
+    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: if the dynamics
+    are unstable, rounding can spoil the cost-to-come while the rest is right.
     """
     steps, plan, policy = settings.steps, work.plan, work.policy
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)

@@ -1,13 +1,13 @@
 """Distances from a model, minus margins. Written in the kernels' subset.
 
-`data` has the data of the distances. From AT on it has the number of steps with margins (the last ones hold from there
-on), the number of margins at a step, the number of each row's obstacle, and the margins, step by step.
+`data` begins with the data of the distances. From AT on it has the number of steps with margins (the last margins hold
+for all later steps), the number of margins per step, the number of each row's obstacle, and the margins, step by step.
 """
 
 from lqrsim.kernels.declarations import N
 
 AT = 0
-ROWS = 1  # how many there are
+ROWS = 1  # number of distances
 
 
 def value(at, u, t, row, data):
@@ -17,6 +17,6 @@ def value(at, u, t, row, data):
 
 
 def slope(at, moves, t, row, data, gradient):
-    """Add its gradient, of all distances and their derivatives in the states."""
+    """Add its gradient, given all distances and their derivatives in the states."""
     for i in range(N):
         gradient[i] += moves[row, i]

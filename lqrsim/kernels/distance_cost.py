@@ -10,12 +10,12 @@ from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.linear_algebra import clear
 
 AT = 0
-ROWS = 1  # how many there are
-MOVED = 1  # states that the distances depend on: the first ones
+ROWS = 1  # number of distances
+MOVED = 1  # number of states, from the first on, that the distances depend on
 
 
 def value(x, u, t, data):
-    """The cost; none at the first step, whose state is given."""
+    """The cost; zero at the first step, whose state is given."""
     total = 0.0
     if t > 0:
         distances = stack(ROWS)

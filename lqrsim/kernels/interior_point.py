@@ -27,7 +27,7 @@ from lqrsim.kernels.model_functions import (
 from lqrsim.kernels.records import LinearStep, QuadraticStage
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
-STEP = 6e-6  # of differences of gradients, relative to a number and at least to 1: the cube root of the precision
+STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
 
 
 def stage_models(t, steps, plan, costates, model, rows, out):
@@ -35,7 +35,7 @@ def stage_models(t, steps, plan, costates, model, rows, out):
 
     Args:
       costates: (T+1, N). rows: ConstraintRows.
-      out: StageModels; the constraints' gradients are those that `constraint_slopes` wrote.
+      out: StageModels; it contains the constraints' gradients from `constraint_slopes`.
     """
     none = zeros(M)
     x, u = plan.states[t], plan.controls[min(t, steps - 1)]
@@ -95,7 +95,7 @@ def acts_at(k, t, steps, constraints):
 
 
 def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
-    """Subtract from a Hessian (W, W) those of all constraints at a step, times their multipliers."""
+    """Subtract from a Hessian (W, W) the Hessians of all constraints at a step, times their multipliers."""
     for k in range(constraints.size):
         if not acts_at(k, t, steps, constraints):
             continue
@@ -130,7 +130,7 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
 
 
 def trial_cost(steps, soft, plan, model, arrived):
-    """Write where each step of a plan leads, (T, N), and return the plan's cost."""
+    """Write the state after each step of a plan, (T, N), and return the plan's cost."""
     for t in range(steps):
         advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
     return cost_of_plan(steps, soft, plan, model)
@@ -222,7 +222,7 @@ def start_change(free, to_go, change):
 
 
 def control_block_definite(stage, least):
-    """Whether the control block of a stage (W, W) less a diagonal (M,) is positive definite."""
+    """Whether the control block of a stage (W, W) minus a diagonal (M,) is positive definite."""
     block = stack(M, M)
     for i in range(M):
         for j in range(M):

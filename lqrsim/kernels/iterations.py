@@ -1,7 +1,8 @@
 """Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
 
-Each function runs the iterations `first` to `last` - 1, and can be called again to continue: its state is in its
-arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the outcome
+Each function runs the iterations `first` to `last` - 1, and can be called again to continue, because its state is in
+its arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the
+outcome
 (a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or -1.
 """
 
@@ -50,9 +51,9 @@ from lqrsim.kernels.rollouts import (
 
 
 def relative_improvement(old, cost, negligible):
-    """The decrease of cost relative to the new cost; 0 where it did not change, -inf where the cost is not finite.
+    """The decrease of cost relative to the new cost; 0 if it did not change, -inf if the cost is not finite.
 
-    Costs below `negligible` are rounding of zero, and would never settle.
+    Costs below `negligible` are rounding errors about zero, and would never settle.
     """
     if not abs(cost) < inf:
         return -inf
@@ -64,9 +65,9 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 
     Args:
       settings: IterationSettings. model: ProblemModel. memory, log: rows of MEMORY and LOG.
-      work: SmootherArrays. Policy and cost-to-go are what to begin with. `rollout` and `kept` are those of the last
-        complete iteration, and before any those of the first policy. `plan` is the rollout of lowest cost so far, the
-        first policy's included, and `memory.plan_cost` its cost: for the safeguard.
+      work: SmootherArrays. It contains the initial policy and cost-to-go. `rollout` and `kept` belong to the last
+        complete iteration, or before the first one to the first policy. For the safeguard, `plan` is the rollout of
+        lowest cost so far, including the first policy's, and `memory.plan_cost` its cost.
 
     With `last` of 0, only the first policy is rolled out.
     """
@@ -82,7 +83,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             copy(work.guess.states[0], N, x_hat)
     for done in range(first, last):
         for i in range(N):
-            if fixed and x_hat[i] != work.start[i]:  # whatever ran before, each pass begins at the given start
+            if fixed and x_hat[i] != work.start[i]:  # each pass begins at the given start, whatever ran before
                 x_hat[i] = work.start[i]
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
@@ -93,7 +94,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         failed, good, negligible = backward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), True, failed
-        if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was not known
+        if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was unknown
             memory.plan_cost, _ = plan_cost(steps, work.plan, model, work.to_go)
         cost = roll_out_and_keep(steps, x_hat, model, work, memory)
         improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, negligible)
@@ -119,7 +120,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 
 
 def roll_out_and_keep(steps, start, model, work, memory):
-    """Run the policy, and keep it with its rollout; the rollout of lowest cost is the plan. Returns the cost."""
+    """Run the policy, and keep it with its rollout. The rollout of lowest cost is the plan. Returns the cost."""
     cost = rollout(steps, start, work.policy, model, work.rollout)
     if NOISY:
         cost += noise_cost(steps, work.rollout, model, work.to_go)
@@ -138,10 +139,10 @@ def failure(good, model):
 
 
 def cycling(log, done):
-    """Whether the costs repeat, up to rounding: then they always will.
+    """Whether the costs repeat, up to rounding; they then always will.
 
-    A cycle must repeat twice; one that the iterations still approach does not count. A cost that stays the same is a
-    cycle, too: iterations that have not converged by then never will.
+    A cycle must repeat twice; a cycle that the iterations still approach does not count. A constant cost is also a
+    cycle: iterations that have not converged by then never will.
     """
     same = done >= 5
     for i in range(5):
@@ -164,7 +165,7 @@ def no_progress(log, done):
     """Whether the lowest cost has not fallen for NO_FALL iterations, or by less than a thousandth for SLOW_FALL.
 
     A rising cost is no sign of failure, because the method passes through worse rollouts on its way. Costs that
-    oscillate, creep or stay infinite are.
+    oscillate, creep or stay infinite are a sign.
     """
     least, reference, since, slow = inf, inf, 0, 0
     for i in range(done + 1):
@@ -197,14 +198,14 @@ def write_row(row, cost, improvement, gap, left, residual, method):
 
 
 def relative_optimality(failed, decrease, cost, negligible):
-    """A predicted decrease relative to the cost; infinite where the pass that predicts it failed."""
+    """A predicted decrease relative to the cost; infinite if the pass that predicts it failed."""
     if failed >= 0 or not decrease < inf or not abs(cost) < inf:
         return inf
     return decrease / max(abs(cost), negligible, 1e-300)
 
 
 def outcome_of(settled, settings, left, cost, full):
-    """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last one."""
+    """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last."""
     if settled and not settings.optimal:
         return COST_CONVERGED
     if settled and left < settings.tolerance:
@@ -222,11 +223,11 @@ def ilqr_iterations(first, last, settings, model, work, log):
 
     Args:
       settings: IterationSettings. model: ProblemModel.
-      work: IlqrArrays. The policy makes the first trajectory; afterwards the plan is the best trajectory, and policy
-        (relative to it) and cost-to-go are about it.
-      log: rows of LOG; the last one has the cost that the first iteration improves on.
+      work: IlqrArrays. The policy makes the first trajectory. Afterwards the plan is the best trajectory, with the
+        policy relative to it and the cost-to-go about it.
+      log: rows of LOG; the last row has the cost that the first iteration improves on.
 
-    With `first` equal to `last`, only policy and cost-to-go are computed, about the plan as it is.
+    With `first` equal to `last`, only policy and cost-to-go are computed, about the present plan.
     """
     steps, policy, plan, to_go, damping = settings.steps, work.policy, work.plan, work.to_go, work.damping
     no_shift = zeros(N)
@@ -251,7 +252,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
             damping[0] = 0.0
-        if NOISY:  # with the cost-to-go that the new policy has
+        if NOISY:  # with the new policy's cost-to-go
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
         cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.trial)
@@ -270,7 +271,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:
-            if isnan(left):  # policy and cost-to-go are not yet about the trajectory that was found
+            if isnan(left):  # policy and cost-to-go are not yet computed about the trajectory that was found
                 failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

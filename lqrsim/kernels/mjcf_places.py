@@ -1,7 +1,7 @@
-"""The places of a robot's balls in MuJoCo: points fixed to bodies of an MJCF. Written in the kernels' subset.
+"""The centres of a robot's balls in MuJoCo: points fixed to bodies of an MJCF. Written in the kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the number of balls, the number of states that they depend on,
-and for each ball the number of its body and its place in the body's axes. It goes with functions of that module.
+and for each ball the number of its body and its position in the body's axes. The code uses functions of that module.
 """
 
 from lqrsim.kernels.declarations import N, at, call, stack, store
@@ -39,7 +39,7 @@ def places(x, data, out):
 
 
 def places_jacobian(x, data, out, slopes):
-    """Write the coordinates, and their derivatives in the states, which are zeros when they come."""
+    """Write the coordinates, and their derivatives in the states, which are zero on entry."""
     z, count = stack(N), 3 * int(data[1])
     for i in range(N):
         z[i] = x[i]

@@ -2,7 +2,8 @@
 
 The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on, `data` has the
 sharpness, the weight, the number of obstacles, the number of steps with a table of obstacles, of which the last holds
-from its step on, the radius of each ball (of a point, one), and the tables. What `places` reads comes before AT.
+from its step on, the radius of each ball (for a point, one radius), and the tables. The data for `places` comes before
+AT.
 """
 
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
@@ -10,9 +11,9 @@ from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AT = 0
-BALLS = 0  # 0 for a point
-AXES = (0, 1, 2)  # states that are the position, two in a plane, whose third coordinate is 0; or that move the balls
-BLOCK = 8  # obstacles whose exponentials are computed together, as vectors
+BALLS = 0  # number of balls; 0 for a point
+AXES = (0, 1, 2)  # states that are the position, two in a plane with third coordinate 0; or states that move the balls
+BLOCK = 8  # number of obstacles whose exponentials are computed together, as vectors
 
 
 def value(x, u, t, data):
@@ -67,7 +68,7 @@ def derivatives(x, u, t, data, hessian, gradient):
 
 
 def tables_at(t, data):
-    """Where the table of obstacles at step t begins."""
+    """The index at which the table of obstacles at step t begins."""
     radii = BALLS if BALLS else 1
     return AT + 4 + radii + ROW * int(data[AT + 2]) * min(t, int(data[AT + 3]) - 1)
 

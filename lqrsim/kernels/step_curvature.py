@@ -70,9 +70,9 @@ def back(fx, after, ahead, share, weights, before):
 
 
 def add_curvature(z, u, p, weights, ahead, slope, total):
-    """Add the Hessian (W, W) of the weighted rates at a stage, whose state is `x + ahead k`; `slope` (N, W) is k's."""
+    """Add the Hessian (W, W) of the weighted rates at a stage with state `x + ahead k`; `slope` (N, W) is k's."""
     curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
-    line = stack(W)  # not a row of a matrix, so that it stays in registers
+    line = stack(W)  # a local array, not a row of a matrix, stays in registers
     rate_curvature(z, u, p, weights, curve)
     for a in range(STATES):
         for j in range(W):

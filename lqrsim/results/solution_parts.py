@@ -32,7 +32,7 @@ class Trajectory:
 
     Raises:
       InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed, because failed solves
-      contain it.
+        contain it.
     """
 
     states: Annotated[Array, "T+1 n"]

@@ -129,7 +129,7 @@ class MjcfDynamics(Dynamics):
 
         Raises:
           InputError: there is no such number, the value is out of range, or the mass of all bodies and of a single body
-          are both given.
+            are both given.
         """
         numbers = self.numbers
         for name in values:

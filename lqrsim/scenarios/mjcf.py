@@ -39,7 +39,7 @@ def mjcf(
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
       goal: the goal, in the same form. Without a start and a goal, the robot is to stay at rest, and a warning says
-      this.
+        this.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100};
         states that are not named have no weight.
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see

@@ -35,7 +35,7 @@ class Scenario:
       tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
       disturbances: the disturbances of the demo: clearly visible, but within the reach of the policy.
       start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several starts are
-      tried.
+        tried.
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius, or
         a tenth of the distance to the goal if the start is within the radius.

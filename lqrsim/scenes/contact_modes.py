@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-_NEAR = 0.02  # m or rad, within which distances are watched
-_SMALLER = 1.0, 1e-2, 1e-4  # differences, relative to the first, that are tried until one stays in the mode
+_NEAR = 0.02  # m or rad; smaller distances are watched
+_SMALLER = 1.0, 1e-2, 1e-4  # steps of differences, relative to the first; tried until one stays in the mode
 _KIND = mujoco.mjtConstraint
 _LIMITS = [int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)]
 _CONTACTS = [int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)]
-# A switch's name, as a number: its stage, whether it is a force, what of, and which of those.
+# The name of a switch as a number: its stage, whether it is a force, the kind of element, and the element.
 _STAGE, _FORCE, _CONTACT, _GEOM, _NUMBER, _EDGE = 1 << 48, 1 << 47, 1 << 46, 1 << 14, 1 << 16, 1 << 4
 
 Names = npt.NDArray[np.int64]
@@ -28,7 +28,7 @@ Names = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Switches:
-    """Switches of a control period, (k,): their names, ascending, and their values; negative where something acts."""
+    """Switches of a control period, (k,): their names, ascending, and their values, negative for active ones."""
 
     names: Names
     values: Array
@@ -44,11 +44,11 @@ class Switches:
 
     @property
     def forces(self) -> npt.NDArray[np.bool_]:
-        """Which of them are forces, whose change of sign is a kink and not a jump."""
+        """Flags of the switches that are forces; their change of sign is a kink, not a jump."""
         return (self.names & _FORCE) != 0
 
     def same_mode(self, other: "Switches") -> bool:
-        """Whether the same acts. What is out of sight of one of them does not act in it."""
+        """Whether the same elements act in both. An element that is out of sight does not act."""
         if not np.array_equal(self.names[self.forces], other.names[other.forces]):
             return False
         return bool(((self.values < 0) == (other.at(self.names) < 0)).all()) and bool(
@@ -61,7 +61,7 @@ class Period:
     """A control period, linearised in its contact mode.
 
     Attributes:
-      state: (n,) at its end. jacobian: (n, n+m). switches: k of them. slopes: (k, n+m), NaN where not known.
+      state: (n,) at its end. jacobian: (n, n+m). switches: k switches. slopes: (k, n+m), NaN if unknown.
       certain: whether all differences stayed in the mode.
     """
 
@@ -76,7 +76,8 @@ class ContactModes:
     """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
 
     Args:
-      model: of the physics. actuators: ids of those that are controlled. substeps: physics steps of a control period.
+      model: model of the physics. actuators: ids of the controlled actuators. substeps: physics steps of a control
+        period.
     """
 
     def __init__(self, model: mujoco.MjModel, actuators: tuple[int, ...], substeps: int) -> None:
@@ -89,7 +90,7 @@ class ContactModes:
 
     @staticmethod
     def known_for(model: mujoco.MjModel) -> bool:
-        """Whether all that switches is known: with joints that slide or turn, and pyramids of friction."""
+        """Whether all switches are known: joints only slide or turn, and friction cones are pyramids."""
         turning = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
         dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
         elliptic = model.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
@@ -112,7 +113,7 @@ class ContactModes:
         return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
 
     def _runge_kutta(self, stage: int, found: list[tuple[Names, Array]]) -> None:
-        """A physics step of `mj_RungeKutta`, whose four stages each have contacts of their own."""
+        """A physics step of `mj_RungeKutta`, whose four stages each have their own contacts."""
         model, data, h = self._model, self._data, self._model.opt.timestep
         qpos, qvel, time = data.qpos.copy(), data.qvel.copy(), data.time
         mujoco.mj_forward(model, data)
@@ -148,7 +149,7 @@ class ContactModes:
         if data.nefc == 0:
             return
         limits, contacts = np.isin(data.efc_type, _LIMITS), np.isin(data.efc_type, _CONTACTS)
-        excess = np.empty(data.nefc)  # of acceleration, above what the constraint wants; it pushes if this is negative
+        excess = np.empty(data.nefc)  # acceleration minus the constraint's reference; it pushes if this is negative
         mujoco.mj_mulJacVec(model, data, excess, data.qacc)
         excess -= data.efc_aref
         if limits.any():
@@ -162,7 +163,7 @@ class ContactModes:
     def linearize(self, state: Array, control: Array) -> Period:
         """The control period and its derivatives, by differences that stay in its contact mode.
 
-        Central ones where both sides do, one-sided ones where one does; smaller ones where neither does.
+        Differences are central if both sides stay in the mode, one-sided if one side does, and smaller if neither does.
         """
         n, point = len(state), np.concatenate([state, control])
         end, switches = self.step(state, control)
@@ -185,7 +186,7 @@ class ContactModes:
         return Period(end, jacobian, switches, slopes, certain)
 
     def _moved(self, point: Array, k: int, by: float) -> tuple[Array, Switches]:
-        """The period from a state and control, joined, of which one number is another."""
+        """The period from a state and control, joined, with one entry changed."""
         other = point.copy()
         other[k] += by
         n = 2 * self._nv
@@ -193,7 +194,7 @@ class ContactModes:
 
 
 def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.bool_]) -> Names:
-    """Names of the limits in these rows: of a joint or a tendon, which one, and which of its two limits."""
+    """Names of the limits in these rows: a joint or a tendon, its number, and which of its two limits."""
     which, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
     lower = data.efc_J.reshape(data.nefc, -1)[rows].sum(axis=1) > 0  # of a joint
     ropes = which[~joints]
@@ -202,7 +203,7 @@ def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.boo
 
 
 def _contacts(geoms: npt.NDArray[np.int32]) -> Names:
-    """Names of contacts: the two geoms, and which of theirs; with room for the edges of a friction pyramid."""
+    """Names of contacts: the two geoms, and a number; they leave room for the edges of a friction pyramid."""
     pairs = (geoms[:, 0].astype(np.int64) * _GEOM + geoms[:, 1]) * _NUMBER
     earlier = np.array([np.count_nonzero(pairs[:k] == one) for k, one in enumerate(pairs)], dtype=np.int64)
     return _CONTACT + pairs + earlier * _EDGE

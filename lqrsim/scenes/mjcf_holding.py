@@ -10,21 +10,21 @@ import numpy.typing as npt
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import couplings_of
 
-_HELD = 1e-6  # share of the largest force that may be missing for a robot that counts as held
-_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # steps at most, their halves, and m or rad of difference quotients
-_LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
+_HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
+_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
+_LIGHT = 1e-9  # weight of the controls relative to the forces: selects the smallest controls that hold
 
 
 @dataclass(frozen=True)
 class Holding:
-    """Controls, and what they leave.
+    """Controls, and the forces that they leave.
 
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
-      activations: (na,), the states of actuators with which they do: a filter's is its control, an integrator's what it
-        has come to.
-      missed: N or N m, (nv,), the force that each joint is short of; 0 for joints that follow others.
-      held: whether they hold it.
+      activations: (na,), the states of actuators at which they do so: a filter's state is its control, an integrator's
+        the value that it has reached.
+      missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
+      held: whether the controls hold the robot.
     """
 
     controls: Array
@@ -36,7 +36,8 @@ class Holding:
 class _Levels:
     """The variable in which each actuator's force is affine: its control or, if it has one, its activation.
 
-    A filter's and a muscle's activation comes to rest at the control, an integrator's anywhere, with a control of zero.
+    The activation of a filter or a muscle comes to rest at the control; an integrator's anywhere, with a control of
+    zero.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -67,8 +68,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
 
     Actuator forces are assumed to be affine in the controls or activations, like those of motors and servos: inverse
-    dynamics give the required forces, and least squares within the limits finds the controls. `act` counts for
-    actuators of other kinds alone.
+    dynamics give the required forces, and least squares within the limits finds the controls. `act` matters only for
+    actuators of other kinds.
     """
     from scipy.optimize import lsq_linear
 
@@ -94,11 +95,11 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     kept, carried = _carried(model)
     columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
     scale = np.abs(columns).max(axis=0)
-    scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
+    scale[scale == 0] = 1.0  # for example if a state of the actuator comes in between
     rows = np.concatenate([columns / scale, _LIGHT * np.eye(model.nu)])
     aims = np.concatenate([wanted - rest, np.zeros(model.nu)])
     bounds = (low - middle) * scale, (high - middle) * scale
-    tight = bounds[1] - bounds[0] < 1e-12  # which lsq_linear refuses
+    tight = bounds[1] - bounds[0] < 1e-12  # lsq_linear refuses such bounds
     bounds = np.where(tight, -1e-12, bounds[0]), np.where(tight, 1e-12, bounds[1])
     found = middle + lsq_linear(rows, aims, bounds).x / scale
     found = np.clip(found, low, high)
@@ -110,10 +111,10 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
-    """Positions (nq,) nearby at which what no actuator drives is at rest, and the largest force (N, N m) left on it.
+    """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
-    Newton's method, with the smallest steps: contacts are springs, and nothing moves in a free direction, such as along
-    a floor.
+    It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
+    as along a floor.
     """
     data, levels = mujoco.MjData(model), _Levels(model)
     data.qpos[:] = qpos
@@ -154,7 +155,7 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
 
 
 def _carried(model: mujoco.MjModel) -> tuple[npt.NDArray[np.intp], Array]:
-    """The free joints, and the map from forces on all joints to those on them, (free, nv), through couplings."""
+    """The free joints, and the map from forces on all joints to forces on these, (free, nv), through couplings."""
     moves, coupled = np.eye(model.nv), couplings_of(model)
     for one in coupled:
         moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0
@@ -163,7 +164,7 @@ def _carried(model: mujoco.MjModel) -> tuple[npt.NDArray[np.intp], Array]:
 
 
 def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
-    """The largest size of each control, (m,): by its own limits, else by those of its force; 1 without limits."""
+    """The largest size of each control, (m,): from its own limits, else from its force's; 1 without limits."""
     found = np.ones(model.nu)
     for number in range(model.nu):
         gain, gear = abs(float(model.actuator_gainprm[number, 0])), abs(float(model.actuator_gear[number, 0]))

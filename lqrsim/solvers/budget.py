@@ -210,7 +210,7 @@ def reported(what: str, found: Callable[[], str], told: Callable[[], float] = la
       what: name of the activity, such as "smooth".
       found: function that returns the results so far, and the time that is left, as text.
       told: function that returns the time at which the caller was last told otherwise, on the clock of
-      `time.perf_counter`.
+        `time.perf_counter`.
     """
     ended, begun = threading.Event(), time.perf_counter()
 

@@ -253,7 +253,7 @@ class ConstraintMultipliers:
       term: the constraint. margin, price: as given; the margin of an equality is 0. first: the first step at which it
         acts.
       array: all numbers, in the layout of `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) the multipliers in
-      it.
+        it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:

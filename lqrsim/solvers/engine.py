@@ -218,7 +218,7 @@ class RunResult:
     Attributes:
       cost: cost of the plan, as in the log; infinite without a plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, in the form for
-      `assemble`.
+        `assemble`.
       final: whether no other start can do better.
       stuck: whether the violation no longer falls, however large the penalty.
       against: in words, the constraints and limits that conflict with the violated constraints, the strongest first.

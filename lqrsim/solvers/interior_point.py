@@ -212,7 +212,7 @@ class InteriorPoint:
       barrier: initial barrier parameter of each row, as a fraction of the cost divided by the number of rows.
       room: the least initial slack: relative to a row's size, or to a control's range.
       price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
-      hold.
+        hold.
       multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
       stages: stages of the same problem, to be reused.
 
@@ -279,7 +279,7 @@ class InteriorPoint:
 
         Args:
           tolerance: tolerance of stationarity, gaps and complementarity. violation: tolerance of the constraints, in
-          their units.
+            their units.
           most: largest number of iterations. near: whether the plan may be next to the answer. watch: called with the
             measures after each iteration; True ends the run.
         """

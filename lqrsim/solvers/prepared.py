@@ -345,7 +345,7 @@ class _Best:
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: cost-to-go of the law; None if unknown.
       multipliers: multipliers with which it was found. cost, violation: its cost and violation. before: the cost of the
-      first plan.
+        first plan.
       improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
     """
 

@@ -109,7 +109,7 @@ def restore(
 
     Args:
       price: price of violating a constraint by its typical size, in units of the typical cost. most: largest number of
-      iterations.
+        iterations.
       watch: called after each iteration with cost, violation and relative predicted decrease; True ends the descent.
       stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
         stationary. It gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends

@@ -56,9 +56,9 @@ def smooth(
 
     Args:
       problem: a problem with an initial cost, the paper's soft start, or with a `FixedState`, which only the dual form
-      supports.
+        supports.
       form: "dual" represents the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's
-      form.
+        form.
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so "backward" adds one pass.
         From controls, "backward" runs the dynamics backwards in time, from the minimiser of the final cost. The
         dynamics of an MJCF cannot run backwards, and are run forwards.

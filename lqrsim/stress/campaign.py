@@ -85,7 +85,7 @@ def run_campaign(
         folder.
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
       progress: called with the number of finished trials and the number of all trials, at the start and after each
-      shard.
+        shard.
 
     Raises:
       InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder

@@ -202,8 +202,7 @@ def _gradients(score: Score, best: Array, pairs: int, spread: float, rng: np.ran
 
 
 def _remaining(halves: Array) -> float:
-    """Share of the distance to a plane that could still be gained without the noise of the gradient; NaN if the halves
-    disagree."""
+    """Fraction of the distance to a plane that could still be gained without gradient noise; NaN if halves disagree."""
     lengths = float(np.linalg.norm(halves[0]) * np.linalg.norm(halves[1]))
     agree = float(halves[0] @ halves[1]) / lengths if lengths > 0 else 0.0
     return 1 - float(np.sqrt(2 * agree / (1 + agree))) if agree > 0 else float("nan")

@@ -166,7 +166,7 @@ class ReliabilityProblem:
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level that the pilot run finds.
           progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
-          far as text.
+            far as text.
 
         Returns:
           The probability with its interval, and the failures that were found.
@@ -201,7 +201,7 @@ class ReliabilityProblem:
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
-          text.
+            text.
 
         Returns:
           The failure, its distance, and the contribution of each disturbance.

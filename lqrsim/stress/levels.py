@@ -102,7 +102,7 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
       runs: (level, numbers of the trials (K,)) -> whether each succeeds. Trials with different numbers are independent;
         a trial has the same random numbers at all levels.
       guess: level at which the pilot begins. largest: largest level that is tried. rate: tested rate, for the text of
-      the reason.
+        the reason.
     """
     pilot = _Pilot(runs, test)
     aimed = pilot.level(min(guess, largest), largest)

@@ -97,7 +97,7 @@ def failure_probability(
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds.
       progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so far
-      as text.
+        as text.
 
     Raises:
       InputError: an option is out of range, or a score is NaN.

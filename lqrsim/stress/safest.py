@@ -49,7 +49,7 @@ class SafestPlan:
       solution: the solution with that plan.
       compared: all plans that were compared, the best first.
       reached: its success rate in fresh trials, with the exact interval. The trials by which it was selected would be
-      biased.
+        biased.
     """
 
     solution: Solution

@@ -74,7 +74,7 @@ class Saturation(Disturbance):
 
     Args:
       lowest: lower limits in the control's unit, within the robot's limits: one number, or one per control. None keeps
-      the robot's lower limits.
+        the robot's lower limits.
       highest: the upper limits, in the same form.
       share: in place of lowest and highest, the remaining fraction of the robot's own limits, 0 to 1.
       strength: interpolates from the robot's own limits (0) to these (1), and beyond, until they meet.
