@@ -1,4 +1,4 @@
-"""The versions and the processor that the bits of a result depend on; every saved result has them."""
+"""The versions and the processor that the bits of a result depend on; they are in every saved result."""
 
 import platform
 import re
@@ -20,7 +20,7 @@ def versions() -> dict[str, str]:
 
 
 def changed(was: Mapping[str, str]) -> str:
-    """The versions that have changed, as `name new (was old)`; empty if none has."""
+    """The versions that have changed, as `name new (was old)`; empty if none has changed."""
     now = versions()
     names = [*now, *(name for name in was if name not in now)]
     return ", ".join(
@@ -30,12 +30,12 @@ def changed(was: Mapping[str, str]) -> str:
 
 @cache
 def outdated() -> str:
-    """A line on the packages that are older than lqrsim needs, as another package may have asked for; else empty."""
+    """A line on packages that are older than lqrsim needs, as another package may require; else empty."""
     try:
         needs = requires("lqrsim") or []
     except PackageNotFoundError:  # a copy of the source that is not installed
         return ""
-    bounds = [re.fullmatch(r"([\w.-]+)>=([\d.]+)", need) for need in needs]  # not those of extras
+    bounds = [re.fullmatch(r"([\w.-]+)>=([\d.]+)", need) for need in needs]  # requirements of extras are left out
     least = {bound[1]: bound[2] for bound in bounds if bound}
     older = {
         name: found for name, found in versions_of(*least).items()

@@ -109,7 +109,7 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     """The outcomes of a rollout's trials, as in the tables of a stress test.
 
     Args:
-      problem: for the costs; there are none without it, or if it has another horizon.
+      problem: the problem, for the costs; without it, or with another horizon, there are no costs.
     """
     from lqrsim.stress.outcome_table import outcomes
 
@@ -133,7 +133,7 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
 
 
 def of_verification(found: "Verification") -> Object:
-    """All fields of a verification, the positions in every frame included."""
+    """All fields of a verification, including the positions in every frame."""
     return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)} | {"passed": found.passed}
 
 

@@ -25,7 +25,7 @@ TAKEN = {
 class New:
     """Write the files of a new robot.
 
-    The folder has an MJCF, dynamics, a scenario and a test. They work as they are: a disc is pushed round a crate.
+    The folder contains an MJCF, dynamics, a scenario and a test. They work unchanged: a disc is pushed round a crate.
     Prints the commands that solve, simulate, render and test it. docs/new_robot.md says what to change.
     """
 
@@ -92,7 +92,7 @@ class Export:
         from lqrsim.results.export_c import export_c
 
         console.check_output("--c", self.c)
-        policy: Any = save_load.load(self.policy)  # what cannot be exported is refused
+        policy: Any = save_load.load(self.policy)  # `export_c` refuses anything that cannot be exported
         found = export_c(
             policy, self.c, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
         )

@@ -133,7 +133,7 @@ class Solve:
         return 0 if solution.success else 1
 
     def _start(self, scenario: "Scenario") -> "StartLike":
-        """The start of the solve. Raises InputError for several, or one that the scenario does not have."""
+        """The start of the solve. Raises InputError for several starts, or a start that the scenario lacks."""
         from lqrsim.errors import InputError
         from lqrsim.scenarios.solutions import stored_start
 

@@ -308,7 +308,7 @@ class Verify:
         solution = None
         if self.solution or os.path.isfile(beside):
             solution = save_load.load(self.solution or beside, Solution)
-            # The solution file beside a run may belong to another run; one that is given is used in any case.
+            # The solution file next to a run may belong to another run; a given solution is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:

@@ -69,8 +69,8 @@ class OffsetFree(Controller):
     Its run, a rollout's `controller_run`, has these attributes:
 
     - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot; else
-    None. They are NaN at knots whose measurement was not used: the last knot, and one more for each period of latency.
-    The covariances of their errors are `filter.corrected`.
+      None. They are NaN at knots whose measurement was not used: the last knot, and one more for each period of
+      latency. The covariances of their errors are `filter.corrected`.
     - `innovations`: with `record`, the differences between measurements and predictions, (T+1, K, Y), with the
       covariances `filter.innovation`. They are also NaN where a measurement got lost. Both covariances belong to the
       first plan: with `replan_every` they hold up to a run's first solve.

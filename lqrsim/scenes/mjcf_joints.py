@@ -147,8 +147,7 @@ def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def _unit(model: mujoco.MjModel, number: int) -> str:
-    """The unit of a control, for plain motors and servos of joints; empty for others, whose unit depends on their
-    use."""
+    """The unit of a control, for plain motors and servos of joints; empty for others, which have no fixed unit."""
     joint = int(model.actuator_trnid[number, 0])
     gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
     if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:

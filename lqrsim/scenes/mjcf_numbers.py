@@ -99,8 +99,7 @@ def _state_masses(
     model: mujoco.MjModel,
     scales: Mapping[str, float],
 ) -> None:
-    """Write the mass and inertia of each body, times its scale: as compiled, in place of the elements that they came
-    from."""
+    """Write the compiled mass and inertia of each body, times its scale, in place of the elements they came from."""
     for name, body in bodies.items():
         for inertial in body.findall("inertial"):
             body.remove(inertial)
