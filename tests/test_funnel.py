@@ -170,7 +170,7 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
         ({"controller": 3}, "controller"),
         ({"progress": 3}, "progress"),
         ({"plant": 3}, "plant"),
-        ({"solution": replace(PLAN, cost_to_go=None)}, "without a cost-to-go"),
+        ({"solution": replace(PLAN, cost_to_go=None)}, "shape: got none and no cost-to-go"),
     ],
 )
 def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:

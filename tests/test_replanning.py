@@ -123,7 +123,7 @@ class TestPreparedSolver:
         self, stated: ls.Problem, solver: ls.types.PreparedSolver, solution: Any
     ) -> None:
         other = replace(stated, stage_cost=ls.ControlCost([0.1, 0.1]))
-        with pytest.raises(ls.InputError, match="problem: got one of another structure"):
+        with pytest.raises(ls.InputError, match="problem: got another structure"):
             solver.solve(np.zeros(4), solution, problem=other)
         with pytest.raises(ls.InputError, match=r"start: gain: got shape \(20, 2, 4\), want \(17, 2, 4\)"):
             solver.solve(np.zeros(4), solution, after=3)
@@ -353,7 +353,7 @@ class TestLive:
                 ready(planner)
             planner.step(solution.trajectory.states[4], 4 * DT)
             assert np.abs(planner.active.plan.trajectory.states[-1] - (2, 1.5, 0, 0)).max() < 0.2
-            with pytest.raises(ls.InputError, match="problem: got one of another structure"):
+            with pytest.raises(ls.InputError, match="problem: got another structure"):
                 planner.change(constraints=())
             with pytest.raises(ls.InputError, match="change: got gaol, want fields of a Problem: dynamics, dt"):
                 planner.change(gaol=1)

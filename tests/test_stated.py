@@ -235,7 +235,7 @@ def test_a_plan_with_a_clearance_is_tracked_but_not_planned_again_without_it(
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ("--controller track --open-loop", "--open-loop: got it with --controller track, want one of them"),
+        ("--controller track --open-loop", "--open-loop: got --controller track as well, want one of the two"),
         ("--design-disturbances light", "design_disturbances: got them with feedback, want track or offset_free"),
         ("--controller track --design-disturbances gale", "disturbances: got 'gale', want one of: scenario, calm"),
     ],

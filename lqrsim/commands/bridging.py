@@ -84,7 +84,7 @@ class Bridge:
 
         solution = save_load.load(self.policy, Solution)
         if not self.scenario and not solution.scenario:
-            raise InputError("--scenario: got none, and the solution names none, want the one to run with --robot")
+            raise InputError("--scenario: got none, and the solution names none, want the scenario to run with --robot")
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
         with bridge.SimulatedRobot(solution, **topics) as robot:
             rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough(None, None))

@@ -145,7 +145,7 @@ class Solve:
             return stored_start(scenario, self.start)
         if self.paper_start:
             if scenario.paper_start is None:
-                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario of the paper")
+                raise InputError(f"--paper-start: got {scenario.name}, want a scenario of the paper")
             return scenario.paper_start
         return None if self.starts is not None else scenario.start
 
@@ -210,13 +210,13 @@ class Simulate:
         from lqrsim.stress.policies import check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
-            raise InputError(f"--open-loop: got it with --controller {self.controller}, want one of them")
+            raise InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
         solution = save_load.load(self.solution, Solution)
         if not self.scenario and not solution.scenario:
             raise InputError(
-                "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
+                "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
             )
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
         if self.open_loop:

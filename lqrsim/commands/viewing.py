@@ -88,7 +88,7 @@ class Render:
         if out.suffix.lower() not in (".mp4", ".gif", ".png"):
             raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png or .rrd")
         if not is_still and (self.time is not None or self.every is not None):
-            raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they belong to stills")
+            raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
         console.check_output("--out", out.parent, out.name)
         runs = [save_load.load(path, Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:

@@ -139,7 +139,7 @@ def smooth_chance_constrained(
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.kept:
-        raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
+        raise InputError("problem: got a problem without obstacles, want an ObstacleCost or a Clearance in it")
     search = _Search(problem, uncertainty, chance, controller, surroundings)
     most = rounds + (len(HEAVIER) if problem.obstacle_costs else 0)
 

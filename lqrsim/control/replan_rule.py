@@ -227,7 +227,7 @@ class ReplanRule:
         dynamics, plan = problem.dynamics, solution.trajectory
         spaces = solution.policy.state_coordinates.names, solution.policy.control_coordinates.names
         if spaces != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
-            raise InputError(f"{who}: solution: got one of another system, want the problem's")
+            raise InputError(f"{who}: solution: got a solution of another system, want the problem's")
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
             raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")

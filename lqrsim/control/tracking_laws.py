@@ -153,7 +153,7 @@ def check_plan(who: str, problem: Problem, solution: Solution) -> None:
     dynamics, policy, plan = problem.dynamics, solution.policy, solution.trajectory
     names = policy.state_coordinates.names, policy.control_coordinates.names
     if names != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
-        raise InputError(f"{who}: solution: got one of another system, want the problem's")
+        raise InputError(f"{who}: solution: got a solution of another system, want the problem's")
     if plan.dt != problem.dt:
         raise InputError(
             f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"

@@ -99,7 +99,7 @@ class Tube:
         if not self.state_coordinates.position:
             raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan, want a run of the tube's plan")
+            raise InputError("rollout: got a run of another plan, want a run of the tube's plan")
         return replace(rollout, tube=self.position_covariance, collision_chance=self.step_chance)
 
 

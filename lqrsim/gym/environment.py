@@ -225,7 +225,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         seed, options = None if seed is None else check_seed("seed", seed), reset_options(options)
         mask = options.pop("reset_mask", None)
         if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
-            raise InputError("options: reset_mask: got some of the episodes, want all: they begin together")
+            raise InputError("options: reset_mask: got a part of the episodes, want all: they begin together")
         super().reset(seed=seed)
         count, frames, threads = self.num_envs, self._frames, self._threads
         episode = self._begin(seed, self.np_random, options, count, frames=frames, threads=threads)

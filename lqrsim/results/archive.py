@@ -144,12 +144,12 @@ class Archive:
             if name == member.filename or member.orig_filename != member.filename:
                 raise InputError(f"{excerpt(member.orig_filename)}: got a part that is no array, want arrays only")
             if name in self._members:
-                raise InputError(f"{excerpt(name)}: got it twice, want it once")
+                raise InputError(f"{excerpt(name)}: got two parts of this name, want one")
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or member.flag_bits & 0x1:
                 raise InputError(f"{excerpt(name)}: got an array in another compression, want it deflated or stored")
             self._members[name] = member
         if META not in self._members:
-            raise InputError(f"{META}: got none, want a file that lqrsim wrote, which has one")
+            raise InputError(f"{META}: got a file without it, want a file that lqrsim wrote")
         if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
             raise InputError(f"size: got {total:,} bytes, want at most {_limit(size):,} in a file of {size:,}")
         self.headers = {name: self._header(name) for name in self._members if name != META}

@@ -194,7 +194,7 @@ class Funnel:
         """
         check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan, want a run of the funnel's plan")
+            raise InputError("rollout: got a run of another plan, want a run of the funnel's plan")
         inside = np.array([self.contains(rollout.states[:, i], t) for i, t in enumerate(self.plan.times)])
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 

@@ -173,7 +173,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         elif said.dtype is not None and field in arrays:
             found[name] = arrays.pop(field)
         elif (kind, name) not in LATER:
-            raise InputError(f"{field}: got none, want it")
+            raise InputError(f"{field}: got nothing, want this field")
     if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
         raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
     try:

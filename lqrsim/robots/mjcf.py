@@ -250,7 +250,7 @@ class MjcfRobot(Robot):
         place, left = settled(model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
             raise InputError(
-                f"state: got one with no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
+                f"state: got no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
                 " robot touches its support"
             )
         found = state.copy()

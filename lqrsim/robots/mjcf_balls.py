@@ -32,7 +32,7 @@ class MjcfBalls(CollisionSpheres):
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
         if not isinstance(dynamics, MjcfDynamics):
-            raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+            raise InputError(f"balls: got an MJCF's balls for {dynamics.name}, want its own dynamics, robot.dynamics")
         memory = MjcfMemory.of(dynamics)
         positions = dynamics.physics.model.nv
         data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])

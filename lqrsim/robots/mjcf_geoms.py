@@ -100,7 +100,7 @@ class MjcfGeoms(CollisionGeoms):
     def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
         """The dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
         if not isinstance(dynamics, MjcfDynamics):
-            raise InputError(f"geoms: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+            raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
         if world is self.scene.world:
             return dynamics, np.arange(len(world))
         known = {one.name: (number, one) for number, one in enumerate(self.scene.world.obstacles)}

@@ -77,7 +77,7 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         if name == WHOLE:
             scales |= dict.fromkeys(_heavy(model), ratio)
             if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
-                raise InputError(f"{what}: {WHOLE}: got it together with {other}, want the mass of all or of bodies")
+                raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
         elif one.what == "mass":
             scales[one.part] = ratio
         elif one.what in _OF_JOINTS:

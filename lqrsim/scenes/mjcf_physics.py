@@ -132,7 +132,7 @@ def _check(model: mujoco.MjModel, name: str) -> None:
             f"got {'none' if bent is None else _equality(model, bent)}",
             'only <joint> with polycoef="a b", which couples two joints linearly, or active="false"',
         ),
-        "plugins": (model.npluginstate > 0, "got some with states of their own", "none"),
+        "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
         "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),
     }
     for what, (found, got, wanted) in refused.items():

@@ -182,7 +182,7 @@ class World:
             return self
         if offset is None and plane not in ("xy", "yx"):
             raise InputError(
-                f"offset: got none for the plane {plane!r}, want where it is along its third axis, in metres"
+                f"offset: got none for the plane {plane!r}, want its coordinate along the third axis, in metres"
             )
         seen = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
         if plane == "xy" and offset is None:

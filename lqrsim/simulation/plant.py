@@ -279,7 +279,7 @@ class Plant:
             # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
             again = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
-            raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None
+            raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
         if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
             raise InputError(f"scene {self.scene.name}: got a model that differs from its xml, want one of load_scene")

@@ -196,7 +196,7 @@ def _checked(problem: Problem, robot: Robot) -> Problem:
     for what in ("state_coordinates", "control_coordinates"):
         found, own = getattr(problem.dynamics, what).names, getattr(robot.dynamics, what).names
         if found != own:
-            raise InputError(f"problem: got one with {excerpt(found)}, want one with {excerpt(own)}, as the robot has")
+            raise InputError(f"problem: got {what} {excerpt(found)}, want {excerpt(own)}, as the robot has")
     return problem
 
 

@@ -139,16 +139,16 @@ def _check_plan(given: Plan, plant: Plant) -> None:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
-        raise InputError(f"plan: got one with {shapes}, want {n} states and {m} controls, as the robot has")
+        raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
     if not plan.finite:
-        raise InputError(f"plan: got one that is not finite ({given.status.name}), want one that can be run")
+        raise InputError(f"plan: got a plan that is not finite ({given.status.name}), want one that can be run")
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
     """Raise InputError for a run that takes too many physics steps or too much memory."""
     if plan.steps * substeps > MOST_STEPS:
         raise InputError(
-            f"plan: got one with {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
+            f"plan: got {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
             f" physics steps, want at most {MOST_STEPS}"
         )
     n, m = plan.states.shape[1], plan.controls.shape[1]

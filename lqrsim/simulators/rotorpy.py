@@ -58,7 +58,7 @@ class RotorPy(Simulator):
         if not isinstance(vehicle, Mapping):
             raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want a name, or RotorPy's quad_params")
         if missing := [key for key in (*POSITIVE, "rotor_pos", "rotor_directions") if key not in vehicle]:
-            raise InputError(f"RotorPy: vehicle: got one without {', '.join(missing)}, want RotorPy's quad_params")
+            raise InputError(f"RotorPy: vehicle: got a dict without {', '.join(missing)}, want RotorPy's quad_params")
         for key in POSITIVE:
             check_number(f"RotorPy: vehicle: {key}", vehicle[key], above=0.0)
         for key in ("rotor_speed_min", "k_d"):

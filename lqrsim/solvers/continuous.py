@@ -166,9 +166,9 @@ def smooth_continuous(
             " the primal form has no other start"
         )
     if problem.constraints:
-        raise InputError("constraints: got some, want none in continuous time; use `smooth`, which keeps them")
+        raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
     if problem.noise is not None:
-        raise InputError("noise: got some, want none in continuous time; use `smooth`: noise is per control period")
+        raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
     if problem.dynamics.discrete:
         raise InputError(f"dynamics: got {problem.dynamics.name}, which has no rate xdot; use `smooth`")
     limits = _Limits(

@@ -126,7 +126,7 @@ def _check(problem: Problem, settings: Settings) -> None:
         raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
     if problem.constraints:
         raise InputError(
-            "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"
+            "constraints: got a problem with constraints, want none for ilqr, which keeps only limits; use smooth"
         )
     if problem.start is None:
         raise InputError(

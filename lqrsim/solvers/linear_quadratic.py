@@ -196,7 +196,7 @@ def _parts(stage: Stage) -> tuple[Array, ...]:
     """The stage's arrays. Raises InputError unless there is one stage per step."""
     check_kind("stage", stage, Stage, "a Stage")
     if np.ndim(stage.B) != 3:
-        raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
+        raise InputError("stage: got a single stage, want one stage per step: B of shape (T, n, m)")
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
 
 

@@ -77,7 +77,7 @@ class PreparedSolver:
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
         check_problem(problem)
         if problem.duration is not None:
-            raise InputError("problem: got one with a free duration, want a fixed one for solves in real time")
+            raise InputError("problem: got a free duration, want a fixed one for solves in real time")
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates
@@ -128,7 +128,7 @@ class PreparedSolver:
         check_problem(problem)
         if compiled.structure(problem) != self._structure:
             raise InputError(
-                "problem: got one of another structure, want the prepared one with other numbers: goal, weights,"
+                "problem: got another structure, want the prepared one with other numbers: goal, weights,"
                 " obstacles, parameters, limits, steps"
             )
         return problem

@@ -35,7 +35,7 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     """
     check_problem(problem)
     if problem.noise is None:
-        raise InputError("problem: got one without noise, want Problem(noise=...), or problem.driven_by(noise)")
+        raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
     check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     plan = solution.trajectory
     wanted = (problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates))

@@ -34,7 +34,7 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     """
     check_problem(problem)
     if problem.noise_term is None:
-        raise InputError("problem: got one without noise, want Problem(noise=...), or problem.driven_by(noise)")
+        raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
     check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     shape = problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates)
     if solution.policy.gain.shape != shape:

@@ -166,7 +166,7 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             raise InputError(f"elastic: got {settings.elastic:g}, want {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     if problem.duration is not None and not settings.second_order(problem):
-        raise InputError('duration: got one without the interior point, want finish="newton" and stop="optimal"')
+        raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
     several = settings.start is None and len(problem.obstacle_costs) > 0
     check_runs(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:

@@ -221,7 +221,7 @@ def _check(manifest: dict[str, Any]) -> None:
     campaign = manifest["campaign"]
     _check_names("campaign", campaign, Campaign)
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
-        raise InputError("cells: got some that are not the campaign's, want each sweep, strength and policy")
+        raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     for policy, hashes in manifest["policies"].items():

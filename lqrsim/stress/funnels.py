@@ -264,7 +264,7 @@ def check_funnel(
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
-        raise InputError("solution: got one with another plan than the funnel's, want the funnel's own solution")
+        raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
     check_count("trials", trials, at_most=MOST_TRIALS)
     shares = check_array("between", between, (2,))
     if not 0 <= shares[0] < shares[1]:
@@ -361,7 +361,7 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     knots, n = plan.states.shape
     if shape is None:
         if solution.cost_to_go is None:
-            raise InputError(f"shape: got none for a solution without a cost-to-go ({solution.status.name}), want one")
+            raise InputError(f"shape: got none and no cost-to-go ({solution.status.name}), want shape=")
         curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
         return np.array([_inverse(one) for one in curve])
     if isinstance(shape, Tube):

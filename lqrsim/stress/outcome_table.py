@@ -95,7 +95,7 @@ def outcomes(
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
     if problem is not None and problem.dynamics.state_coordinates.names != rollout.state_coordinates.names:
         raise InputError(
-            f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}"
+            f"problem: got a problem of another system, want states {', '.join(rollout.state_coordinates.names)}"
         )
     if goal_radius is not None or goal_tolerance is not None:
         rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))

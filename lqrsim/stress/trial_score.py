@@ -92,7 +92,7 @@ class PrescribedDraws:
 
     def __getattr__(self, name: str) -> Any:
         raise InputError(
-            f"disturbance: got one that draws with {name}, want standard_normal, normal, random, uniform, exponential,"
+            f"disturbance: got draws by {name}, want standard_normal, normal, random, uniform, exponential,"
             " integers or choice, which can be made from standard normal numbers"
         )
 

@@ -86,7 +86,7 @@ def of_cost(recorded: RecordedTrial, solution: Solution | None) -> DrawnTube:
     if not run.state_coordinates.position:
         raise InputError("overlays: got cost_tube for a robot without a position, want other overlays")
     if not np.array_equal(solution.trajectory.states, run.plan.states):
-        raise InputError("solution: got one with another plan than the run's, want the Solution that was run")
+        raise InputError("solution: got a plan other than the run's, want the Solution that was run")
     ellipsoids = Ellipsoids.of_cost(solution, run.state_coordinates.position)
     return _tube(recorded, ellipsoids, np.arange(len(ellipsoids.centres)), OF_COST)
 
@@ -101,7 +101,7 @@ def of_funnel(recorded: RecordedTrial, funnel: Funnel | None) -> DrawnFunnel:
     if funnel is None:
         raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
     if not np.array_equal(funnel.plan.states, run.plan.states):
-        raise InputError("funnel: got one with another plan, want a funnel about the plan of the run")
+        raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
     covariances = funnel.position_covariance / SIGMAS**2  # half axes are then those of the level
     every = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
     levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))

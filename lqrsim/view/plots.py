@@ -259,14 +259,12 @@ def plot_policy(
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
-        raise InputError(
-            f"solution: got one without a cost-to-go ({solution.status.name}), want one of a completed solve"
-        )
+        raise InputError(f"solution: got no cost-to-go ({solution.status.name}), want a solution of a completed solve")
     check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
-        raise InputError("tube: got one of another plan, want one of the solution's plan")
+        raise InputError("tube: got a tube of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
-        raise InputError("tube: got one of a robot without a position, want None")
+        raise InputError("tube: got a tube of a robot without a position, want None")
     with style.figure(path, size=(11, 7.5)) as figure:
         draw_policy(figure, solution, world, radius, tube)
     return Path(path)
