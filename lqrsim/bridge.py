@@ -10,7 +10,7 @@ names, types and bytes of ROS 2, so ROS 2 nodes treat them like any others. ROS 
 
 States come from `nav_msgs/msg/Odometry`, from `sensor_msgs/msg/JointState`, or from both. Commands go out as
 `std_msgs/msg/Float64MultiArray`, in the order of the policy's controls and in their units, as the controllers of
-ros2_control take them. Frames are those of REP 103, which are ours: z up; the body's x forward, y to the left.
+ros2_control take them. Frames follow REP 103, as in this package: z up; the body's x forward, y to the left.
 """
 
 import contextlib

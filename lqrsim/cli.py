@@ -34,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      arguments: the words after `lqrsim` on the command line. By default those of this process, which then handles
+      arguments: the words after `lqrsim` on the command line. By default the arguments of this process, which then
+        handles
         signals as a command does: it removes unfinished files and ends.
 
     Returns:

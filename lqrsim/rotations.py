@@ -89,7 +89,7 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
       InputError: the argument is not numbers of this shape.
     """
     rows = vectors_of("quaternion", quaternion, 4)
-    # q and -q are the same rotation; the one with scalar part >= 0 is at most half a turn.
+    # q and -q are the same rotation; with a scalar part >= 0 it is at most half a turn.
     scalar, x, y, z = (rows[..., i] for i in range(4))
     sine = np.sqrt(x * x + y * y + z * z)
     # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.

@@ -14,8 +14,8 @@ class Bridge:
     """Run a policy on a robot, by messages of ROS 2; needs lqrsim[ros].
 
     Reads states from an Odometry or a JointState and publishes a Float64MultiArray in each control period. The safe
-    command is published last: at the end, if states stay away, on an error and on Ctrl-C. docs/bridge.md has units,
-    frames, and what happens when. Exits with 1 if it had to stop early.
+    command is published last: at the end, if states stay away, on an error and on Ctrl-C. docs/bridge.md describes
+    units, frames and reactions to events. Exits with 1 if it had to stop early.
 
       lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --safe 0 0 0 0
       lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --robot  # in place of it

@@ -128,7 +128,7 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
 
 
 def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":
-    """Solve a scenario; print each iteration as it ends, then the status. The options are those of the solver."""
+    """Solve a scenario; print each iteration as it ends, then the status. The options are the solver's options."""
     from lqrsim.results.solution_parts import Iteration
     from lqrsim.scenarios import solutions
 

@@ -26,7 +26,7 @@ class New:
     """Write the files of a new robot.
 
     The folder contains an MJCF, dynamics, a scenario and a test. They work unchanged: a disc is pushed round a crate.
-    Prints the commands that solve, simulate, render and test it. docs/new_robot.md says what to change.
+    Prints the commands that solve, simulate, render and test it. docs/new_robot.md explains the changes to make.
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
@@ -79,7 +79,7 @@ class Export:
     number: Literal["float", "double"] = "float"
     """Type of the numbers, except the time, which is a double."""
     gains: Literal["full", "int16"] = "full"
-    """int16: matrices take 16 bits an entry. What that changes of the commands is printed, and is in the header."""
+    """int16: matrices take 16 bits an entry. The largest change of the commands is printed and in the header."""
     interpolate: bool = False
     """Blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
     name: str = "policy"
@@ -104,7 +104,7 @@ class Export:
 
 
 def check_robot_name(name: str) -> None:
-    """Raise InputError unless the name can be that of a new module."""
+    """Raise InputError unless a new module can have this name."""
     from lqrsim.errors import InputError, excerpt
 
     wanted = "lower-case letters, digits and underscores, beginning with a letter, such as my_robot"

@@ -149,7 +149,7 @@ def _end(running: subprocess.Popen[str]) -> None:
 
 
 def results_page(saved: Mapping[str, Any]) -> str:
-    """All results in Markdown: verdicts on the paper's statements, what was run, and the report of each script."""
+    """All results in Markdown: verdicts on the paper's statements, the runs, and the report of each script."""
     results: dict[str, ScriptResult] = saved["results"]
     statements = [statement for one in results.values() for statement in one["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]

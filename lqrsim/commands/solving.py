@@ -83,7 +83,7 @@ class Solve:
     clearance: Annotated[float | None, optional("METRES")] = None
     """Constrain the distance to all obstacles to at least this, at the steps. By default obstacles only add cost."""
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
-    """Limits of every control for planning, in its unit. By default those of the actuators."""
+    """Limits of every control for planning, in its unit. By default the actuators' limits."""
     figure: Annotated[Path | None, optional("FILE")] = None
     """Also plot the policy to FILE.png, .pdf or .svg: the predicted tube under the scenario's disturbances, the
     cost-to-go along the plan, and the gains over time."""
@@ -169,7 +169,7 @@ class Simulate:
     """Robot and scene, as in `lqrsim solve`. By default the scenario that was solved, if `lqrsim list` has it. Files
     never choose code to run: name your own function here."""
     out: Folder = None
-    """Folder for rollout.npz. By default that of the solution."""
+    """Folder for rollout.npz. By default the folder of the solution."""
     open_loop: bool = False
     """Run the plan without feedback: its controls, whatever the state."""
     controller: ControllerName = "feedback"
@@ -178,7 +178,7 @@ class Simulate:
     design_disturbances: DesignSet = None
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
-    those of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
+    the set of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
     strength: Strength = 1.0
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""

@@ -60,7 +60,7 @@ class Render:
     quality: Quality = "standard"
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
-    """In pixels. By default that of the quality, and half of it for a GIF, but not less than 480 x 270."""
+    """In pixels. By default the size of the quality, and half of it for a GIF, but not less than 480 x 270."""
     fps: Annotated[float | None, optional("RATE")] = None
     """Frames per second of a video. By default 30, and 15 for a GIF."""
     speed: float = 1.0

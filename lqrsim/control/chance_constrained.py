@@ -279,7 +279,7 @@ class _Search:
         if self.make is not None:
             return self.make(problem, solution)
         law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
-        if len(self.plans) == 1:  # one law for all later plans, so that of two plans the one with more room is safer
+        if len(self.plans) == 1:  # one law for all later plans, so that the plan with more room is safer
             self.tolerate = tuple((law.weights.state**-0.5).tolist())
         return law
 

@@ -74,7 +74,7 @@ class Surroundings:
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
         """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p) and its variance (O,).
 
-        With balls, the distance is that of the ball nearest to the obstacle.
+        With balls, the distance is measured from the ball nearest to the obstacle.
         """
         if not self.shapes:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)

@@ -89,7 +89,7 @@ class FilterRun(ControllerRun):
 
     def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
         self.law, self.first = law, 0
-        self.model = law.model  # for predictions, independent of what a later plan assumes about the unknowns
+        self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
         # If the first measurement is lost, the plan's first state is shown.

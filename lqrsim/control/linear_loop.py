@@ -3,7 +3,7 @@
 The true state and the estimate are jointly Gaussian: X = (z, zhat), with zhat before the measurement of the same knot.
 For a law without an estimate X = z. Control limits enter by statistical linearisation: for u normal with mean mu and
 std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
-For lost commands the moments are exact, those of a mixture; the distribution itself is not Gaussian.
+For lost commands the moments of the mixture are exact; the distribution itself is not Gaussian.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Re-planning: the rule that says what is solved, when and from which state; and the log of the solves.
+"""Re-planning: the rule that determines the problem, time and start of each solve; and the log of the solves.
 
 `replanner.py` applies the rule in simulations or on a robot. `replanned.py` applies it within output feedback.
 """

@@ -54,7 +54,7 @@ class LiveReplanner:
     used, and the previous law continues. Everything is compiled before the first step.
 
     Args:
-      rule: the rule that says what is solved, when and from which state.
+      rule: the rule that determines the problem, time and start of each solve.
       interpolate: as in `Replanner.live`.
       clock: as in `Replanner.live`.
 

@@ -170,7 +170,7 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits
 def of_states(model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array]) -> StateMoments:
     """Moments under C laws of the measured states, (C, T, m, n) and (C, T, m), in deviations from the plan.
 
-    The moments are those of `linear_loop.py`. No law moves the unknowns: their rows are the same for all, and of the
+    `linear_loop.py` defines the moments. No law moves the unknowns: their rows are the same for all, and of the
     covariance's next one only the rows for the state and the actuators are computed.
     """
     n, own, steps, count, size = model.n, model.n + model.lagging, model.plan.steps, len(gain), model.size
@@ -240,8 +240,8 @@ def track(
         the ratios to one another and to `effort` matter. By default, the tolerances with which the robot is least
         likely to fail under the uncertainty.
       effort: the largest change of each control for returning to the plan; by default a quarter of its range.
-      at_end: factor on the tolerances of the position at the end of the plan; on those of all states if there is no
-        position.
+      at_end: factor on the tolerances of the position at the end of the plan; on the tolerances of all states if there
+        is no position.
       uncertainty: the uncertainty in a run, as from `uncertainty_of`. It serves for choosing tolerances, and for the
         effect of lost commands.
       risk: theta: minimise (1/theta) log E exp(theta/2 * sum of squares) under the problem's noise along the plan. A

@@ -50,7 +50,8 @@ class Weights:
         """The weights for tolerances in the states' units and efforts (m,) in the controls'.
 
         Args:
-          at_end: factor on the tolerances of the position at the end; on those of all states if there is no position.
+          at_end: factor on the tolerances of the position at the end; on the tolerances of all states if there is no
+            position.
 
         Raises:
           InputError: there is no such name or unit, or a tolerance is not positive.

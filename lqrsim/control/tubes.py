@@ -117,8 +117,8 @@ def predict_tube(
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
       solution: the solution whose plan is run.
-      uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are those of the samples
-        that stay finite.
+      uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
+        samples that stay finite.
       controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or

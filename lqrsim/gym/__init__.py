@@ -6,8 +6,8 @@
     env = gymnasium.make("lqrsim/Quadrotor-v0", disturbances="moderate")
     env = lqrsim.gym.make_env("my_robot.py:hallway")
 
-Importing this module registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. Where only a
-name can be given, as in a trainer's configuration, "lqrsim.gym:lqrsim/Quadrotor-v0" imports the module, too. Gymnasium
+Importing this module registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. If only a name
+can be given, as in a trainer's configuration, "lqrsim.gym:lqrsim/Quadrotor-v0" imports the module, too. Gymnasium
 has not read entry points since version 1.0.
 """
 

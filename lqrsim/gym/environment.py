@@ -189,7 +189,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
       num_envs: K. threads: number of MuJoCo's threads; by default one per processor.
       frames: whether `rollout()` can be drawn; it takes memory.
 
-    The other arguments are those of `Environment`.
+    The other arguments are the arguments of `Environment`.
 
     Raises:
       InputError: as `Environment` does.

@@ -47,7 +47,7 @@ RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 class Task:
-    """The task of an environment. The arguments are those of `Environment`.
+    """The task of an environment. It takes the arguments of `Environment`.
 
     Attributes:
       scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
@@ -250,7 +250,7 @@ class Episode:
     """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
     Attributes:
-      seed, first: the trials have the numbers `first` to `first + K - 1` of this seed.
+      seed, first: the episodes are the trials `first` to `first + K - 1` of this seed.
       ended: (K,) whether each episode has ended. outcomes: (K,) outcome of each episode; empty while it is running.
     """
 

@@ -4,7 +4,7 @@ A control that is at a limit and would go beyond it is *fixed*: a constant in st
 The backward pass determines which controls are fixed, by minimising within the limits at the expected state. The
 forward pass fixes the same controls. Every control that is applied is clamped. At convergence each control minimises
 the remaining cost within its limits: the first-order conditions hold, up to rounding, without a penalty or a
-multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
+multiplier. iLQR's steps become steps of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control

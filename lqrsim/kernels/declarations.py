@@ -1,7 +1,8 @@
 """The names that kernels are written against. They get a meaning only when the kernels are compiled.
 
-Sizes become constants. The words of the language become what `codegen/language.py` defines. Open functions become those
-of dynamics, costs, constraints, noise and sensors, and of the form of the cost-to-come; see `codegen/sources.py`. All
+Sizes become constants. The words of the language become what `codegen/language.py` defines. Open functions become the
+functions of dynamics, costs, constraints, noise and sensors, and of the form of the cost-to-come; see
+`codegen/sources.py`. All
 names are declared here so that each kernel can be read, linted and type-checked on its own.
 """
 

@@ -308,7 +308,7 @@ def copy_between(source, target, first, count):
 
 
 def read_from(near, p, one, out):
-    """Write the state of an MjData, with the rotation vectors nearest to those of `near`; NaN if invalid."""
+    """Write the state of an MjData, with the rotation vectors nearest to the vectors in `near`; NaN if invalid."""
     nv, na = int(p[NV]), int(p[NA])
     qpos, qvel, act = at(one[QPOS]), at(one[QVEL]), at(one[ACT])
     for k in range(int(p[JOINTS])):
@@ -350,7 +350,7 @@ def write_quaternion(x, first, qpos, q):
 @outline
 @exact
 def rotation_vector_near(qpos, q, near, first, out):
-    """Write the rotation vector of a quaternion to out[first]: the one nearest to that of `near`."""
+    """Write a quaternion's rotation vector to out[first], the vector nearest to the vector in `near`."""
     sine, along, length = 0.0, 0.0, 0.0
     for i in range(3):
         sine += qpos[q + 1 + i] * qpos[q + 1 + i]

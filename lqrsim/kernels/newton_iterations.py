@@ -40,7 +40,8 @@ def newton_iterations(first, last, settings, model, work, memory, log):
 
     If no fraction of a step lowers the merit, the step is repeated without second-order terms. If that also fails, the
     method has stalled.
-    At the end, the value functions are those of smoothing, without second-order terms. They are convex, so that the
+    At the end, the value functions are computed as in smoothing, without second-order terms. They are convex, so that
+    the
     minimum of their sum is at the plan. If it is not, up to MORE further steps follow: in flat directions a plan may be
     far off although the predicted decrease is small.
 

@@ -1,6 +1,6 @@
 """Sweeps along a trajectory: rollouts of a policy, costs, line searches, and the backward pass of iLQR.
 
-Written in the kernels' subset. Shapes and names are those of `passes.py`.
+Written in the kernels' subset. Shapes and names are as in `passes.py`.
 """
 
 from math import isnan, nan

@@ -61,7 +61,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 
 
 def back(fx, after, ahead, share, weights, before):
-    """Write the weights (N,) of a stage's rates, given those of the next stage."""
+    """Write the weights (N,) of a stage's rates, given the next stage's weights."""
     for j in range(N):
         total = 0.0
         for i in range(N):

@@ -139,7 +139,7 @@ class ShapeInWorld:
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).
 
-        Both are those of the nearest ball.
+        Both belong to the nearest ball.
         """
         knots, count, size = np.arange(len(states))[:, None], len(self.radii), states.shape[1]
         if self.centers is None:
@@ -306,5 +306,5 @@ class KeepsClear:
 
 
 def each_once(kept: Sequence[KeepsClear]) -> list[KeepsClear]:
-    """The terms whose obstacles or shape differ from those of all terms before them."""
+    """The terms whose obstacles or shape differ from all terms before them."""
     return list({(id(one.world), *one.shape.items()): one for one in kept}.values())

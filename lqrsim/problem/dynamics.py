@@ -56,7 +56,7 @@ class Dynamics:
 
     Args:
       f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed. The parameters are attributes
-        of p. If x and u are symbols, states and controls are attributes, too: `x.speed` is `x[1]`.
+        of p. If x and u are symbols, states and controls are also attributes: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.

@@ -73,7 +73,7 @@ class Plan:
         """The rest of the plan after `steps` steps, as a start for the next solve: `start=solution.shifted(k)`.
 
         A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
-        end. A "shrinking" horizon has fewer steps. Status, log, cost and digest stay those of the whole plan.
+        end. A "shrinking" horizon has fewer steps. Status, log, cost and digest still describe the whole plan.
 
         Args:
           steps: steps that are over, fewer than the plan has.

@@ -21,7 +21,7 @@ class Solution(Plan):
     """A locally optimal feedback policy, and how it was found.
 
     A `Plan` with the log of the solve. `detail` also says where the safeguard stepped in. The policy and the cost-to-go
-    are those of the last backward pass that was completed.
+    come from the last completed backward pass.
 
     Attributes:
       inverse_policy: the law that follows the optimum backwards from a state of arrival. None from `ilqr`, and with a

@@ -170,8 +170,8 @@ class Iteration:
       seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; "contact modes", see `Certificate.contacts`; with
         constraints or limits "interior point", and "restoration", a descent on cost and penalised violation; in the
-        safeguard "damped", or "ilqr" where its step is that of iLQR; in Newton's method and the safeguard "rejected"
-        (the cost would have risen, or a pass failed; the cost is that of the plan that was kept).
+        safeguard "damped", or "ilqr" if its step is an iLQR step; in Newton's method and the safeguard "rejected"
+        (the cost would have risen, or a pass failed; the cost belongs to the plan that was kept).
     """
 
     cost: float

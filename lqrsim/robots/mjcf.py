@@ -59,7 +59,7 @@ class MjcfRobot(Robot):
 
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
-    and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
+    and `<name>_wx` to `_wz` in body axes; free joints also `<name>_x` to `_z` and `<name>_vx` to `_vz`, without the
     `<name>_` if the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
     angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
     name in the MJCF get a name, such as `unnamed_joint_0`.
@@ -74,7 +74,7 @@ class MjcfRobot(Robot):
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
       body: name of the body on which disturbances act, and whose position is the robot's. By default the first moving
-        body that has mass, either its own or that of bodies fixed to it.
+        body that has mass, its own mass or the mass of bodies fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
         kinematics. () for none.
       radius: radius of a ball about the body's origin that contains everything that may collide; by default the
@@ -291,8 +291,8 @@ class MjcfRobot(Robot):
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
             that are not named then have none.
           effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
-            so that a deviation of that size costs 1/2. The largest value is that of the control limits, else that of
-            the force limits, else 1.
+            so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
+            force limits, else it is 1.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
           limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.

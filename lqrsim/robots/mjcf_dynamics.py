@@ -124,8 +124,8 @@ class MjcfDynamics(Dynamics):
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
 
-        A body's inertia scales with its mass; several numbers of a gear keep their ratios. Forces on the body are
-        parameters, too: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+        A body's inertia scales with its mass; several numbers of a gear keep their ratios. Forces on the body are also
+        parameters: `dynamics.disturbed.with_parameters(force_x=1.0)`.
 
         Raises:
           InputError: there is no such number, the value is out of range, or the mass of all bodies and of a single body

@@ -67,7 +67,7 @@ class Quadrotor(Robot):
 
     @property
     def hover_force(self) -> float:
-        """The force of each rotor in N with which the rotors carry the weight."""
+        """The force of each rotor in hover, in N: a quarter of the weight."""
         return self.mass * self.gravity / 4
 
     @property

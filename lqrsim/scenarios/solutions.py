@@ -124,7 +124,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
 def _check_fits(
     field: str, what: object, scenario: Scenario, states: Coordinates, controls: Coordinates, steps: int
 ) -> None:
-    """Raise InputError unless states, controls and number of steps are those of the scenario's problem."""
+    """Raise InputError unless states, controls and number of steps agree with the scenario's problem."""
     problem = scenario.problem
     wanted = problem.dynamics.state_coordinates, problem.dynamics.control_coordinates
     for kind, got, want in zip(("states", "controls"), (states, controls), wanted, strict=True):

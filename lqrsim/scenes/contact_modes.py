@@ -2,8 +2,8 @@
 
 A contact or a limit begins to act when its distance crosses zero. An active one, or an edge of its friction cone, lets
 go when its force crosses zero. Each of these *switches* is a number that changes sign at the event. As long as no
-switch changes sign, a control period is a smooth function of its state and control. Where a distance changes sign, the
-period is in general discontinuous. Where a force changes sign, it has a kink.
+switch changes sign, a control period is a smooth function of its state and control. If a distance changes sign, the
+period is in general discontinuous. If a force changes sign, it has a kink.
 """
 
 import copy

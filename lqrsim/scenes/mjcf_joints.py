@@ -209,7 +209,7 @@ def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
     if not moving:
         raise InputError(f"{what}: got no joints, want a robot that moves: at least one <joint> or <freejoint/>")
     # Several bodies may each carry a slide before there is any mass. The robot is the first body with mass, its own or
-    # that of bodies fixed to it.
+    # the mass of bodies fixed to it.
     masses = np.bincount(model.body_weldid, weights=model.body_mass, minlength=model.nbody)
     return next((number for number in moving if masses[number] > 0), moving[0])
 

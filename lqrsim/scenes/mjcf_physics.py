@@ -141,7 +141,7 @@ def _check(model: mujoco.MjModel, name: str) -> None:
 
 
 def _equality(model: mujoco.MjModel, number: int) -> str:
-    """An equality constraint as text: its element, its name, and what it constrains."""
+    """An equality constraint as text: its element, its name, and the constrained objects."""
     kind = mujoco.mjtEq(model.eq_type[number]).name.removeprefix("mjEQ_").lower()
     couples = {"joint": mujoco.mjtObj.mjOBJ_JOINT, "tendon": mujoco.mjtObj.mjOBJ_TENDON}
     objects = couples.get(kind, mujoco.mjtObj(model.eq_objtype[number]))

@@ -16,7 +16,7 @@ SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
-# MuJoCo's types without a distance here. Robots from an MJCF use MuJoCo's distances.
+# MuJoCo's types for which no distance is implemented here. Robots from an MJCF use MuJoCo's distances.
 OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 

@@ -76,7 +76,7 @@ def simulate(
         moves through them. This takes a quarter less time, is bit-identical until the collision, and has the same
         outcome. In simulators other than MuJoCo the robot always moves through obstacles.
       threads: number of MuJoCo's threads; by default one per processor.
-      generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
+      generators: (trial, number of the disturbance) -> its random generator, instead of the generators of the seed.
       progress: called after each control period with the number of finished periods and the number of all periods.
       watch: called with each frame: its time, MuJoCo's qpos (K, nq), and which trials are unstable (K,).
 

@@ -167,7 +167,7 @@ class MujocoPhysics(Physics):
                 self.simulations.step(rows, nstep=self._part)
             except batch.SimulationError as error:
                 self.unstable[error.ids] = True
-            # MuJoCo resets an unstable simulation and goes on; only its warnings show it.
+            # MuJoCo resets an unstable simulation and continues; only its warnings show it.
             warned = self.simulations.warning[..., 1]
             if warned.any():
                 self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)

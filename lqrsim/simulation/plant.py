@@ -40,7 +40,8 @@ class Plant:
       simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
       shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
       world: the obstacles for this shape; none for a robot that has neither geoms nor balls nor a position.
-      obstacles: names of the obstacles that the robot can collide with: by default those of `world`. A robot without a
+      obstacles: names of the obstacles that the robot can collide with: by default the obstacles of `world`. A robot
+        without a
         position, or with balls in space, can collide with all that the MJCF lets it touch, except level planes on which
         a free joint, or a slide that is not level, lets it stand.
       model: the compiled scene, with a contact sensor for each obstacle.
@@ -51,7 +52,8 @@ class Plant:
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
-        do not fit these; its position is not that of its body in MuJoCo; or the simulator cannot simulate the robot.
+        do not fit these; its position differs from its body's position in MuJoCo; or the simulator cannot simulate the
+        robot.
     """
 
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:

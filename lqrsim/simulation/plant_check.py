@@ -133,8 +133,8 @@ def check_plant(
       around: (n,) mean of the random states; by default the problem's start, or zero.
       spread: their standard deviation, in each state's unit.
       controls: lowest and highest random control, (m,) each; by default the limits of the problem, or the dynamics'.
-      settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as those of
-        wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
+      settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
+        speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
       tolerance: largest allowed error, relative to the largest change of the state.
       seed: seed of all random numbers.

@@ -50,8 +50,8 @@ def tube_under(
     disturbances: Sequence[Disturbance],
     controller: ControllerLike | None = None,
 ) -> tuple[Tube | None, str]:
-    """Predict the tube of a run if possible. Returns the tube, and a line that says what it leaves out, or why there is
-    none.
+    """Predict the tube of a run if possible. Returns the tube, and a line that lists what the tube leaves out, or says
+    why there is no tube.
 
     Without disturbances there is neither a tube nor a line.
 

@@ -91,7 +91,7 @@ class ActiveSet:
     def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
         """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values.
 
-        The gains are those of a step with a penalty on the active rows, and zero at limits.
+        The gains come from a step with a penalty on the active rows, and zero at limits.
         """
         stages = self.stages
         for share in MIXES:

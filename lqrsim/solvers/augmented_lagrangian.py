@@ -35,7 +35,7 @@ ITERATIONS, ROUNDS = 100, 30  # total number of undamped iterations; rounds of d
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # number of undamped iterations without progress that ends them; factor that counts as progress
-REFINED = 5  # damped iterations from a plan of the search before Newton's method goes on
+REFINED = 5  # damped iterations from a plan of the search before Newton's method continues
 
 
 def finish(run: SolveRun) -> RunResult:
@@ -242,7 +242,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
 
 
 def _forces(own: ConstraintMultipliers, values: Array) -> Array:
-    """The new multipliers: lambda - mu d, for inequalities at least 0; 0 if the row does not act."""
+    """The new multipliers: lambda - mu d, at least 0 for inequalities; 0 if the row is inactive."""
     acting = np.where(np.isinf(values), 0.0, values)
     forces = np.clip(own.values - own.penalty * acting, -own.price if own.term.equality else 0.0, own.price)
     return np.where(np.isinf(values), 0.0, forces)
@@ -283,7 +283,7 @@ class AugmentedLagrangian:
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [own.penalty for own in self._own]  # zero, except those of another solution
+        self._first = [own.penalty for own in self._own]  # zero, except multipliers of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)

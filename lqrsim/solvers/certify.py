@@ -96,7 +96,7 @@ def faults(
 
     Args:
       claimed: the last cost in the log. rest: the rounding error of a cost whose terms cancel.
-      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether the violation is that of
+      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether the violation comes from
         equalities within their tolerance.
     """
     found = []

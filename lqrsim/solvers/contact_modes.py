@@ -5,7 +5,7 @@ descent ends at a *switch*, next to a jump or at a kink: a contact that is just 
 gradient is not zero there, and steps along it cross the switch. Here a switch is an inequality, like a limit of a
 control:
 
-- The model of the cost is that of iLQR, in the offsets of the policy with fixed gains, and derivatives are those of the
+- The model of the cost is iLQR's model, in the offsets of the policy with fixed gains. Derivatives are taken within the
   plan's own mode. The step minimises the model subject to linearised switches, which must keep their sides: a quadratic
   program.
 - A step that still crosses a switch, because the switch is curved, is pushed back to its side.

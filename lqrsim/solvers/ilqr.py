@@ -67,7 +67,7 @@ def ilqr(
       risk: as in `smooth`.
 
     Returns:
-      A Solution, like that of `smooth`, but without cost-to-come and inverse policy. A hard problem raises no
+      A Solution, as `smooth` returns, but without cost-to-come and inverse policy. A hard problem raises no
       exception.
 
     Raises:

@@ -5,7 +5,7 @@ the linearised dynamics, by a Riccati recursion; gaps between the steps of the p
 parameter is reduced by Mehrotra's rule if the last step was long and the measures decrease. Otherwise it is reduced
 when the barrier problem is nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006).
 Corrections with the same models then reduce the residuals of a long step. If a model has no minimum, the Hessian is
-mixed with that of the projected cost until it has one.
+mixed with the Hessian of the projected cost until the model has a minimum.
 
 A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
 row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the

@@ -1,8 +1,8 @@
 """Restoration: descent on an exact penalty, to a plan that violates the constraints least.
 
 A violation costs its size times a price, smoothed by a logarithmic barrier with a decreasing parameter. A separate
-barrier keeps controls within their limits. Steps are those of Newton's method in the Riccati recursion, and are rolled
-out in closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit than the one before. Far
+barrier keeps controls within their limits. Steps are Newton steps by the Riccati recursion, and are rolled out in
+closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit than the previous iterate. Far
 from a solution this is more reliable than the interior point, whose states need not satisfy the dynamics. Near a
 solution it is slower.
 

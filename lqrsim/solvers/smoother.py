@@ -133,7 +133,8 @@ def smooth_many(
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
-    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an iteration
+    The solutions are identical to the solutions of `smooth`, to the last bit, with any number of threads; only the
+    seconds of an iteration
     are an average. Constraints are checked after each iteration. Dynamics and costs in plain Python run one at a time,
     and gain nothing from threads.
 

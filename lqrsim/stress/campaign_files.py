@@ -190,7 +190,7 @@ def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(parse(json.dumps(manifest)))  # without sorting: the order of the sweeps is that of the cells
+    _check(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
 
 

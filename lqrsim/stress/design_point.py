@@ -4,7 +4,7 @@ In reliability analysis this is the design point of FORM, the first-order reliab
 half-space beyond a plane, their probability would be Phi(-|z|), which is FORM's estimate. It is only a hint;
 multilevel_splitting.py measures the probability. The search uses no derivatives, and scores many vectors at once:
 
-1. It begins with given failures, or failures from a splitting, and with their mean, which shows what they share.
+1. It begins with given failures, or failures from a splitting, and with their mean, which shows their common direction.
 2. Along a ray it finds the smallest multiple that fails, on a grid that is refined.
 3. Around the best failure it scores pairs z + s e, z - s e with random e. The mean of (difference of scores) e
    estimates the gradient of the score; estimates of the last rounds are added up. The search then tries rays between
@@ -81,7 +81,7 @@ def smallest_failure(
     Args:
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
-      failures: (k, size), failures to begin with; by default those of a small splitting.
+      failures: (k, size), failures to begin with; by default the failures of a small splitting.
       rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than `tolerance` of
         the distance, and five rounds together gain less than a tenth of that.
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer pairs the gradient is

@@ -12,7 +12,8 @@ For this machine, libraries have these drawbacks:
 
 Here each worker has its own pipe.
 
-On a cluster dask starts workers, distributes tasks, and repeats those of dead workers, up to its `allowed-failures`.
+On a cluster dask starts workers, distributes tasks, and repeats the tasks of dead workers, up to its
+`allowed-failures`.
 Tables come back as bytes, so no folder needs to be shared. This module adds four things: a time limit that counts from
 the moment when a worker begins a task; restarts of workers that hang, because `cancel()` does not stop a running task;
 one task at a time per worker; and at most two queued tasks per worker, so that the scheduler never holds a whole

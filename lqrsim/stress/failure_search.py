@@ -59,7 +59,8 @@ class ReliabilityProblem:
 
     Attributes:
       scenario: as in `lqrsim solve`.
-      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default those of the scenario's demo.
+      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
+        demo.
       strength: factor by which they are scaled.
       policy: as in `Campaign`.
       design_disturbances: the name of the set for which "track" or "offset_free" is designed; by default as in

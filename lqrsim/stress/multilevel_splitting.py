@@ -154,7 +154,7 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
         return rate(round(float(shares.sum()) * particles), count * particles, confidence=confidence)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
-    # Repetitions may agree by chance. Their spread is at least that of independent particles at each level.
+    # Repetitions may agree by chance. Their spread is at least the spread of independent particles at each level.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical) / particles)

@@ -106,8 +106,9 @@ class Campaign:
       policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
         of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
         smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
-      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of those in a
-        trial. By default the preset "moderate": one policy serves all strengths, and this preset is in the middle.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of the
+        disturbances in a trial. By default the preset "moderate": one policy serves all strengths, and this preset is
+        in the middle.
       trials: number of trials of each cell.
       seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.

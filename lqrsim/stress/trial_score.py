@@ -152,7 +152,8 @@ def miss_score(rollout: Rollout) -> Array:
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 
-    A trial fails if its score is positive. Standard normal numbers give trials distributed as those of `simulate`.
+    A trial fails if its score is positive. Standard normal numbers give trials with the same distribution as in
+    `simulate`.
 
     Args:
       plant: the simulated robot.

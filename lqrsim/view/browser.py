@@ -152,7 +152,7 @@ class Browser(Viewer):
 
     Args:
       port: port of the server; 0 takes the first free port from 8080 on.
-      title: title of the page. The other arguments are those of a Viewer.
+      title: title of the page. The other arguments are the arguments of a Viewer.
 
     Attributes:
       port: port on which the server listens.

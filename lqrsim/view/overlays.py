@@ -102,7 +102,7 @@ def of_funnel(recorded: RecordedTrial, funnel: Funnel | None) -> DrawnFunnel:
         raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
     if not np.array_equal(funnel.plan.states, run.plan.states):
         raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
-    covariances = funnel.position_covariance / SIGMAS**2  # half axes are then those of the level
+    covariances = funnel.position_covariance / SIGMAS**2  # gives the half axes at the level
     every = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
     levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))
     drawn = (levels > 0) & (knots >= funnel.knots[0]) & (knots <= funnel.knots[-1])
@@ -128,7 +128,7 @@ def _tube(
     label: str,
     opaque: Mapping[bool, float] = OPACITY,
 ) -> DrawnTube:
-    """Some of the ellipsoids at these knots. Where they overlap, their joint opacity is about the given one."""
+    """Some of the ellipsoids at these knots. If they overlap, their joint opacity is about the given one."""
     one = Ellipsoids(every.centres[among], every.covariances[among])
     chosen = one.spread(MOST_ELLIPSOIDS)
     apart = np.linalg.norm(np.diff(one.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)

@@ -433,7 +433,7 @@ def _shadow(
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
     onto = _begin_projection(axes, space, world, plan, radius, plane, "funnel", "pale grey: within a radius")
-    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # outlines are then those of the level
+    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
     last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)

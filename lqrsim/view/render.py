@@ -65,7 +65,7 @@ def encoder(
 @contextlib.contextmanager
 def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Callable[[Pixels], None]]:
     """Like `encoder`, for a GIF, with one palette from the samples, so that colours do not flicker."""
-    # Maximum coverage keeps rare colours, such as those of lines.
+    # Maximum coverage keeps rare colours, such as the colours of lines.
     palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
     frames: list[Image.Image] = []
 

@@ -27,7 +27,7 @@ class Pane:
     """A part of the picture that shows one trial, in pixels from the upper left corner.
 
     Attributes:
-      run: number of the rollout among those of the metadata.
+      run: number of the rollout among the rollouts of the metadata.
       trial: row of the rollout.
       camera: the calibrated camera; None for other cameras.
     """

@@ -34,7 +34,7 @@ from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClos
 
 LONGEST_RUN = 600.0  # s, after which a run restarts, because the whole run is kept in memory
 RECENT = 100  # number of solves in the median of the caption
-GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the colour of the plan nor that of the trace
+GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # differs from the colours of plan and trace
 GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
 
 

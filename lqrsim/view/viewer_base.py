@@ -156,7 +156,7 @@ class Viewer(abc.ABC):
         self._wait(seconds * self.speed)
 
     def hold(self, selected: int) -> int:
-        """Note which body the person selected (0: none); returns the one to select: the goal or the robot."""
+        """Note which body the person selected (0: none); returns the body to select: the goal or the robot."""
         if selected:
             self.holds_goal = selected == self.goal_body
         return selected or (self.goal_body if self.holds_goal else self.robot)

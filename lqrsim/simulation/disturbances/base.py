@@ -101,7 +101,7 @@ class Disturbance(abc.ABC):
         """The disturbance in words and units, for records. By default this is its repr.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
         """
         return repr(self)
 
@@ -125,7 +125,7 @@ class Disturbance(abc.ABC):
         """Check that the plant can have this disturbance.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
 
         Raises:
           InputError: it cannot.
@@ -135,7 +135,7 @@ class Disturbance(abc.ABC):
         """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
 
         Returns:
           An Uncertainty.
@@ -147,7 +147,7 @@ class Disturbance(abc.ABC):
         """Start a run with one trial per generator. A trial's random numbers must come from its own generator.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
           plan: the plan that the policy follows.
           generators: K of them, one per trial.
 

@@ -1,8 +1,8 @@
 """Robots that differ from the model for which the policy was designed.
 
 Each class multiplies a parameter in the model of each trial by a factor: 1 plus a normal number, truncated at
-three standard deviations and drawn for each trial; or a fixed factor. Filters and tubes treat a fixed factor as
-unknown, too: its mean is 1, and its standard deviation is its distance from 1.
+three standard deviations and drawn for each trial; or a fixed factor. Filters and tubes also treat a fixed factor as
+unknown: its mean is 1, and its standard deviation is its distance from 1.
 """
 
 import abc
