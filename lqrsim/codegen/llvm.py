@@ -96,7 +96,7 @@ class Loaded:
             self._engine.finalize_object()
 
     def address(self, symbol: str) -> int:
-        """The address of a function. Raises RuntimeError if there is none of that name."""
+        """The address of a function. Raises RuntimeError if no function has this name."""
         found = self._engine.get_function_address(symbol)
         if not found:
             raise RuntimeError(f"the object file has no {symbol}")

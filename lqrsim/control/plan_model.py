@@ -78,7 +78,7 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     if isinstance(listed, (list, tuple)) and all(isinstance(one, str) for one in listed):
         names = check_items("sensors", listed, str, f"a tuple of names of states, of {', '.join(space.names)}")
         if not names or len(set(names)) < len(names):
-            raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, and each once")
+            raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, each at most once")
         chosen = [space.names.index(check_name("sensors", name, space.names)) for name in names]
         source = "def measure(x, data, out):\n" + "".join(f"    out[{i}] = x[{j}]\n" for i, j in enumerate(chosen))
         source += "def measure_slope(x, data, out):\n"

@@ -325,5 +325,5 @@ def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str)
     if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
         raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
     if when is not None and horizon != "shrinking":
-        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end')
+        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want horizon="shrinking"')
     return when

@@ -195,7 +195,7 @@ def report(
     """
     check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
     check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_function("progress", progress, "a function of the numbers of parts that are done and of all", arguments=2)
+    check_function("progress", progress, "a function of the numbers of finished parts and of all parts", arguments=2)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:

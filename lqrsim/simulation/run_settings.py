@@ -77,7 +77,7 @@ class RunSettings:
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
         wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
         check_function("generators", self.generators, wanted, arguments=2)
-        wanted = "a function of the number of finished periods and of all"
+        wanted = "a function of the numbers of finished periods and of all periods"
         check_function("progress", self.progress, wanted, arguments=2)
         wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
         check_function("watch", self.watch, wanted, arguments=3)

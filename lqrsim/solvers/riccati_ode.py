@@ -89,7 +89,7 @@ def bordered(hessian: Array, gradient: Array, constant: float) -> Array:
 
 
 def minimizer(V: Array, t: float) -> Array:
-    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises IntegrationFailure without a minimum."""
+    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises IntegrationFailure if none exists."""
     _, x, info = dposv(V[:-1, :-1], V[:-1, -1])
     if info != 0:
         raise IntegrationFailure(

@@ -438,7 +438,7 @@ class Search:
 
     @property
     def _stuck(self) -> bool:
-        """Whether there is a plan whose violation is stationary, and none that keeps the constraints."""
+        """Whether there is a plan whose violation is stationary, but none that satisfies the constraints."""
         return bool(self._known.evidence) and not self.best[1].success
 
 

@@ -117,7 +117,7 @@ def run_resolved(
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_function("progress", progress, "a function of the number of finished trials and of all", arguments=2)
+    check_function("progress", progress, "a function of the numbers of finished trials and of all trials", arguments=2)
     given = None if solution is None else solving.given(scenario, solution)
     _check_runnable(campaign, scenario, given)
     _check_folder(folder)

@@ -153,7 +153,7 @@ class Campaign:
         for field in ("strengths", "policies"):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
+                raise InputError(f"{field}: got {excerpt(values)}, want at least one entry, each at most once")
         if self.design_disturbances is not None:
             check_designed(self.policies)
             design = check_items("design_disturbances", self.design_disturbances, Disturbance, wanted)
