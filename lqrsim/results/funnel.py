@@ -206,6 +206,9 @@ class Funnel:
           points: (..., d).
           level: level of the ellipsoid.
 
+        Returns:
+          The states (..., n).
+
         Raises:
           InputError: there is no such knot, the points have another shape, or the ellipsoid is flat.
         """

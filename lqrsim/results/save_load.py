@@ -42,7 +42,7 @@ LATER = {(Certificate, "contacts")}  # fields that older files of the same versi
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
-    """Write a solution, a rollout, a policy, a funnel or a certificate, all or nothing. Returns the path.
+    """Write a solution, a rollout, a policy, a funnel or a certificate, all or nothing. Returns its path.
 
     If the path is a link, the file that it points to changes. Only regular files are replaced.
 

@@ -48,7 +48,8 @@ def certified(
       states: (T+1, n) of the plan. value: the cost-to-go, or None.
       violation: violation of the worst constraint. kept: whether that is within the equalities' tolerance.
       claimed: the last cost in the log; None if the solver does not claim success.
-      tolerance: tolerance of the optimality; None if only the cost was tested."""
+      tolerance: tolerance of the optimality; None if only the cost was tested.
+    """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
 
     def none() -> CostToGo:

@@ -17,8 +17,8 @@
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
-     (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails. with
-     constraints: a ladder of initial plans, each finished by the interior point (`constrained.py`).
+     (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
+  with constraints: a ladder of initial plans, each finished by the interior point (`constrained.py`).
   without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
      smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
 

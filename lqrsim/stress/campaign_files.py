@@ -1,7 +1,8 @@
 """The files of a campaign's folder: its lock, the tables of its trials, and its manifest.
 
-A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written all or
-nothing. Its metadata names the campaign, the cell and the trials, and contains a hash of these and of the columns.
+A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written whole or
+not at all. Its metadata names the campaign, the cell and the trials, and contains a hash of these and of the columns.
+
 `manifest.json` contains specification, versions and hashes. `sha256` covers the whole file, so that an edited file is
 refused. `digest` covers everything that the rows depend on. It is also in each shard, so that a manifest with new
 settings and a renewed hash does not fit the shards.

@@ -165,8 +165,7 @@ def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
 
 
 class CountedScore:
-    """Counts the evaluations of a score and checks its results. Raises InputError unless it is one number for each
-    vector."""
+    """Counts the evaluations of a score and checks its results: InputError unless there is one for each vector."""
 
     def __init__(self, score: Score) -> None:
         self.score, self.evaluations = score, 0

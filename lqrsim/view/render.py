@@ -143,7 +143,8 @@ def render(
     mp4 describes its content, so that `lqrsim verify` can measure it.
 
     Args:
-      runs: one rollout, or several rollouts to be shown side by side. path: FILE.mp4 or FILE.gif.
+      runs: one rollout, or several rollouts to be shown side by side.
+      path: FILE.mp4 or FILE.gif.
       trial: row of the rollout; several rows are shown side by side. With several rollouts, one row for all or one for
         each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
@@ -222,7 +223,8 @@ def render_still(
     else, including exceptions, is as in `render`.
 
     Args:
-      runs: one rollout, or several rollouts to be shown side by side. path: FILE.png.
+      runs: one rollout, or several rollouts to be shown side by side.
+      path: FILE.png.
       time: seconds after the start; by default the end.
       every: seconds; the robot is also drawn at each multiple of it.
       trial: as in `render`.
