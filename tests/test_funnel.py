@@ -416,7 +416,7 @@ class TestReplannerWhenLeft:
         for wrong, said in (
             ({"when": 3}, "when: got 3"),
             ({"when": moved}, "when: got a funnel of another plan"),
-            ({"when": funnel, "horizon": "moving"}, 'want "shrinking"'),
+            ({"when": funnel, "horizon": "moving"}, 'want horizon="shrinking"'),
         ):
             with pytest.raises(InputError, match=said):
                 unchecked(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)

@@ -135,7 +135,7 @@ def test_what_was_edited_with_all_its_hashes_has_no_shards(folder: Path, name: s
     """Nobody can be kept from beginning another campaign, but its numbers are not those of the shards."""
     if name == "a cell relabelled":  # which no campaign has
         edit(folder, EDITS[name], seals=("digest", "sha256"))
-        with pytest.raises(ls.InputError, match="cells: got some that are not the campaign"):
+        with pytest.raises(ls.InputError, match="cells: got cells of another campaign"):
             Results(folder)
         return
     edit(folder, EDITS[name], seals=("digest", "sha256"))

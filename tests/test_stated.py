@@ -158,7 +158,7 @@ def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], li
 
 def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"^design_disturbances: Gusts: got robot differential_drive, which has no drag"
+        InputError, match=r"^design_disturbances: Gusts: got robot differential_drive, which wind cannot push"
     ):
         ls.stress.run_campaign(
             replace(CAMPAIGN, design_disturbances=(ls.disturbances.Gusts(),)), tmp_path / "new", workers=0

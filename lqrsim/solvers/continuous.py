@@ -69,7 +69,7 @@ def smooth_lq_continuous(
     def at(t: float) -> Stage:
         given = stage(t) if callable(stage) else stage
         if not isinstance(given, Stage) or np.ndim(given.B) != 2:
-            got = f"one with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
+            got = f"a Stage with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
             raise InputError(
                 f"stage: got {got}, want a Stage without a leading axis, or a function of t that gives one"
             )
