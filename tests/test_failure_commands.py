@@ -129,7 +129,7 @@ def test_a_certificate_is_measured_again_and_a_false_one_is_found_out(
     assert main(["certify", file, "--scenario", reference, "--seed", "7"]) == 0
     assert "as certified: the intervals overlap" in capsys.readouterr().out
     assert main(["certify", file]) == 2
-    assert "scenario: got none, want that of the certificate" in capsys.readouterr().err
+    assert "scenario: got none, want the certificate's scenario" in capsys.readouterr().err
     true = ls.load(file, ls.stress.FailureCertificate)
     less = {name: getattr(true, name) / 1000 for name in ("probability", "low", "high", "repetitions")}
     for change, more, says in (

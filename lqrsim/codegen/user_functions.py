@@ -454,7 +454,7 @@ def axes_of(
 def check_derivative(field: str, derivative: Any, function: Any, level: str, arguments: str) -> None:
     """Raises InputError unless a derivative takes these arguments, and is allowed at its function's level."""
     if level == "symbolic":
-        got = f"one for {name_of(function)}, which is symbolic"
+        got = f"a derivative of {name_of(function)}, which is symbolic"
         raise InputError(f"{field}: got {got}, want none (it is derived) or level='compiled' or 'plain'")
     check_function(field, derivative, f"a function of ({arguments})")
     level_of(derivative, level)

@@ -323,7 +323,7 @@ def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str)
     """Raises InputError unless it is None, or a funnel of the solution with a fixed end."""
     check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
     if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
-        raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
+        raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
     if when is not None and horizon != "shrinking":
         raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want horizon="shrinking"')
     return when

@@ -173,7 +173,7 @@ class Archive:
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
         if 10 + length + prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
-            raise InputError(f"{excerpt(name)}: got a size that does not fit its shape, want that of {excerpt(shape)}")
+            raise InputError(f"{excerpt(name)}: got a size that does not fit, want the size of {excerpt(shape)}")
         return Header(dtype, shape)
 
     def _text(self) -> dict[str, Any]:

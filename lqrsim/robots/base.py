@@ -109,5 +109,5 @@ def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int)
     """MuJoCo's positions (..., nq) and velocities (..., nv) as arrays. Raises InputError unless they fit."""
     qpos, qvel = vectors_of("qpos", qpos, nq), vectors_of("qvel", qvel, nv)
     if qpos.shape[:-1] != qvel.shape[:-1]:
-        raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with {nv} numbers")
+        raise InputError(f"qvel: got shape {qvel.shape}, want qpos's shape, {qpos.shape}, with {nv} numbers")
     return qpos, qvel

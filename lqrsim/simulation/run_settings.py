@@ -124,7 +124,7 @@ def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinate
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
         raise InputError(
-            f"controller: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
     # A command that the robot clips is at a limit, whatever limits the policy assumed.

@@ -131,7 +131,7 @@ def run_resolved(
         if unfinished:
             if others := changed(results.manifest["versions"]):
                 raise InputError(
-                    f"versions: got {others}, which may change the last bits, want those that {folder} was begun with,"
+                    f"versions: got {others}, which may change the last bits, want the versions of {folder},"
                     " or another folder"
                 )
             results.trials.warm_up()  # done here first, so that the workers find everything compiled

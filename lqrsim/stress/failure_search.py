@@ -427,7 +427,7 @@ def certify(
     every = len(certificate.repetitions)
     count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
     if scenario is None and ":" in certificate.scenario:
-        raise InputError(f"scenario: got none, want that of the certificate, {certificate.scenario}, which is code")
+        raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     asked: dict[str, Any] = {name: getattr(certificate, name) for name in _ASKED} | {"solution": certificate.solution}
     if scenario is not None:
         asked["scenario"] = scenario

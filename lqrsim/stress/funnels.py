@@ -366,7 +366,7 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
         return np.array([_inverse(one) for one in curve])
     if isinstance(shape, Tube):
         if not np.array_equal(shape.plan.states, plan.states):
-            raise InputError("shape: got a tube of another plan, want that of the solution")
+            raise InputError("shape: got a tube of another plan, want a tube of the solution")
         given = shape.covariance
     else:
         given = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
