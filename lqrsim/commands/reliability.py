@@ -241,7 +241,7 @@ class FunnelCommand(PolicyOptions):
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
         knots, states = self.knots or None, self.states or None
         options = self.rate, self.confidence, knots, states, self.failures, None, self.seed
-        FunnelOptions.of(space, steps, *options)  # before it is solved
+        FunnelOptions.of(space, steps, *options)  # checked before the solve
         scenario.target_radius(self.goal_radius, self.goal_tolerance)
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):

@@ -104,7 +104,7 @@ class Surroundings:
         return np.min(found, axis=0, initial=np.inf) if found else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
-        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""
+        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the previous knot."""
         place = list(self.position)
         clearance, normal, displaced = self.clearances(states)
         variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced

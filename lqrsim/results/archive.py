@@ -254,8 +254,8 @@ def replacing(path: Path) -> Iterator[Path]:
     if target.exists() and not target.is_file():
         what = "a folder" if target.is_dir() else "neither a file nor a folder"
         raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a regular file")
-    # A random name, so that two writers do not collide, and known before the file exists, so that Ctrl-C at any moment
-    # removes it. The suffix stays, because writers choose the format by it.
+    # A random name, so that two writers do not collide. It is known before the file exists, so that Ctrl-C at any
+    # moment removes the file. The suffix stays, because writers choose the format by it.
     unfinished = target.parent / f"{UNFINISHED}{secrets.token_hex(8)}{path.suffix}"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

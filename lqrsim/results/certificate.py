@@ -63,8 +63,8 @@ class FailureCertificate:
     def __post_init__(self) -> None:
         check_fields(self)
         if not self.low <= self.probability <= self.high:
-            got = f"{self.probability:g} in an interval from {self.low:g} to {self.high:g}"
-            raise InputError(f"FailureCertificate: probability: got {got}, want it inside")
+            wanted = f"a number from {self.low:g} to {self.high:g}, its interval"
+            raise InputError(f"FailureCertificate: probability: got {self.probability:g}, want {wanted}")
         mean = float(self.repetitions.mean()) if len(self.repetitions) > 1 else -1.0
         if abs(mean - self.probability) > 1e-9 * self.probability:
             raise InputError(

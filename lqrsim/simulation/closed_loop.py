@@ -166,7 +166,7 @@ class ClosedLoop:
         self.records.knot(step, self.states, measured, self.collisions.clearance)
         self.records.lose(step, self.physics.unstable | _not_finite(measured))
         over = self.records.over(step)
-        if over.any():  # trials that have ended continue in the plan's states, to not disturb the others
+        if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
             measured[over] = self.settings.trajectory.states[step]
         return measured
 
