@@ -140,7 +140,7 @@ def test_a_certificate_is_measured_again_and_a_false_one_is_found_out(
         false = ls.save(dataclasses.replace(true, **change), tmp_path / "false.npz")
         assert main(["certify", str(false), "--scenario", reference, "--repetitions", "2", *more]) == 1
         assert says in capsys.readouterr().out
-    with pytest.raises(ls.InputError, match="want a number from .*, its interval"):
+    with pytest.raises(ls.InputError, match=r"want a number from .*, its interval"):
         dataclasses.replace(true, probability=0.0)
     with pytest.raises(ls.InputError, match="of which the probability is the mean"):
         dataclasses.replace(true, repetitions=true.repetitions * 1.01)
