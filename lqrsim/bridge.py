@@ -1,16 +1,16 @@
-"""A controller and its robot as two programs that exchange messages of ROS 2, by DDS; needs the extra `ros`.
+"""Run a controller and its robot as two programs that exchange ROS 2 messages over DDS. Needs the extra `ros`.
 
     import lqrsim.bridge
 
     ran = lqrsim.bridge.run(solution, odometry="/odom", commands="/rotors/commands", safe=[0, 0, 0, 0])
 
-`run` is the controller's side: it reads states, and publishes the commands of one control period after the other. Its
-messages have the names, types and bytes of ROS 2, so that nodes see them as any other; ROS 2 itself is not needed.
-`SimulatedRobot` is the robot's side for a try-out, with MuJoCo as the robot.
+`run` is the controller's side: it reads states and publishes the commands, period by period. The messages have the
+names, types and bytes of ROS 2, so ROS 2 nodes treat them like any others. ROS 2 itself is not needed.
+`SimulatedRobot` is the robot's side for a test: MuJoCo takes the place of the robot.
 
 States come from `nav_msgs/msg/Odometry`, from `sensor_msgs/msg/JointState`, or from both. Commands go out as
 `std_msgs/msg/Float64MultiArray`, in the order of the policy's controls and in their units, as the controllers of
-ros2_control take them. Frames are those of REP 103, which are ours: z up; the body's x forward, y to the left.
+ros2_control take them. Frames follow REP 103, as in this package: z up; the body's x forward, y to the left.
 """
 
 import contextlib
@@ -47,9 +47,9 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 
 LATE = 3  # control periods without a state after which the controller stops
-SLICE = 0.05  # s, after which a wait looks for signals
+SLICE = 0.05  # s, the interval at which a wait checks for signals
 AXES = "xyz"
-# The states that an Odometry has, by name: velocities along the world's axes, rates along the body's.
+# The states in an Odometry message, by name: velocities along the world's axes, rates along the body's.
 ODOMETRY = ("x", "y", "z", "vx", "vy", "vz", "rx", "ry", "rz", "wx", "wy", "wz", "heading")
 
 Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveReplanner
@@ -57,17 +57,17 @@ Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveRepla
 
 @dataclass(frozen=True, kw_only=True)
 class Bridged:
-    """What a run of a controller was, until the safe command.
+    """The record of a controller's run, up to the safe command.
 
     Attributes:
       completed: whether all periods were run.
-      reason: why not, in a line; empty if they were.
+      reason: one line that says why not; empty if all were run.
       commands: (T, m), as published.
-      held: number of periods that had to do with the state of an earlier one.
-      refused: number of messages that were not used, for what is in them, and the last reason.
-      response: in s, (T,), from the beginning of each period, in lockstep from when its state had arrived, until its
-        command was published.
-      late: in s, (T,), by which each period began later than the clock had it; zeros in lockstep.
+      held: number of periods that had to use the state of an earlier period.
+      refused: number of messages that were not used because of their content, and the last reason.
+      response: (T,) time in s until each period's command was published, from the beginning of the period; in lockstep,
+        from the arrival of its state.
+      late: (T,) delay in s of each period's beginning behind the clock; zeros in lockstep.
     """
 
     completed: bool
@@ -79,7 +79,7 @@ class Bridged:
     late: Array
 
     def summary(self) -> str:
-        """Some lines on the run."""
+        """A summary of the run in a few lines."""
         lines = [f"{len(self.commands)} periods, {self.held} with the state held"]
         lines += [f"stopped: {self.reason}"] if self.reason else []
         lines += [f"{self.refused[0]} messages not used; the last: {self.refused[1]}"] if self.refused[0] else []
@@ -107,26 +107,26 @@ def run(
 
     The clock begins with the first state. If a period has no new state, the last one is held: a policy acts on it by
     the law of the new period, and a filter predicts. After `lost_after` without a state the run stops. After the
-    horizon a policy holds its last law. Once a command was published, the safe one is published last, however the run
-    ends: by Ctrl-C and by an error, too.
+    horizon a policy holds its last law. Once a command has been published, the safe command is published last, however
+    the run ends, be it by Ctrl-C or an error.
 
     Args:
-      controller: a plan, whose policy it is; a policy, with or without a filter; a Controller with a plan, such as an
-        OffsetFree; or a re-planner's live front, `with replanner.live() as live`.
+      controller: a plan, whose policy then controls; a policy, with or without a filter; a Controller with a plan, such
+        as an OffsetFree; or a running re-planner, from `with replanner.live() as live`.
       commands: topic, such as "/rotors/commands".
-      safe: (m,), within the limits: what the robot is to do when nobody controls it any more.
+      safe: (m,), within the limits: the command for the robot when it is no longer controlled.
       odometry: topic. It has the states x, y, z, vx, vy, vz (along the world's axes), the rotation vector rx, ry, rz,
         the rates wx, wy, wz (along the body's), and heading, the yaw.
-      joints: topic. It has the state NAME, and NAME_velocity, of each joint, as a robot from an MJCF has them.
-      names: state -> its name among these, for states that are called otherwise.
+      joints: topic. It has the states NAME and NAME_velocity of each joint, as in a robot from an MJCF.
+      names: state -> its name in messages, for states with other names.
       seconds: how long to run; by default the horizon.
-      lockstep: run a period for each state that arrives, and not by the clock: for simulations.
-      lost_after: in s, by default three control periods; in lockstep `patience`.
-      patience: in s, for the first state, and for the robot to be there at all.
-      domain: of DDS; by default ROS_DOMAIN_ID, or 0.
+      lockstep: run one period for each state that arrives, instead of by the clock; for simulations.
+      lost_after: time in s; by default three control periods, in lockstep `patience`.
+      patience: time in s to wait for the robot to appear, and for its first state.
+      domain: the DDS domain; by default ROS_DOMAIN_ID, or 0.
 
     Returns:
-      What the run was.
+      The record of the run.
 
     Raises:
       InputError: an argument is not as described, the robot is not there, or cyclonedds is not installed.
@@ -135,7 +135,7 @@ def run(
     states, controls = law.coordinates
     safe = check_array("safe", safe, (len(controls),))
     if (safe < controls.low).any() or (safe > controls.high).any():
-        raise InputError(f"safe: got {excerpt(safe.tolist())}, want it within {controls.low} and {controls.high}")
+        raise InputError(f"safe: got {excerpt(safe.tolist())}, want numbers from {controls.low} to {controls.high}")
     lockstep, patience = check_flag("lockstep", lockstep), check_number("patience", patience, above=0.0, at_most=1e6)
     longest = patience if lockstep else LATE * dt
     if lost_after is not None:
@@ -146,10 +146,10 @@ def run(
     node, commands = _Node(domain), _checked_topic(commands)
     inlet = _Inlet(node, _topics(odometry, joints), states, needed, names, reliable=lockstep)
     _wait(inlet.matched, patience, inlet.lacking)
-    outlet = node.writer(commands, "Float64MultiArray")  # who sees it can rely on its states being heard
+    outlet = node.writer(commands, "Float64MultiArray")  # seeing this writer means that its states are heard
     _wait(outlet.get_matched_subscriptions, patience, lambda: f"commands: got no reader of {commands}")
-    if not isinstance(controller, LiveReplanner):  # which would begin to solve
-        law.start(1).control(0, nominal[None])  # so that the first period does not load compiled code
+    if not isinstance(controller, LiveReplanner):  # a LiveReplanner would begin to solve
+        law.start(1).control(0, nominal[None])  # loads compiled code before the first period
     _wait(inlet.complete, patience, inlet.lacking)
     running, sent, response, late = law.start(1), list[Array](), list[float](), list[float]()
     held, reason, begun = 0, "", time.monotonic()
@@ -176,7 +176,7 @@ def run(
             sent.append(command)
     finally:
         outlet.write(node.numbers(safe))
-        with contextlib.suppress(AttributeError):  # which cyclonedds 11.0 raises where a reader hangs or is gone
+        with contextlib.suppress(AttributeError):  # cyclonedds 11.0 raises it if a reader hangs or is gone
             outlet.wait_for_acks(node.second)
     return Bridged(
         completed=not reason, reason=reason, commands=np.array(sent).reshape(len(sent), len(controls)), held=held,
@@ -185,26 +185,26 @@ def run(
 
 
 class SimulatedRobot:
-    """A robot for `run`: in `simulate` it is the controller, whose controls come from the other program.
+    """A simulated robot for `run`. In `simulate` it is the controller: its controls come from the other program.
 
         with lqrsim.bridge.SimulatedRobot(solution, odometry="/odom", commands="/rotors/commands") as robot:
             rollout = ls.simulate(plant, solution, controller=robot)
         print(robot.summary())
 
-    It publishes the measured state of each control period and waits for a command. What it runs is what a bridge in
-    lockstep makes of it; or, by a bridge with a clock, as fast as that clock.
+    It publishes the measured state of each control period and waits for a command. With a bridge in lockstep, the
+    simulation runs as fast as both programs allow. With a bridge that runs by a clock, it runs as fast as the clock.
 
     Args:
       plan: a plan or a policy, for the names of the states and controls.
       commands: as in `run`.
-      odometry: likewise.
-      joints: likewise.
-      names: likewise.
-      patience: in s, for a command; and for the other program to be there at all.
+      odometry: as in `run`.
+      joints: as in `run`.
+      names: as in `run`.
+      patience: time in s to wait for the other program to appear, and for each command.
       domain: as in `run`.
 
     Attributes:
-      round_trips: in s, from publishing each state to the arrival of its command.
+      round_trips: times in s from publishing each state to the arrival of its command.
 
     Raises:
       InputError: as in `run`.
@@ -238,7 +238,7 @@ class SimulatedRobot:
         self._outlets, self._inlet, self._node = {}, None, None
 
     def __call__(self, state: npt.ArrayLike, t: float) -> Array:
-        """The controls (m,) for a measured state (n,). Raises InputError if none, or others, arrive."""
+        """The controls (m,) for a measured state (n,). Raises InputError if no controls arrive, or invalid ones."""
         node, inlet = self._node, self._inlet
         if node is None or inlet is None:
             raise InputError("SimulatedRobot: got a state after its end, want it within `with SimulatedRobot(...)`")
@@ -259,7 +259,7 @@ class SimulatedRobot:
         return check_array("command", message.data, (len(self._controls),))
 
     def summary(self) -> str:
-        """How long commands took, in a line."""
+        """The times that commands took, in one line."""
         return f"state to command and back: {_quantiles(self.round_trips)}" if self.round_trips else "no command"
 
 
@@ -269,7 +269,7 @@ def _quantiles(seconds: npt.ArrayLike) -> str:
 
 
 def _wait(until: Callable[[], Any], patience: float, lacking: Callable[[], str]) -> None:
-    """Wait. Raises InputError with what is lacking when the patience ends."""
+    """Wait. When the patience ends, raises InputError that says what is missing."""
     end = time.monotonic() + patience
     while not until():
         if time.monotonic() > end:
@@ -300,19 +300,19 @@ def _law_of(given: Bridgeable) -> tuple[Controller, float, int, Array]:
 
 def _checked_topic(topic: object) -> str:
     if not isinstance(topic, str) or not re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic):
-        raise InputError(f"topic: got {excerpt(topic)}, want a name of ROS 2, such as /odom")
+        raise InputError(f"topic: got {excerpt(topic)}, want a ROS 2 topic name, such as /odom")
     return topic
 
 
 def _topics(odometry: str | None, joints: str | None) -> dict[str, str]:
     found = {kind: topic for kind, topic in (("Odometry", odometry), ("JointState", joints)) if topic is not None}
     if not found:
-        raise InputError("odometry: got no topic of states, want one, or joints=")
+        raise InputError("odometry: got none, want a topic of states in odometry=, in joints=, or in both")
     return found
 
 
 def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str, ...]:
-    """What the states are called in messages."""
+    """The names of the states in messages."""
     given = {} if names is None else check_kind("names", names, Mapping, "state -> its name in messages")
     if unknown := set(given) - set(states.names):
         raise InputError(f"names: got {excerpt(sorted(unknown))}, want some of {', '.join(states.names)}")
@@ -320,10 +320,10 @@ def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str,
 
 
 class _Inlet:
-    """The newest state from its topics.
+    """The newest state from the topics.
 
     Attributes:
-      state: (n,); what the controller does not measure is 0.
+      state: (n,); entries that the controller does not measure are 0.
       refused: as in `Bridged`.
     """
 
@@ -336,7 +336,8 @@ class _Inlet:
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
             raise InputError(
-                f"odometry: got no {', '.join(sorted(self._lacking - known))} in it, want joints= or names="
+                f"odometry: got no {', '.join(sorted(self._lacking - known))} in its messages, want a topic in joints="
+                " that has them, or other names="
             )
         self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
         self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
@@ -344,18 +345,18 @@ class _Inlet:
 
     @property
     def arrived(self) -> float:
-        """When the state was taken in, on the clock: the oldest of its parts."""
+        """The time on the clock at which the oldest part of the state was received."""
         return min(self._arrived.values())
 
     def wait(self, seconds: float) -> None:
-        """Wait until each topic has something new, but no longer."""
+        """Wait until each topic has a new message, or the time is over."""
         end = time.monotonic() + seconds
         for reader in self._readers.values():
             while not reader.wait(SLICE) and time.monotonic() < end:
                 pass
 
     def matched(self) -> bool:
-        """Whether each topic has somebody who writes it."""
+        """Whether each topic has a writer."""
         return all(reader.writers() for reader in self._readers.values())
 
     def complete(self) -> bool:
@@ -367,7 +368,7 @@ class _Inlet:
         return f"states: got no {', '.join(sorted(self._lacking))} from {', '.join(self._topics.values())}"
 
     def take(self) -> bool:
-        """Take in what is new. Returns whether all parts of the state are."""
+        """Receive new messages. Returns whether all parts of the state are new."""
         now = time.monotonic()
         for kind, reader in self._readers.items():
             for message in reader.take():
@@ -390,7 +391,7 @@ class _Inlet:
 
 
 def _of_odometry(message: Any) -> dict[str, float]:
-    """Its states. Raises ValueError if they are none."""
+    """The states in the message. Raises ValueError if they are invalid."""
     pose, twist = message.pose.pose, message.twist.twist
     place, turned = pose.position, pose.orientation
     quaternion = np.array([turned.w, turned.x, turned.y, turned.z])
@@ -407,7 +408,7 @@ def _of_odometry(message: Any) -> dict[str, float]:
 
 
 def _of_joints(message: Any) -> dict[str, float]:
-    """Its states, of the joints that it has. Raises ValueError if they are none."""
+    """The states in the message, for the joints that it lists. Raises ValueError if they are invalid."""
     found: dict[str, float] = {}
     for field, suffix in (("position", ""), ("velocity", "_velocity")):
         numbers = getattr(message, field)
@@ -418,7 +419,7 @@ def _of_joints(message: Any) -> dict[str, float]:
 
 
 class _Node:
-    """Readers and writers of ROS 2's topics in one domain of DDS, and their messages."""
+    """Readers and writers of ROS 2 topics in one DDS domain, and their messages."""
 
     def __init__(self, domain: int | None) -> None:
         self._ros = _ros()
@@ -441,9 +442,9 @@ class _Node:
         return self._ros.Topic(self._participant, f"rt{_checked_topic(topic)}", self._ros.messages[kind])
 
     def _quality(self, reliable: bool, kind: str) -> Any:
-        """Of states the newest counts; of commands each does. A writer that is reliable suits readers that are not.
+        """Of states only the newest counts, of commands every one. A reliable writer also serves unreliable readers.
 
-        The representation is that of ROS 2, the first version of CDR.
+        The representation is the first version of CDR, as in ROS 2.
         """
         ros, policy = self._ros, self._ros.Policy
         kept = policy.History.KeepLast(10 if kind == "Float64MultiArray" else 1)
@@ -495,21 +496,21 @@ class _Reader:
         self._waits.attach(self._new)
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a message, but no longer. Returns whether there is one."""
+        """Wait for a message until the time is over. Returns whether a message is there."""
         return self._waits.wait(self._ros.duration(seconds=seconds)) > 0
 
     def take(self) -> list[Any]:
-        """The oldest message, if there is one."""
+        """The oldest message, or None."""
         return self._reader.take(N=1)
 
     def writers(self) -> list[Any]:
-        """Who writes it."""
+        """The writers of the topic."""
         return self._reader.get_matched_publications()
 
 
 @functools.cache
 def _ros() -> SimpleNamespace:
-    """What is used of cyclonedds, and the messages. Raises InputError if it is not installed."""
+    """The parts of cyclonedds that are used, and the messages. Raises InputError if cyclonedds is not installed."""
     try:
         from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
         from cyclonedds.domain import DomainParticipant

@@ -5,7 +5,7 @@ evenly spaced along the segment, are inside it. Between two balls, `spacing` apa
 
     radius - sqrt(radius^2 - spacing^2 / 4)
 
-and a distance to the balls overestimates that to the capsule by at most as much.
+so the distance to the balls exceeds the distance to the capsule by at most this amount.
 """
 
 import itertools
@@ -16,10 +16,10 @@ from typing import Any
 
 from lqrsim.errors import InputError, check_number, excerpt
 
-MOST = 10_000  # balls in a chain
+MOST = 10_000  # largest number of balls in a chain
 
 
-# A named tuple, so that formulas that refer to one can be cached: see `codegen/fingerprint.py`.
+# A named tuple, so that formulas that refer to a capsule can be cached: see `codegen/fingerprint.py`.
 class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     """A capsule that is covered by a chain of balls, for `CollisionSpheres`.
 
@@ -34,8 +34,8 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 
     Attributes:
-      length: length of its segment, without the round ends, in metres; 0 for a ball.
-      radius: in metres, of the capsule and of each ball.
+      length: length of the segment, without the round ends, in metres; 0 for a ball.
+      radius: radius of the capsule and of each ball, in metres.
       tolerance: largest protrusion of the capsule from the balls, in metres, more than 0.
 
     Raises:
@@ -89,7 +89,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
           `count` lists with the same number of coordinates.
 
         Raises:
-          InputError: they are not two points of the same size.
+          InputError: the arguments are not two points of the same size.
         """
         try:
             first, last = (list(itertools.islice(iter(one), 4)) for one in (start, end))

@@ -34,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      arguments: the words after `lqrsim` on the command line. By default those of this process, which then handles
+      arguments: the words after `lqrsim` on the command line. By default the arguments of this process, which then
+        handles
         signals as a command does: it removes unfinished files and ends.
 
     Returns:
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             code = _run(list(sys.argv[1:] if arguments is None else arguments))
-        except SystemExit:  # of --help, and of arguments that cannot be parsed
+        except SystemExit:  # after --help, and for arguments that cannot be parsed
             process.flush()
             raise
         process.flush()
@@ -87,14 +88,14 @@ def _run(arguments: list[str]) -> int:
 
     from lqrsim.versions import outdated
 
-    if line := outdated():  # before the import that fails because of it
+    if line := outdated():  # before the import that fails because of old packages
         process.print_error(f"lqrsim: error: {line}")
         return 2
 
     from lqrsim.commands import NAMES, console
     from lqrsim.errors import InputError
 
-    notices = logging.StreamHandler()  # on stderr: what takes long, such as compiling for a new kind of problem
+    notices = logging.StreamHandler()  # on stderr: notices of slow work, such as compiling for a new kind of problem
     logger = logging.getLogger("lqrsim")
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)

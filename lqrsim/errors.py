@@ -1,6 +1,6 @@
-"""`InputError`, which bad input raises, and the checks that raise it.
+"""`InputError`, the exception for bad input, and the checks that raise it.
 
-Every message is one line with the field, the value and what is wanted, and the valid names if there is a list of them.
+Every message is one line with the field, the value that it got, the value that it wants, and valid names, if any.
 The command line prints that line and exits with 2.
 """
 
@@ -26,9 +26,9 @@ if outdated():
 Array = npt.NDArray[np.floating]
 
 _FLOAT64 = np.dtype(np.float64)
-_LARGE = 10**7  # entries; for larger arrays the memory is checked first
-LONGEST = 1010  # characters of a message
-LARGEST_COUNT = 10**9  # of a count without a limit of its own: a longer loop takes more than a day
+_LARGE = 10**7  # entries above which the memory for an array is checked first
+LONGEST = 1010  # largest number of characters of a message
+LARGEST_COUNT = 10**9  # limit of counts without their own limit: a longer loop takes more than a day
 
 
 class InputError(ValueError):
@@ -40,7 +40,7 @@ class InputError(ValueError):
 
 
 def keep(record: object, **values: object) -> None:
-    """Set fields of a frozen record to what its `__post_init__` has checked."""
+    """Set fields of a frozen record to the values that its `__post_init__` has checked."""
     for name, value in values.items():
         object.__setattr__(record, name, value)
 
@@ -140,7 +140,7 @@ def check_number(
     at_most: float | None = None,
     below: float | None = None,
 ) -> float:
-    """`value` as a finite float within the bounds. Raises InputError otherwise, also for text and bools."""
+    """`value` as a finite float within the bounds. Raises InputError otherwise, including for text and bools."""
     number = float("nan")
     try:
         if not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
@@ -231,7 +231,7 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
     """`value` if it is one printable line of text. Raises InputError otherwise.
 
     Args:
-      at_most: number of characters.
+      at_most: largest number of characters.
       empty: whether the text may be empty.
     """
     if not isinstance(value, str) or not (value or empty) or not value.isprintable():
@@ -337,7 +337,7 @@ def excerpt(value: object) -> str:
             return f"{type(value).__name__} of {len(value)}"  # pyright: ignore[reportArgumentType]
         elif isinstance(value, int) and value.bit_length() > 1000:
             return f"an int of {value.bit_length()} bits"
-        elif dataclasses.is_dataclass(value):  # may hold megabytes
+        elif dataclasses.is_dataclass(value):  # its repr may have megabytes
             return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
         text = " ".join(repr(value).split())
     except Exception:  # a __repr__ that fails, or recurses without end

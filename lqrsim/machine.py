@@ -26,7 +26,7 @@ def description() -> str:
 
 
 def memory() -> int:
-    """Bytes of memory that this process may use: those of the machine, or fewer under a limit."""
+    """Bytes of memory that this process may use: the machine's memory, or less under a limit."""
     there = [_physical()]
     with contextlib.suppress(ImportError, OSError, ValueError):  # not on Windows
         import resource
@@ -55,7 +55,7 @@ def instruction_set() -> tuple[str, str, str]:
     """The target of compiled code: LLVM's triple, the name of the processor, and its features.
 
     `LQRSIM_CPU_NAME` and `LQRSIM_CPU_FEATURES` replace the last two: with "generic" and "", machines of one
-    architecture run the same instructions. AVX-512 is left out, for LLVM's loops are slower with it;
+    architecture run the same instructions. AVX-512 is left out, because LLVM's loops are slower with it;
     `python experiments/benchmark_compiling.py --sections features` compares them.
     """
     import llvmlite.binding as llvm
@@ -74,7 +74,7 @@ def instruction_set() -> tuple[str, str, str]:
 def processor() -> str:
     """The processor that code is compiled for, and a hash of its features; see `instruction_set`.
 
-    Where it differs, the same program gives other bits: instructions round differently, and sums have another order.
+    If it differs, the same program gives other bits: instructions round differently, and sums have another order.
     The hash includes the actual processor, on which NumPy and MuJoCo depend, and the target of LLVM.
     """
     import llvmlite.binding as llvm

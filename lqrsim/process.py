@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 WAKE = getattr(signal, "SIGURG", signal.SIGINT)  # unused otherwise, and ignored by default
 MOST_WAKES = 100
-GRACE = 2.0  # s after a signal; a second one in this time is ignored, so that it does not stop the tidying up
+GRACE = 2.0  # s after a signal in which a second signal is ignored, so that it does not stop the tidying up
 
 
 class Unprintable(Exception):
@@ -45,14 +45,14 @@ class _Signals:
 
 
 def handle_signals(last_words: str = "") -> None:
-    """Handle signals as a command does. To be called once, before slow imports.
+    """Handle signals as a command does. Call it once, before slow imports.
 
     Args:
       last_words: a line for stderr when a signal stops the process.
     """
     _Signals.last_words = last_words
     _fill_streams()
-    # Signals that are ignored stay so, as nohup wants it.
+    # Signals that are ignored stay ignored, as nohup requires.
     for number in SIGNALS:
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _end_at_once)
@@ -63,9 +63,8 @@ def handle_signals(last_words: str = "") -> None:
 def _wake_for_signals() -> None:
     """Make sure that signals are handled soon.
 
-    The system may deliver a signal to any thread, such as one of OpenBLAS. Python handles it on the main thread, which
-    is
-    not interrupted then: if it waits, it goes on waiting. A further signal to the main thread wakes it.
+    The system may deliver a signal to any thread, such as a thread of OpenBLAS. Python handles it on the main thread,
+    which is then not interrupted: if it waits, it continues to wait. A further signal to the main thread wakes it.
     """
     arrived, arrivals = os.pipe()
     os.set_blocking(arrivals, False)
@@ -116,10 +115,10 @@ def uninterrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
-    """A block in which `tell` is called, by another thread, as soon as a signal arrives that raises KeyboardInterrupt.
+    """A block in which another thread calls `tell` as soon as a signal arrives that raises KeyboardInterrupt.
 
-    Python raises it only when compiled code returns, which can be told so to return early. Other handlers of signals,
-    which may not raise anything, are left alone; and so is what happens outside of the main thread.
+    Python raises it only when compiled code returns; with `tell`, that code can be told to return early. Other signal
+    handlers, which may not raise anything, are left alone. Outside of the main thread, nothing changes.
     """
     if threading.current_thread() is not threading.main_thread() or os.name != "posix":
         yield
@@ -149,10 +148,10 @@ def on_interrupt(tell: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
-    """A block in which an exception, such as that of Ctrl-C, gets the results so far as its `found`.
+    """A block in which an exception, such as KeyboardInterrupt, gets the results so far as its `found`.
 
     Args:
-      make: returns it, or None if there is nothing. Its argument is what an inner block has kept, or None.
+      make: returns the results, or None if there are none. Its argument is the results of an inner block, or None.
     """
     try:
         yield
@@ -209,7 +208,7 @@ def printing() -> Iterator[None]:
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:
-    """End the process at once, for there is nothing to tidy up."""
+    """End the process at once, because there is nothing to tidy up."""
     if _Signals.last_words:
         with contextlib.suppress(OSError):
             os.write(2, f"{_Signals.last_words}\n".encode())
@@ -228,7 +227,7 @@ def _raise_interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _fill_streams() -> None:
-    """Open closed standard streams on the null device; otherwise the next file to be opened would take their place."""
+    """Open closed standard streams on the null device; otherwise the next opened file would take their place."""
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         if getattr(sys, name) is None:
             opened = os.open(os.devnull, os.O_RDWR)

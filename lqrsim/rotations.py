@@ -71,7 +71,7 @@ def quaternion(rotation_vector: npt.ArrayLike) -> Array:
       rotation_vector: (..., 3), in radians.
 
     Raises:
-      InputError: the argument is not numbers of that shape.
+      InputError: the argument is not numbers of this shape.
     """
     rotation = vectors_of("rotation_vector", rotation_vector, 3)
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
@@ -86,10 +86,10 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
       quaternion: (..., 4), scalar first.
 
     Raises:
-      InputError: the argument is not numbers of that shape.
+      InputError: the argument is not numbers of this shape.
     """
     rows = vectors_of("quaternion", quaternion, 4)
-    # q and -q are the same rotation; the one with scalar part >= 0 is at most half a turn.
+    # q and -q are the same rotation; with a scalar part >= 0 it is at most half a turn.
     scalar, x, y, z = (rows[..., i] for i in range(4))
     sine = np.sqrt(x * x + y * y + z * z)
     # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
@@ -136,7 +136,7 @@ def _cross(a: Vector, b: Vector) -> list[Any]:
 
 
 def _ratio(name: str, s: Any) -> Any:
-    """A ratio at s: numeric for a number or an array, otherwise as a SymPy function."""
+    """A ratio at s: numeric for a number or an array, otherwise a SymPy function."""
     if isinstance(s, float | int | np.number):
         if s > sys.float_info.max:
             raise InputError("r: got a rotation vector whose squared length is beyond all floats, want a shorter one")

@@ -1,4 +1,4 @@
-"""The versions and the processor that the bits of a result depend on; every saved result has them."""
+"""The versions and the processor that the bits of a result depend on; they are in every saved result."""
 
 import platform
 import re
@@ -20,7 +20,7 @@ def versions() -> dict[str, str]:
 
 
 def changed(was: Mapping[str, str]) -> str:
-    """The versions that have changed, as `name new (was old)`; empty if none has."""
+    """The versions that have changed, as `name new (was old)`; empty if none has changed."""
     now = versions()
     names = [*now, *(name for name in was if name not in now)]
     return ", ".join(

@@ -183,7 +183,7 @@ def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.P
         ls.view.plot_run(plan, {"run": bare}, tmp_path / "run.png", world=plant.scene.world)
     assert run.balls is not None
     nameless = dataclasses.replace(run.balls, anchors=np.full_like(run.balls.anchors, np.nan))
-    with pytest.raises(ls.InputError, match="want one among the sites= of CollisionSpheres"):
+    with pytest.raises(ls.InputError, match="want one in sites= of CollisionSpheres"):
         ls.verify_run(dataclasses.replace(run, balls=nameless))
     with pytest.raises(ls.InputError, match="got a body that the model does not have"):
         ls.verify_run(dataclasses.replace(run, balls=dataclasses.replace(run.balls, anchors=1e3 + run.balls.anchors)))

@@ -338,7 +338,7 @@ def with_u(x, u, p):
         (lambda: balls_of(with_u, [0.1]), "want a function of \\(x, p\\)"),
         (lambda: ls.CollisionSpheres(nobody, [0.1], names=("a", "b")), "names: got"),
         (lambda: ls.CollisionSpheres(nobody, [0.1], sites=("a", "b")), "sites: got 2"),
-        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
+        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got a derivative of nobody, which is symbolic"),
         (
             lambda: ls.CollisionSpheres(nobody, [0.1], depends_on=("a",)),
             "depends_on: got names for a symbolic function",

@@ -405,7 +405,7 @@ def test_a_plan_that_is_not_finite_is_refused(cage):
     states = solution.trajectory.states.copy()
     states[3, 0] = np.inf
     failed = replace(solution, status=Status.NOT_FINITE, trajectory=replace(solution.trajectory, states=states))
-    with pytest.raises(InputError, match=r"^plan: got one that is not finite \(NOT_FINITE\), want one"):
+    with pytest.raises(InputError, match=r"^plan: got a plan that is not finite \(NOT_FINITE\), want one"):
         simulate(cage, failed)
 
 

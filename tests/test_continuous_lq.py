@@ -260,7 +260,7 @@ def test_questions_that_have_no_answer(ask: Callable[[Any], Any], message: str) 
         ({"horizon": 0.0}, "horizon: got 0.0, want a finite number > 0"),
         ({"rtol": 1e-16}, "rtol: got 1e-16, want a finite number >= 1e-13"),
         ({"stage": 3}, "stage: got 3, want a Stage without a leading axis"),
-        ({"stage": Stage(A=np.zeros((2, 1, 1)), B=np.ones((2, 1, 1)), R=np.ones((2, 1, 1)))}, "stage: got one with 3"),
+        ({"stage": Stage(A=np.zeros((2, 1, 1)), B=np.ones((2, 1, 1)), R=np.ones((2, 1, 1)))}, "stage: got a Stage"),
         (
             {"stage": lambda t: STAGE if t == 0 else Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])},
             r"stage: got B of shape \(2, 1\), want \(1, 1\) at all times",

@@ -136,6 +136,6 @@ def test_the_filters_are_discretised_exactly(step):
 @pytest.mark.parametrize("wind", [MeanWind((1.0, 0.0, 0.0)), Gusts(), Dryden()])
 def test_a_robot_without_drag_is_refused_by_name(wind):
     arena = Plant(DifferentialDrive(), load_scene("arena"))
-    message = f"^{type(wind).__name__}: got robot differential_drive, which has no drag for wind to act through"
+    message = f"^{type(wind).__name__}: got robot differential_drive, which wind cannot push without drag"
     with pytest.raises(InputError, match=message):
         simulate(arena, weave(5), disturbances=[wind])

@@ -130,7 +130,7 @@ def test_a_certificate_is_measured_again_and_a_false_one_is_found_out(
     assert main(["certify", file, "--scenario", reference, "--seed", "7"]) == 0
     assert "as certified: the intervals overlap" in capsys.readouterr().out
     assert main(["certify", file]) == 2
-    assert "scenario: got none, want it" in capsys.readouterr().err
+    assert "scenario: got none, want the certificate's scenario" in capsys.readouterr().err
     true = ls.load(file, ls.stress.FailureCertificate)
     less = {name: getattr(true, name) / 1000 for name in ("probability", "low", "high", "repetitions")}
     for change, more, says in (
@@ -141,7 +141,7 @@ def test_a_certificate_is_measured_again_and_a_false_one_is_found_out(
         false = ls.save(dataclasses.replace(true, **change), tmp_path / "false.npz")
         assert main(["certify", str(false), "--scenario", reference, "--repetitions", "2", *more]) == 1
         assert says in capsys.readouterr().out
-    with pytest.raises(ls.InputError, match="want it inside"):
+    with pytest.raises(ls.InputError, match=r"want a number from .*, its interval"):
         dataclasses.replace(true, probability=0.0)
     with pytest.raises(ls.InputError, match="of which the probability is the mean"):
         dataclasses.replace(true, repetitions=true.repetitions * 1.01)

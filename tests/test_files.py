@@ -299,7 +299,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"frame_times": lambda a: a[::-1].copy()}, "frame_times: got times that are not in order"),
         ({"contacts": lambda a: a - 10**6}, r"contacts: got .*, want whole numbers >= 0"),
         ({"states": lambda a: np.array(1.0)}, "states: got shape"),
-        ({"torques": None}, "torques: got none, want it"),
+        ({"torques": None}, "torques: got nothing, want this field"),
         ({"bomb": np.zeros(3)}, "'bomb': got an unknown array, want only arrays of this format"),
         # Text of another type or range.
         *(({name: 7}, f"{name}: got 7, want text") for name in ("robot", "scene", "model", "policy_digest")),
@@ -339,7 +339,7 @@ STATES = "policy.state_coordinates"
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({STATES: {"names": [1, 2, 3]}}, f"{STATES}.units: got none, want it"),
+        ({STATES: {"names": [1, 2, 3]}}, f"{STATES}.units: got nothing, want this field"),
         (
             {STATES: lambda one: one | {"names": [1, 2, 3]}},
             "state_coordinates: names: got 1 at 0, want a tuple",
@@ -361,7 +361,7 @@ STATES = "policy.state_coordinates"
         ),
         ({"candidates": []}, "candidates.0.trajectory.controls: got an array that meta does not mention"),
         ({"iterations": lambda one: [row | {"method": 3} for row in one]}, "iterations.0: Iteration: method: got 3"),
-        ({"multipliers": [{"penalty": 1.0}]}, "multipliers.0.values: got none, want it"),
+        ({"multipliers": [{"penalty": 1.0}]}, "multipliers.0.values: got nothing, want this field"),
         *(
             ({name: spoil}, rf"{name.split('.')[0]}.*: got NaN or infinity in")
             for name in (
@@ -381,7 +381,7 @@ STATES = "policy.state_coordinates"
         ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got more nested lists or objects, want at most 6"),
         ({"scenario": ["quadrotor"]}, "scenario: got .*, want text"),
         ({"version": 4.5}, "of version 4.5, want version 7"),
-        ({"cost_to_go.gradient": None}, "cost_to_go.gradient: got none, want it"),
+        ({"cost_to_go.gradient": None}, "cost_to_go.gradient: got nothing, want this field"),
         (
             {
                 name: lambda a: a[:0]
@@ -431,9 +431,9 @@ def npy(array: np.ndarray) -> bytes:
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got it twice, want it once"),
-        ("meta.npy", npy(np.array("{}")), "'meta': got it twice"),
-        ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays only"),
+        ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got two parts of this name, want one"),
+        ("meta.npy", npy(np.array("{}")), "'meta': got two parts of this name"),
+        ("readme.txt", b"hello", "'readme.txt': got a part that is no array, want arrays only"),
         ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got an array in another format"),
         (
             "multipliers.0.values.npy",
@@ -441,7 +441,7 @@ def npy(array: np.ndarray) -> bytes:
             "'multipliers.0.values': got an array in another format",
         ),
         ("multipliers.0.values.npy", npy(np.zeros((151, 1))), "sha256: got another hash than that of the content"),
-        ("clearance ", b"", "got a part of that name"),
+        ("clearance ", b"", "got a part that is no array"),
     ],
 )
 def test_other_members_are_refused(saved: Path, name: str, data: bytes, message: str) -> None:

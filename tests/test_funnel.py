@@ -171,7 +171,7 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
         ({"controller": 3}, "controller"),
         ({"progress": 3}, "progress"),
         ({"plant": 3}, "plant"),
-        ({"solution": replace(PLAN, cost_to_go=None)}, "without a cost-to-go"),
+        ({"solution": replace(PLAN, cost_to_go=None)}, "shape: got none and no cost-to-go"),
     ],
 )
 def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:
@@ -417,7 +417,7 @@ class TestReplannerWhenLeft:
         for wrong, said in (
             ({"when": 3}, "when: got 3"),
             ({"when": moved}, "when: got a funnel of another plan"),
-            ({"when": funnel, "horizon": "moving"}, 'want "shrinking"'),
+            ({"when": funnel, "horizon": "moving"}, 'want horizon="shrinking"'),
         ):
             with pytest.raises(InputError, match=said):
                 unchecked(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)

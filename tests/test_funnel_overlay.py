@@ -183,7 +183,7 @@ def test_refused(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: 
     assert "funnel" not in OVERLAYS
     for wrong, said in (
         (None, "funnel: got None with the overlay funnel"),
-        (moved, "funnel: got one with another plan"),
+        (moved, "funnel: got a funnel about another plan"),
         (flat, "states: got x, y, want the position among them"),
         (3, "funnel: got 3"),
         ((whole, whole), "funnel: got 2, want one for each of 1 runs"),

@@ -223,8 +223,8 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
         wrong("quadrotor", solution=drive_solution).reset()
     many: Any = lqrsim.gym.VectorEnvironment("quadrotor", num_envs=2, solution=quadrotor_solution)
     for reset, line in (
-        ({"seed": [1, 2]}, "seed: got 2 of them, want one"),
-        ({"options": {"reset_mask": np.array([True, False])}}, "options: reset_mask: got some"),
+        ({"seed": [1, 2]}, "seed: got 2 seeds, want one"),
+        ({"options": {"reset_mask": np.array([True, False])}}, "options: reset_mask: got a part of the episodes"),
     ):
         with pytest.raises(InputError) as caught:
             many.reset(**reset)

@@ -360,7 +360,7 @@ def test_bad_functions_get_one_line(level: str, function, fields: dict, message:
 def test_what_numba_can_not_compile_gets_one_line() -> None:
     with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got code that numba cannot compile, want .*readonly"):
         ls.ilqr(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
-    with pytest.raises(ls.InputError, match="jacobian: got one for symbolic, which is symbolic, want none"):
+    with pytest.raises(ls.InputError, match="jacobian: got a derivative of symbolic, which is symbolic, want none"):
         ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)
     with pytest.raises(ls.InputError, match="level: got 'fast', want one of: symbolic, compiled, plain"):
         ls.Dynamics(symbolic, level="fast", **FIELDS)

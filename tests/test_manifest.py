@@ -135,7 +135,7 @@ def test_what_was_edited_with_all_its_hashes_has_no_shards(folder: Path, name: s
     """Nobody can be kept from beginning another campaign, but its numbers are not those of the shards."""
     if name == "a cell relabelled":  # which no campaign has
         edit(folder, EDITS[name], seals=("digest", "sha256"))
-        with pytest.raises(ls.InputError, match="cells: got some that are not the campaign"):
+        with pytest.raises(ls.InputError, match="cells: got cells of another campaign"):
             Results(folder)
         return
     edit(folder, EDITS[name], seals=("digest", "sha256"))
@@ -156,10 +156,10 @@ def test_what_was_edited_with_all_its_hashes_has_no_shards(folder: Path, name: s
         (lambda m: m["campaign"].update(scenario=None), "scenario: got None, want a reference"),
         (lambda m: m["campaign"].update(policies=["best"]), "policies: got 'best', want one of: smooth"),
         (lambda m: m["campaign"].update(sweeps=[]), "sweeps: got {}, want at least one"),
-        (lambda m: m["campaign"]["sweeps"].update(gusts=[1]), "digest: got one that does not fit"),
+        (lambda m: m["campaign"]["sweeps"].update(gusts=[1]), "digest: got a hash that does not fit"),
         (lambda m: m["campaign"].update(time_limit=float("nan")), "time_limit: got nan, want a finite"),
         (lambda m: m.update(campaign=None), "campaign: got None, want a dictionary by name"),
-        (lambda m: m.update(cells={}), "cells: got some that are not the campaign's"),
+        (lambda m: m.update(cells={}), "cells: got cells of another campaign"),
         (lambda m: m.update(policies={"smooth": 1}), "policies.smooth: got 1, want a dictionary by name"),
         (lambda m: m["policies"].pop("smooth"), "policies: got open_loop, want smooth, open_loop"),
         (lambda m: m.update(versions={"numpy": None}), "versions.numpy: got None, want text"),

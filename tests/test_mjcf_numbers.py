@@ -183,7 +183,7 @@ def test_what_it_cannot_be_is_said_in_one_line() -> None:
         ({"cart_mass": np.nan}, r"cart_mass: got nan, want a finite number > 0"),
         ({"turn_gear": np.inf}, r"turn_gear: got inf, want a finite number"),
         ({"hinge_damping": "much"}, r"hinge_damping: got 'much', want a finite number >= 0"),
-        ({"mass": 2.0, "pole_mass": 1.0}, r"mass: got it together with pole_mass, want the mass of all or of bodies"),
+        ({"mass": 2.0, "pole_mass": 1.0}, r"mass: got mass and pole_mass, want one of the two"),
         ({"force_x": 1.0}, r"parameters: got 'force_x', want one of: mass"),
     )
     for values, message in cases:

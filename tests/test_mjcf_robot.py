@@ -599,7 +599,7 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
     mujoco.mj_step(model, data, round(0.5 / model.opt.timestep))
     moved = robot.state(data.qpos, data.qvel) - state[: 2 * model.nv]
     np.testing.assert_allclose(moved, 0, atol=1e-6)  # MuJoCo's solver ends at 1e-8 of the forces
-    with pytest.raises(InputError, match="near which nothing is at rest"):
+    with pytest.raises(InputError, match="got no state of rest nearby"):
         robot.settled(robot.at(base_z=1.0))
 
 

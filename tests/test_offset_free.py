@@ -257,7 +257,7 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
     [
         ({"sensors": "x"}, "sensors: got 'x', want a tuple of names"),
         ({"sensors": ("x", "q")}, "sensors: got 'q', want one of: x, y, z, vx"),
-        ({"sensors": ("x", "x")}, "sensors: got ('x', 'x'), want at least one state, and each once"),
+        ({"sensors": ("x", "x")}, "sensors: got ('x', 'x'), want at least one state, each at most once"),
         ({"sensors": ()}, "sensors: got (), want at least one state"),
         ({"sensors": np.ones((2, 3))}, "sensors: got shape (2, 3), want (any, 12)"),
         ({"sensors": np.ones((0, 12))}, "sensors: got no rows"),

@@ -327,7 +327,7 @@ def test_a_plan_for_another_plane_is_not_run() -> None:
     below = PlanarQuadrotor(names=("a", "b"), plane="xz", offset=0.7)
     solution = track(PlanarQuadrotor(names=("a", "b")), np.zeros(6), np.full((5, 2), 2.45), 0.02)
     with pytest.raises(
-        ls.InputError, match=r"\(a, b\) in the plane 'xy', want that .*: \(a, b\) in the plane 'xz' at 0.7 m"
+        ls.InputError, match=r"\(a, b\) in the plane 'xy', want the position .*: \(a, b\) in the plane 'xz' at 0.7 m"
     ):
         ls.simulate(fitted(below, y=0.7), solution)
 

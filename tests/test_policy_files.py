@@ -184,7 +184,7 @@ def test_the_hash_is_what_the_page_says(saved: Path) -> None:
         ),
         ({"dt": -1.0}, "dt: got -1.0"),
         ({"more": 1}, "meta: got 'more', want only"),
-        ({"gain": None}, "gain: got none, want it"),
+        ({"gain": None}, "gain: got nothing, want this field"),
         ({"bomb": np.zeros(2)}, "'bomb': got an unknown array, want only arrays of this format"),
         ({"gain": lambda a: a[:-1].copy()}, "got shape"),
         ({"gain": lambda a: a.astype(int)}, "gain: got numbers of type <i8, want <f8"),

@@ -162,7 +162,7 @@ def test_a_tube_of_another_plan_is_refused(
 ) -> None:
     look: dict = {"world": differential_drive.scene.world, "radius": 0.2}
     moved = replace(drive_tube.plan, states=drive_tube.plan.states + 0.1)
-    with pytest.raises(ls.InputError, match="tube: got one of another plan"):
+    with pytest.raises(ls.InputError, match="tube: got a tube of another plan"):
         ls.view.plot_policy(drive_solution, tmp_path / "p.png", tube=replace(drive_tube, plan=moved), **look)
     with pytest.raises(ls.InputError, match="tube: got 3, want a Tube"):
         ls.view.plot_policy(drive_solution, tmp_path / "p.png", tube=3, **look)  # pyright: ignore[reportArgumentType]
@@ -217,7 +217,7 @@ def test_solutions_without_a_cost_to_come_have_no_tube(differential_drive: ls.Sc
     solution = ls.ilqr(differential_drive.problem)
     axes = drawn(solution, differential_drive).axes[0]
     assert not [one for one in axes.collections if isinstance(one, PolyCollection)]
-    with pytest.raises(ls.InputError, match="solution: got one without a cost-to-go"):
+    with pytest.raises(ls.InputError, match="solution: got no cost-to-go"):
         ls.view.plot_policy(replace(solution, cost_to_go=None), tmp_path / "policy.png", world=ls.World([]), radius=0.1)
     assert not list(tmp_path.iterdir())
 

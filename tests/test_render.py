@@ -263,7 +263,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
         assert 1e-4 < changed < (0.2 if overlay == "caption" else 0.05), overlay
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
     options: dict = {"overlays": ("cost_tube",), "size": SMALL}
-    with pytest.raises(ls.InputError, match="solution: got one with another plan"):
+    with pytest.raises(ls.InputError, match="solution: got a plan other than"):
         render_still(
             dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options
         )

@@ -166,7 +166,10 @@ def lq(stage: ls.lq.Stage = STEP, *, initial: Any = END, final: Any = END, form:
             lambda: lq(ls.lq.Stage(A=FLAT.hessian, B=np.ones((4, 2, 1)), R=[[1.0]]), form="primal"),
             r'stage: A: got a singular matrix at step 0, want an invertible one, or form="dual"',
         ),
-        (lambda: lq(ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])), "stage: got one stage, want one a step"),
+        (
+            lambda: lq(ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])),
+            "stage: got a single stage, want one stage per step",
+        ),
         (
             lambda: ls.lq.Stage(A=np.eye(3), B=np.ones((4, 2, 1)), R=[[1.0]]),
             r"Stage: A: got shape \(4, 3, 3\), want \(4, 2, 2\)",

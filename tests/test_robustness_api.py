@@ -448,7 +448,7 @@ def test_what_hostile_calls_once_found(call: Callable[[], object], says: str) ->
 )
 def test_positions_and_velocities_are_of_as_many_states(robot: Any, positions: int, velocities: int) -> None:
     line = refusal(lambda: robot().state(np.zeros((2, positions)), np.zeros(velocities)))
-    assert line == f"qvel: got shape ({velocities},), want that of qpos, (2, {positions}), with {velocities} numbers"
+    assert line == f"qvel: got shape ({velocities},), want qpos's shape, (2, {positions}), with {velocities} numbers"
 
 
 def test_a_robot_at_rest_has_a_state() -> None:

@@ -263,7 +263,7 @@ class TestConstraintsInTheWay:
         solution = ls.smooth(problem)
         assert any(one.values.any() for one in solution.multipliers)
         assert solution.candidates == ()
-        with pytest.raises(ls.InputError, match="starts: got 3, want 1 without a start and a goal"):
+        with pytest.raises(ls.InputError, match="starts: got 3, want 1: there is nothing to go round"):
             ls.smooth(problem, starts=3)
 
 
@@ -299,7 +299,7 @@ class TestWithoutAWay:
         for changes in changed:
             problem = in_the_plane(**changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
-            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without a start and a goal"):
+            with pytest.raises(ls.InputError, match="starts: got 2, want 1: there is nothing to go round"):
                 ls.smooth(problem, starts=2)
             with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
                 ls.smooth_many([nowhere, problem], starts=2)

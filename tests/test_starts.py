@@ -219,7 +219,7 @@ def test_a_campaign_does_not_go_on_with_another_start(own: Path, tmp_path: Path)
     results = ls.stress.run_campaign(campaign, folder, workers=0)
     ls.stress.run_campaign(campaign, folder, workers=0)
     copy.write_text(OWN.replace("bulge: float = 1.2) -> ls", "bulge: float = 1.3) -> ls"), encoding="utf-8")
-    with pytest.raises(ls.InputError, match=r"^scenario: got another start than .*out was begun with"):
+    with pytest.raises(ls.InputError, match=r"^scenario: got a start other than the one .*out was begun with"):
         ls.stress.run_campaign(campaign, folder, workers=0)
     other = ls.stress.run_campaign(campaign, tmp_path / "other", workers=0).manifest
     assert other["problem"] == results.manifest["problem"]

@@ -158,7 +158,7 @@ def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], li
 
 def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"^design_disturbances: Gusts: got robot differential_drive, which has no drag"
+        InputError, match=r"^design_disturbances: Gusts: got robot differential_drive, which wind cannot push"
     ):
         ls.stress.run_campaign(
             replace(CAMPAIGN, design_disturbances=(ls.disturbances.Gusts(),)), tmp_path / "new", workers=0
@@ -235,7 +235,7 @@ def test_a_plan_with_a_clearance_is_tracked_but_not_planned_again_without_it(
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ("--controller track --open-loop", "--open-loop: got it with --controller track, want one of them"),
+        ("--controller track --open-loop", "--open-loop: got --controller track as well, want one of the two"),
         ("--design-disturbances light", "design_disturbances: got them with feedback, want track or offset_free"),
         ("--controller track --design-disturbances gale", "disturbances: got 'gale', want one of: scenario, calm"),
     ],

@@ -422,7 +422,7 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
         (lambda: problem(ls.StateBounds(y=(0, 1))), "StateBounds: states: got 'y', want one of: x, v"),
         (lambda: problem(ls.StateBounds(x=(-np.inf, 0.5)), ls.GoalState([1, 0])),
          "constraints: got a goal of 1 m for x, want x of at most 0.5 m"),
-        (lambda: ls.ilqr(problem(ls.GoalState([1, 0]))), "constraints: got some, want none for ilqr"),
+        (lambda: ls.ilqr(problem(ls.GoalState([1, 0]))), "constraints: got a problem with constraints"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_a_line(state: Callable[[], object], line: str) -> None:

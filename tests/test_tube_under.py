@@ -80,7 +80,7 @@ def test_a_tube_is_added_to_runs_of_its_plan_alone(
     np.testing.assert_array_equal(with_tube.tube, tube.covariance[:, :2, :2])
     np.testing.assert_array_equal(with_tube.collision_chance, tube.step_chance)
     moved = dataclasses.replace(run, plan=dataclasses.replace(run.plan, states=run.plan.states + 1))
-    with pytest.raises(ls.InputError, match="rollout: got one of another plan"):
+    with pytest.raises(ls.InputError, match="rollout: got a run of another plan"):
         tube.added_to(moved)
     with pytest.raises(ls.InputError, match="rollout: got 3, want a Rollout"):
         tube.added_to(3)  # pyright: ignore[reportArgumentType]

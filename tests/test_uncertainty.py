@@ -310,7 +310,7 @@ def test_those_of_ones_own(cage):
 
 
 def test_what_does_not_fit_is_refused(cage, arena):
-    with pytest.raises(InputError, match=r"^MeanWind: got robot differential_drive, which has no drag"):
+    with pytest.raises(InputError, match=r"^MeanWind: got robot differential_drive, which wind cannot push"):
         ls.uncertainty_of(arena, [ls.disturbances.MeanWind((1.0, 0.0, 0.0))])
     with pytest.raises(InputError, match=r"^MeasurementNoise: std: got 3 numbers, want 1 or 12"):
         ls.uncertainty_of(cage, [ls.disturbances.MeasurementNoise([0.1] * 3)])

@@ -1,4 +1,4 @@
-"""Kernels as machine code: compiled when first used, cached on disk by content, and called.
+"""Kernels as machine code, compiled when first used and cached on disk by content.
 
 Functions that Python calls are *entries*: they are compiled for the types of their arguments, which they get as one
 block of memory, a number or an address every 8 bytes. Functions that compiled code calls are C functions with the
@@ -44,11 +44,11 @@ from lqrsim.machine import instruction_set
 
 logger = logging.getLogger("lqrsim")
 
-# Functions that were compiled in this process, and not loaded from disk.
+# Functions that were compiled in this process instead of loaded from disk.
 compilations: list[str] = []
 compiling = threading.RLock()
 
-# Functions that take long to compile, which is announced.
+# Functions that take long to compile, for which a message is printed.
 LONG = ("smoother", "ilqr")
 
 
@@ -56,12 +56,12 @@ class CompiledModule:
     """The functions of one source for one set of sizes.
 
     `module.name(...)` calls the function of that name, with numbers, C-ordered float64 arrays, tuples and records of
-    these, and structured arrays. The shape of an array's blocks is part of its type; its first dimension is not, and
+    these, and structured arrays. The shape of an array's blocks is part of its type; the first dimension is not, and
     indices are not checked against it.
 
     Args:
-      source: the functions. sizes: name -> number, of the sizes in `kernels/declarations.py`.
-      what: its purpose, in progress messages and `lqrsim cache`.
+      source: the functions. sizes: name -> number, for sizes in `kernels/declarations.py`.
+      what: purpose of the module, for progress messages and `lqrsim cache`.
     """
 
     def __init__(self, source: Source, sizes: Mapping[str, int], what: str) -> None:
@@ -80,7 +80,7 @@ class CompiledModule:
         entry = self._last.get(name)
         if entry is not None:
             try:
-                return Call(entry, arguments)  # which checks the types
+                return Call(entry, arguments)  # this checks the types
             except TypeError:
                 pass
         types = tuple(map(type_of, arguments))
@@ -116,7 +116,7 @@ class CompiledModule:
     def _load(
         self, what: str, functions: str, write: Callable[[Program, Scope], Type | None], long: bool
     ) -> tuple[Loaded, Type | None]:
-        """Machine code of some functions, from disk or compiled now, and the type that the entry among them returns."""
+        """Machine code of some functions, from disk or newly compiled, and the type that their entry returns."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
@@ -130,7 +130,7 @@ class CompiledModule:
         self, what: str, write: Callable[[Program, Scope], Type | None], long: bool, key: str
     ) -> tuple[Loaded, Type | None]:
         compilations.append(what)
-        # A warning, because scripts show it without setting up logging: a long silence would be worse.
+        # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
         log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
         last = disk.noted(timed)
         took = "some seconds" if last is None else f"{last:.0f} s the last time"
@@ -155,9 +155,9 @@ def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
     """The CompiledModule of a source and sizes, one per process.
 
     Args:
-      source: the functions. what: as for CompiledModule. **sizes: some of those in `kernels/declarations.py`.
+      source: the functions. what: as for CompiledModule. **sizes: sizes in `kernels/declarations.py`.
     """
-    with compiling:  # also because Python 3.11 cannot parse in two threads at once
+    with compiling:  # a further reason: Python 3.11 cannot parse in two threads at once
         return _module_of(source, tuple(sizes.items()), what)
 
 
@@ -174,7 +174,7 @@ class Entry:
     """A compiled function that Python calls.
 
     Args:
-      types: types of the arguments. address: of the machine code. returns: the type of the result.
+      types: types of the arguments. address: address of the machine code. returns: type of the result.
     """
 
     def __init__(self, types: tuple[Type, ...], address: int, returns: Type | None) -> None:
@@ -187,8 +187,8 @@ class Entry:
 class Call:
     """A call of an entry, with its arguments laid out once.
 
-    `call()` repeats it, and `call(...)` takes other arguments; only those that are different objects than before are
-    laid out again. Arrays are passed by reference.
+    `call()` repeats the call, and `call(...)` takes other arguments. Only arguments that are new objects are laid out
+    again. Arrays are passed by reference.
     """
 
     def __init__(self, entry: Entry, arguments: tuple[Any, ...]) -> None:
@@ -204,7 +204,7 @@ class Call:
         if arguments:
             try:
                 self._lay_changes(self._layout, arguments, self._arguments, 0)
-            except Exception:  # leave no address of an array that is not kept alive
+            except Exception:  # must not leave the address of an array that is not kept alive
                 self._lay(self._layout, self._arguments, 0)
                 raise
             self._arguments = arguments
@@ -233,7 +233,7 @@ class Call:
             place += part.size
 
     def _lay(self, layout: "_Layout", argument: Any, place: int) -> None:
-        """Write the words of an argument, beginning at a place."""
+        """Write the words of an argument, beginning at an index."""
         kind = layout.kind
         if layout.block is not None:
             self._words[place] = _address_of(argument, layout.block)
@@ -262,12 +262,12 @@ class Call:
                     f"got {type(argument).__name__}, want a structured array of float64: {', '.join(kind.fields)}"
                 )
             if not argument.flags.c_contiguous:
-                raise TypeError("got a structured array that is not contiguous, want numpy.ascontiguousarray of it")
+                raise TypeError("got an array that is not contiguous, want numpy.ascontiguousarray(array)")
             self._words[place] = argument.ctypes.data
 
 
 class _Layout:
-    """The size of a type in words, its parts, the shape of an array's blocks, and the dtype of a structured array."""
+    """The layout of a type: size in words, parts, shape of an array's blocks, and dtype of a structured array."""
 
     def __init__(self, kind: Type) -> None:
         self.kind = kind
@@ -300,9 +300,9 @@ def _address_of(array: Array, block: tuple[int, ...]) -> int:
 
 
 def in_c_order(array: Array) -> Array:
-    """The array, or a copy that is C-ordered float64 and writable, as compiled functions want it."""
+    """The array, or a copy that is C-ordered float64 and writable, as compiled functions require."""
     if array.dtype == np.float64 and array.flags.carray:
-        return array  # at once: np.require would take most of the time of a control step
+        return array  # returned directly: np.require would take most of the time of a control step
     return np.require(array, np.float64, ["C", "W"])
 
 
@@ -329,7 +329,7 @@ def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, Type | None] 
 
 @functools.cache
 def _toolchain() -> str:
-    """A hash of everything besides the source that machine code depends on: all kernels, and the compiler's own
+    """A hash of everything that machine code depends on, except the source: all kernels, and the compiler's own
     modules.
     """
     own = (f"{__package__}.{name}" for name in ("language", "sources", "printer", "llvm", "compiled_module"))

@@ -1,11 +1,12 @@
 """A cache on disk, by content: compiled functions, and sources traced from formulas.
 
-An item's name is a hash of everything that it depends on, so it cannot be stale; its first line has a checksum, so a
-damaged item counts as missing. A cache that cannot be read or written costs time, never an error. When the items exceed
+An item's name is a hash of everything that it depends on, so it cannot be stale. Its first line contains a checksum, so
+a damaged item counts as missing. A cache that cannot be read or written costs time, never an error. When the items
+exceed
 `LIMIT`, the least recently used are removed.
 
 Items are programs: compiled functions are run, and sources are executed. The checksum protects against damage, not
-against people: whoever can write the folder can run code as whoever reads it.
+against people: anyone who can write to the folder can run code in the name of its readers.
 """
 
 import contextlib
@@ -24,13 +25,13 @@ from lqrsim.results.archive import replacing, sha256
 LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"
 _DURATIONS = "durations.json"
-_LONGEST = 100_000  # bytes of a header, and of the durations
+_LONGEST = 100_000  # largest size in bytes of a header, and of the durations
 _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
 
 
 @dataclass(frozen=True)
 class Item:
-    """One item of the cache: what it is, its size in bytes, and when it was last used (seconds since 1970)."""
+    """One item of the cache: its description, its size in bytes, and the time of its last use (seconds since 1970)."""
 
     what: str
     path: Path
@@ -76,13 +77,13 @@ def save(name: str, contents: bytes, what: str, **said: Any) -> None:
 
 
 def note(name: str, seconds: float) -> None:
-    """Store how long something took on this machine, if possible, in place of the time before."""
+    """Store, if possible, how long something took on this machine, in place of the previous time."""
     with contextlib.suppress(OSError, InputError, ValueError), replacing(folder() / _DURATIONS) as unfinished:
         unfinished.write_text(json.dumps(_durations() | {name: seconds}), encoding="utf-8")
 
 
 def noted(name: str) -> float | None:
-    """The seconds that it took the last time; None if unknown."""
+    """The seconds that something took the last time; None if unknown."""
     seconds = _durations().get(name)
     return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
 

@@ -11,7 +11,7 @@ from lqrsim.scenes.world import World
 
 
 def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
-    """Distances (...) of points (..., 2 or 3) to the nearest obstacle; a compiled `world_seen.distance(points)`."""
+    """Distances (...) of points (..., 2 or 3) to the nearest obstacle: `world_seen.distance(points)`, compiled."""
     points = np.asarray(points, dtype=np.float64)
     flat = points.reshape(1, points[..., 0].size, points.shape[-1])
     still = np.zeros((1, len(world_seen), 3))

@@ -2,7 +2,8 @@
 
 It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
 that it refers to, recursively. NumPy, SymPy and numba count by their versions. A function that refers to anything else
-(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing of it is cached.
+(an object that may change, a module of the user's own, a file) has no fingerprint, and nothing derived from it is
+cached.
 """
 
 import dis
@@ -25,7 +26,7 @@ from lqrsim.kernels import rotation_ratios
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
 # Names that read files, other names or random numbers: a function that uses them has no hash. `getattr` is allowed,
-# because what it can reach is covered, except through names like `__globals__`.
+# because everything that it can reach is covered, except through names like `__globals__`.
 _REFUSED = {
     "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "setattr", "__import__",
     "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "frompyfunc", "vectorize",
@@ -47,7 +48,7 @@ def fingerprint(function: Any) -> str | None:
 
 
 def _version(name: str) -> str:
-    """The version of a package; numba may be missing, and then no function refers to it."""
+    """The version of a package. If numba is missing, no function refers to it."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -78,7 +79,7 @@ _seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDiction
 
 
 def note_helpers(function: Any) -> None:
-    """Remember which helpers are not compiled yet: numba will compile them with their present globals."""
+    """Remember which helpers are not yet compiled: numba will compile them with their present globals."""
     if fingerprint(function) is not None:
         fresh = (helper for helper in _helpers(function) if not helper.overloads)
         _seen_fresh.update((helper, fingerprint(helper)) for helper in fresh)
@@ -91,7 +92,7 @@ def stale(function: Any) -> bool:
 
 def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
     """The parts of a Python or numba function."""
-    if id(function) in seen:  # its position tells it from other functions
+    if id(function) in seen:  # its position distinguishes it from other functions
         yield f"seen {list(seen).index(id(function))}"
         return
     seen[id(function)] = function

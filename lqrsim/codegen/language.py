@@ -14,16 +14,16 @@ Types
     tuple, record   Of any of these; records are the named tuples of `kernels/records.py`.
 
 Statements
-    assignments     To names, entries and fields; also several at once, chained and augmented. A name has one type; one
-                    that gets ints and floats is a float.
+    assignments     To names, entries and fields; several at once, chained and augmented ones are allowed. A name has
+                    one type; a name that gets ints and floats is a float.
     control flow    if, for over range, while, break, continue, return, pass. A constant condition is decided when
                     compiling, and the other branch is not compiled.
     calls           Of other kernels. No recursion, no keywords.
 
 Expressions
-    + - * / // %    As in Python, signs too. A division by zero gives infinity or NaN; // and % of ints give 0.
-    **              Of any float; a whole exponent is best constant.
-    < <= == ...     Chained, too; all parts are evaluated. and, or, not of bools, and of ints in conditions.
+    + - * / // %    As in Python, including signs. A division by zero gives infinity or NaN; // and % of ints give 0.
+    **              Of any float; whole exponents should be constant.
+    < <= == ...     May be chained; all parts are evaluated. and, or, not of bools, and of ints in conditions.
                     Conditional expressions.
     a[i, j]         Indices are nonnegative ints; of a tuple, any int if its entries have one type.
     min, max        Of two or more. abs, int, float, len of a tuple.
@@ -43,7 +43,7 @@ import numpy as np
 
 from lqrsim.errors import InputError
 
-# Functions of one float: those that LLVM knows, and those of the C library; by their names in `math`.
+# Functions of one float, by their names in `math`: functions that LLVM knows, and functions of the C library.
 UNARY = {
     name: f"llvm.{name}.f64" for name in ("sqrt", "sin", "cos", "exp", "log", "log10", "log2", "floor", "ceil", "trunc")
 } | {name: name for name in (
@@ -60,7 +60,7 @@ MATH = (*UNARY, *BINARY, *SCALES, *TESTS, *CONSTANTS)
 
 
 class SubsetError(InputError):
-    """Code outside of the subset, and where it is."""
+    """The exception for code outside of the subset, with its position."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def describe(kind: Type | None) -> str:
 
 
 def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | StructArray | Struct]:
-    """The parts of a type that are no tuples or records."""
+    """The parts of a type that are neither tuples nor records."""
     if isinstance(kind, Group):
         return [one for member in kind.members for one in scalars(member)]
     return [kind]
@@ -153,7 +153,7 @@ def llvm_type(kind: Type) -> str:
 
 
 def join(one: Type, other: Type) -> Type | None:
-    """The type that holds values of both; None if there is none."""
+    """The type that holds values of both types; None if there is none."""
     if one == other:
         return one
     if isinstance(one, Scalar) and isinstance(other, Scalar) and INT32 not in (one, other):
@@ -167,7 +167,7 @@ def join(one: Type, other: Type) -> Type | None:
 
 
 def type_of(argument: Any) -> Type:
-    """The type of an argument from Python. Raises TypeError if it has none."""
+    """The type of an argument from Python. Raises TypeError if the subset has no such type."""
     if isinstance(argument, np.ndarray):
         if argument.dtype.names:
             return StructArray(argument.dtype.names)

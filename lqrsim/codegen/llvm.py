@@ -9,7 +9,7 @@ from typing import Any
 
 from lqrsim.machine import instruction_set
 
-# Functions that LLVM may call for loops over arrays and for its intrinsics, besides those that kernels call.
+# Functions that LLVM may call for loops over arrays and for its intrinsics, in addition to those that kernels call.
 _IMPLIED = (
     "sin", "cos", "sincos", "exp", "exp2", "log", "log2", "log10", "pow", "fmod", "floor", "ceil", "trunc", "rint",
     "memcpy", "memset", "memmove",
@@ -83,7 +83,7 @@ class Loaded:
       contents: the object file. libraries: names of the C library functions that it calls.
 
     Raises:
-      RuntimeError: it is no object file for this processor, or a function is not found.
+      RuntimeError: the contents are no object file for this processor, or a function is not found.
     """
 
     def __init__(self, contents: bytes, libraries: tuple[str, ...]) -> None:
@@ -96,7 +96,7 @@ class Loaded:
             self._engine.finalize_object()
 
     def address(self, symbol: str) -> int:
-        """The address of a function. Raises RuntimeError if there is none of that name."""
+        """The address of a function. Raises RuntimeError if no function has this name."""
         found = self._engine.get_function_address(symbol)
         if not found:
             raise RuntimeError(f"the object file has no {symbol}")

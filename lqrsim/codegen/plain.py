@@ -12,7 +12,7 @@ from lqrsim.codegen.sources import PYTHON, Record, Scope, ScopedFunction, Source
 from lqrsim.errors import Array
 from lqrsim.kernels import records
 
-_LONG = 1 << 24  # entries; assumed length of the memory at an address
+_LONG = 1 << 24  # assumed length of the memory at an address, in entries
 
 # Called with each kernel, its Python function, and its arguments.
 Caller = Callable[[ScopedFunction, Callable[..., Any], tuple[Any, ...]], Any]
@@ -42,7 +42,7 @@ def plain_functions(
 def _run(
     function: ScopedFunction, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
 ) -> Callable[..., Any]:
-    """The Python function of a kernel; `made` has those that were made before."""
+    """The Python function of a kernel; `made` holds the functions that were made earlier."""
     key = id(function.scope), function.node.name
     if key in made:
         return made[key]
@@ -79,9 +79,10 @@ class _Plain(ast.NodeTransformer):
 
 
 def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
-    """Words of the language that Python does not have.
+    """Words of the language that Python lacks.
 
-    Functions of math are NumPy's, because those of `math` raise where compiled code goes on with NaN or infinity.
+    Functions of math are NumPy's, because functions of `math` raise exceptions where compiled code continues with NaN
+    or infinity.
     """
 
     def call(address: float, *arguments: Any) -> None:

@@ -39,13 +39,13 @@ from lqrsim.codegen.sources import Constant, Record, Scope, ScopedFunction, Word
 
 FAST = "reassoc nsz arcp contract"  # lets LLVM fuse and reorder sums, but keeps NaN and infinity meaningful
 MOST_FACTORS = 64  # largest constant exponent of a power that becomes a product
-MOST_ON_STACK = 1 << 20  # numbers in one work array: 8 MiB, the whole stack of a thread
+MOST_ON_STACK = 1 << 20  # largest count of numbers in a work array: 8 MiB, the whole stack of a thread
 
 _COMPARISONS = {
     ast.Lt: ("lt", operator.lt), ast.LtE: ("le", operator.le), ast.Gt: ("gt", operator.gt),
     ast.GtE: ("ge", operator.ge), ast.Eq: ("eq", operator.eq), ast.NotEq: ("ne", operator.ne),
 }  # fmt: skip
-# Numbers of arguments of words that do not have one; those of `_MANY` are the least.
+# Numbers of arguments of words that do not take one argument; the numbers of `_MANY` are the least.
 _COUNTS = {
     "min": 2, "max": 2, "rows_at": 2, "claim": 2, "load": 2, "store": 3, "fetch_add": 3, "stack": 1, "zeros": 1,
 }  # fmt: skip
@@ -59,7 +59,7 @@ _OPERATORS: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
 
 @dataclass(frozen=True)
 class Value:
-    """The value of an expression: its type, its name in LLVM or its parts, and its number if it is constant."""
+    """The value of an expression: its type, its name in LLVM or its parts, and its number if constant."""
 
     type: Type
     name: str = ""
@@ -77,11 +77,11 @@ class Block:
 
 
 class _Retyped(Exception):
-    """A variable or the result turned out to be a float: the function must be printed again."""
+    """The exception for a variable or result that turned out to be a float: the function must be printed again."""
 
 
 class Program:
-    """LLVM IR of kernels and everything that they call.
+    """The LLVM IR of kernels and everything that they call.
 
     `export` and `entry` add functions; `text` is the IR.
     """
@@ -148,7 +148,7 @@ class Program:
     def entry(self, function: ScopedFunction, types: tuple[Type, ...], symbol: str) -> Type | None:
         """Add a C function of one address, at which there are 8 bytes for each number and address of the arguments.
 
-        It writes its result after them. Returns the type of that.
+        It writes its result after them. Returns the type of the result.
         """
         kind, call, result = self._call_of(function, types)
         returned = scalars(result) if result is not None else []
@@ -188,7 +188,7 @@ class Program:
 
 
 def where(function: ScopedFunction, node: ast.AST) -> str:
-    """Where a node is, for messages."""
+    """The position of a node, for messages."""
     return f"{function.scope.source.what}: {function.node.name}, line {getattr(node, 'lineno', 0)}"
 
 
@@ -209,7 +209,7 @@ class _Body:
     """One function, printed for arguments of certain types.
 
     Args:
-      widened: names that turned out to be floats, and their types. result: the type of the result, as far as known.
+      widened: names that turned out to be floats, with their types. result: type of the result, as far as known.
     """
 
     def __init__(
@@ -688,7 +688,7 @@ class _Body:
         if _is_number(left.constant) and _is_number(right.constant) and not large:
             try:
                 return self._number(plainly(left.constant, right.constant), node)
-            except (ArithmeticError, TypeError):  # a division by zero and the like: left to the processor
+            except (ArithmeticError, TypeError):  # for example a division by zero, which is left to the processor
                 pass
         if name == "pow":
             return self._power(left, right, node)
@@ -713,7 +713,7 @@ class _Body:
         """Arithmetic of ints."""
         if name in ("add", "sub", "mul"):
             return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
-        none = self._emit(f"icmp eq i64 {b}, 0")  # a division by zero would end the process
+        none = self._emit(f"icmp eq i64 {b}, 0")  # because a division by zero would end the process
         a, b = self._emit(f"select i1 {none}, i64 0, i64 {a}"), self._emit(f"select i1 {none}, i64 1, i64 {b}")
         quotient, rest = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
         # Python rounds down, the processor towards zero.
@@ -773,7 +773,7 @@ class _Body:
         return self._decide(node, of_bools=True)
 
     def _decide(self, node: ast.BoolOp, of_bools: bool = False) -> Value:
-        """Evaluate operands until one decides; `of_bools` refuses others, which are conditions but no values."""
+        """Evaluate operands until one decides; `of_bools` refuses non-bools, which are conditions but no values."""
         decides = isinstance(node.op, ast.Or)
         end, slot, pending = self._label(), "", False
         for i, one in enumerate(node.values):
@@ -811,7 +811,7 @@ class _Body:
         if kind is None:
             self._refuse(node, f"{describe(found[0][0].type)} or {describe(found[1][0].type)}", "one type")
         slots = self._slots_of(kind)
-        for value, self._now in found:  # the type that both fit is known only now
+        for value, self._now in found:  # the common type is known only now
             self._put(slots, self._cast(value, kind, node))
             self._end(f"br label %{end}")
         self._begin(end)

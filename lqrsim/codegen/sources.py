@@ -1,6 +1,6 @@
 """Functions in the kernels' subset, and the meaning of the names in them.
 
-A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as which states are
+A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as the indices of
 the position, and functions, such as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
 a source, for the printer to LLVM IR (`printer.py`) and for plain Python (`plain.py`).
 """
@@ -21,7 +21,7 @@ from lqrsim.errors import InputError, check_kind, excerpt
 from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
 from lqrsim.results.archive import sha256
 
-# Words of the language, as `declarations.py` declares them.
+# Words of the language that `declarations.py` declares.
 WORDS = (
     "stack", "zeros", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
     "power_of_two", "inline", "outline", "exact",
@@ -36,10 +36,11 @@ class Source:
     """Functions in the kernels' subset; `source_of` and `text_source` make it.
 
     Attributes:
-      module: name of a module in `lqrsim/kernels`; empty for a text. text: defines functions.
+      module: name of a module in `lqrsim/kernels`; empty for a text. text: text that defines functions.
       constants: (name, number or tuple of numbers), which replace the module's.
-      fills: (name, source, name there) of functions that the module or its imports declare, or that replace theirs.
-      what: its name in messages.
+      fills: (name, source, name there) of functions that fill declarations of the module or its imports, or replace
+        their functions.
+      what: name of the source in messages.
     """
 
     module: str = ""
@@ -57,7 +58,7 @@ class Source:
 
     @functools.cached_property
     def digest(self) -> str:
-        """A hash of everything that defines it."""
+        """A hash of everything that defines the source."""
         filled = (f"{name}={source.digest}.{there}" for name, source, there in self.fills)
         own = _module_text(self.module) if self.module else ""
         return sha256(self.module, own, self.text, repr(self.constants), *filled)
@@ -75,7 +76,7 @@ class Source:
         )
 
     def has(self, name: str) -> bool:
-        """Whether it has a function of that name, its own or filled in."""
+        """Whether there is a function of that name, the source's own or filled in."""
         return isinstance(Scope(self, {}).find(name), ScopedFunction)
 
 
@@ -105,10 +106,11 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
     Functions of math are named without a module in it: cos, not math.cos or np.cos.
 
     Args:
-      field: its name in messages. source: text or Source. functions: name -> number of arguments, which it must define.
+      field: its name in messages. source: text or Source. functions: name -> number of arguments, for each function
+        that it must define.
 
     Raises:
-      InputError: it is neither, or does not define the functions.
+      InputError: the source is neither, or does not define the functions.
     """
     if isinstance(source, Source):
         return source
@@ -122,10 +124,10 @@ def check_source(field: str, source: object, functions: Mapping[str, int]) -> So
 
 @functools.lru_cache(maxsize=256)  # a problem that is stated repeatedly has the same sources
 def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
-    """What is wrong with a text, as a message; empty if nothing is."""
+    """A message that says what is wrong with a text; empty if the text is valid."""
     try:
         tree = ast.parse(source)
-    except Exception as error:  # SyntaxError, or others for deep nesting, null characters and the like
+    except Exception as error:  # SyntaxError, or other exceptions, as for deep nesting or null characters
         return f"got {excerpt(source)}, which is not valid Python ({error}), want function definitions"
     defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     for name, count in functions:
@@ -151,13 +153,13 @@ class ScopedFunction:
 
     @property
     def decorators(self) -> set[str]:
-        """Their names: `inline`, `outline`, `exact`."""
+        """The names of the decorators: `inline`, `outline`, `exact`."""
         return {one.id for one in self.node.decorator_list if isinstance(one, ast.Name)}
 
 
 @dataclass(frozen=True)
 class Word:
-    """A word of the language: of `declarations.py`, `math` or Python."""
+    """A word of the language, from `declarations.py`, `math` or Python."""
 
     name: str
 
@@ -241,7 +243,7 @@ class Scope:
         return self._module(module).find(name) if module.startswith(f"{kernels.__name__}.") else None
 
     def _declared(self, name: str) -> Meaning | None:
-        """The meaning of a name in `declarations.py`: a size, a word, a function filled in, or a constant."""
+        """The meaning of a name in `declarations.py`: a size, a word, a filled-in function, or a constant."""
         if name in self.sizes:
             return self.sizes[name]
         if name in WORDS:
@@ -262,7 +264,7 @@ class Scope:
         return self._declared(name)
 
     def _module(self, module: str) -> "Scope":
-        """The scope of another module of the kernels, with this source's fills as far as it leaves their names open."""
+        """The scope of another kernel module, with this source's fills for the names that the module leaves open."""
         fills = tuple(fill for fill in self.source.fills if fill[0] in _left_open(module))
         return self._scope_of(Source(module, fills=fills, what=module))
 
@@ -321,7 +323,7 @@ def _parse(text: str) -> _Parsed:
         ValueError,
         RecursionError,
         MemoryError,
-    ) as error:  # deep nesting, null characters and the like
+    ) as error:  # as for deep nesting or null characters
         raise SubsetError(f"got {excerpt(text)}, which is not valid Python ({error}), want functions") from None
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):

@@ -1,4 +1,4 @@
-"""Trace Python functions of symbols, and write the source of compiled ones. SymPy is imported only when needed."""
+"""Trace Python functions with symbols, and write the source to compile. SymPy is imported only when needed."""
 
 import contextlib
 import functools
@@ -15,11 +15,11 @@ from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.errors import InputError, check_kind, check_name, check_number, excerpt
 from lqrsim.rotations import RATIOS
 
-MOST = 1000  # parameters of a function, at most
+MOST = 1000  # largest number of parameters of a function
 
 
 class Parameters(SimpleNamespace):
-    """The `p` of `f(x, u, p)`, with an attribute for each parameter; an unknown name raises, with the valid ones."""
+    """The `p` of `f(x, u, p)`, with an attribute for each parameter; errors for unknown names list the valid names."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -28,7 +28,7 @@ class Parameters(SimpleNamespace):
 
 
 class Vector(tuple[Any, ...]):
-    """The `x` or `u` of `f(x, u, p)`: symbols by their place, `x[1]`, or by their names, `x.speed`."""
+    """The `x` or `u` of `f(x, u, p)`: symbols by index, `x[1]`, or by name, `x.speed`."""
 
     names: tuple[str, ...]
 
@@ -37,7 +37,7 @@ class Vector(tuple[Any, ...]):
         made.names = tuple(names)
         return made
 
-    def __getattribute__(self, name: str) -> Any:  # first the names: a state may be called `count`
+    def __getattribute__(self, name: str) -> Any:  # names come first: a state may be called `count`
         names = super().__getattribute__("__dict__").get("names", ())
         return self[names.index(name)] if name in names else super().__getattribute__(name)
 
@@ -71,12 +71,13 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(
     function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
 ) -> dict[str, Any]:
-    """The result of `make` for a user's function, or the same from the cache, without importing SymPy.
+    """The result of `make` for a user's function, if possible from the cache, without importing SymPy.
 
     A function without a fingerprint is not cached.
 
     Args:
-      function: the user's. details: what else the result depends on. make: returns names and JSON values.
+      function: the user's function. details: everything else that the result depends on. make: returns names and JSON
+        values.
       **kinds: the types of the values.
     """
     print_of_it = fingerprint(function)
@@ -118,14 +119,14 @@ def trace(
     """Call `function(x, u, p)` with symbols.
 
     Args:
-      function: the user's. states: names of x. controls: names of u; None for a `function(x, p)`.
+      function: the user's function. states: names of x. controls: names of u; None for a `function(x, p)`.
       parameters: names in p. constants: further attributes of p, with numbers in place of symbols.
 
     Returns:
       The expressions that it returned, the symbols of x, and the symbols of u.
 
     Raises:
-      InputError: it failed on symbols, or returned something other than expressions.
+      InputError: the function failed with symbols, or did not return expressions.
     """
     import sympy
 
@@ -141,7 +142,7 @@ def trace(
         returned = function(*given)
     except InputError as error:
         raise InputError(f"{called}: {error}") from None
-    except Exception as error:  # whatever a user's function may raise becomes one line
+    except Exception as error:  # any exception of a user's function becomes one line
         raise InputError(
             f"{called}: got {type(error).__name__} ({error}) when called with symbols, {len(x)} in x{counted},"
             " want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
@@ -149,7 +150,7 @@ def trace(
         ) from None
     if returned is None:
         raise InputError(f"{called}: got None, want expressions: is a return missing?")
-    if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
+    if hasattr(returned, "tolist"):  # a NumPy array or a SymPy matrix
         returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]
     expressions = []
@@ -180,7 +181,7 @@ def write_function(
     """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
 
     Args:
-      name, arguments: its signature. data: the argument with the parameters p0, p1, ....
+      name, arguments: signature of the function. data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
       of: the name of the user's function in messages.
       returns: the target, among `assignments`, whose value is returned.
@@ -208,7 +209,7 @@ def write_function(
             return super()._print_Pow(expr, rational=rational)
 
     def smooth_almost_everywhere(expression: Any) -> Any:
-        """Replace distributions: they are zero except at kinks and jumps, where there is no derivative."""
+        """Replace distributions by zero: they are zero except at kinks and jumps, where there is no derivative."""
         expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
         for kind in (sympy.sign, sympy.Heaviside):
             expression = expression.replace(
@@ -242,7 +243,7 @@ def write_chain(states: int, slopes: Iterable[str]) -> str:
     Known zeros make an iteration faster than zeros that are found at run time.
 
     Args:
-      states: N. slopes: the entries that are not zero, `fx[0, 3]`, `fu[1, 0]`, ....
+      states: N. slopes: the nonzero entries, `fx[0, 3]`, `fu[1, 0]`, ....
     """
     entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
     inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]

@@ -2,8 +2,8 @@
 
 Compiled code knows only the address, so it serves all functions of the same sizes. A plain function is called back
 through Python, at microseconds per call. A numba function is compiled to a C function, and cached on disk if it has a
-fingerprint: numba compiles it once, to LLVM IR. An object file of that is cached, in which everything except the
-function itself is internal: numba numbers its functions within a process, so that files of two processes would have
+fingerprint: numba compiles it once, to LLVM IR. An object file of this IR is cached. In the file everything except the
+function itself is internal: numba numbers its functions within a process, so files of two processes would contain
 different functions of the same name.
 """
 
@@ -31,7 +31,7 @@ from lqrsim.machine import instruction_set
 
 logger = logging.getLogger("lqrsim")
 
-# `contract` and the like let LLVM fuse and reorder sums, as in kernels, but keep NaN and infinity meaningful.
+# Flags such as `contract` let LLVM fuse and reorder sums, as in kernels, but keep NaN and infinity meaningful.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _SYMBOL = "function"
 
@@ -46,8 +46,8 @@ def compiled(
 
     Args:
       function: a numba function, or one that numba can compile.
-      adapter: source of `adapter`, which calls it by the name `function`.
-      names: others that the adapter uses, among them the named tuple `Parameters`. what: its name in messages.
+      adapter: source of `adapter`, which calls the function by the name `function`.
+      names: other names that the adapter uses, among them the named tuple `Parameters`. what: name in messages.
 
     Returns:
       The object that must be kept alive, and the address.
@@ -71,7 +71,7 @@ def compiled(
     found = _unpacked(*kept) if kept is not None else None
     if found is None:
         note_helpers(function)
-        # numba compiled helpers with the globals of that time: if these have changed, the result is not cached.
+        # numba compiled helpers with their globals at that time. If these have changed, the result is not cached.
         lasting = bool(key) and not stale(function)
         compilations.append(what)
         logger.debug(f"compiling {what} ...")
@@ -83,7 +83,7 @@ def compiled(
             namespace = names | _numba_names() | {"function": again, "nan": float("nan")}
             exec(compile(adapter, "<lqrsim>", "exec"), namespace)
             made: Any = numba.cfunc(numba.types.void(*[pointer] * pointers), **_OPTIONS)(namespace["adapter"])
-        except Exception as error:  # mostly NumbaError, but numba raises others, too
+        except Exception as error:  # mostly NumbaError, but numba also raises others
             raise InputError(f"{what}: got code that numba cannot compile, want {_reason(error)}") from error
         found = made, made.address
         text = made.inspect_llvm()
@@ -144,7 +144,7 @@ LEVELS = ("symbolic", "compiled", "plain")
 
 
 def level_of(function: Any, asked: str | None) -> str:
-    """The level of a function: as asked, or by default compiled for a numba function and symbolic for others."""
+    """The level of a function: the given level, or by default compiled for a numba function and symbolic for others."""
     if not callable(function):
         raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
@@ -178,22 +178,22 @@ def parameters_class(names: tuple[str, ...]) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class UserFunction:
-    """One function, and how it is called.
+    """One function of a user, and the form of its calls.
 
     With `values`, `function(x, u, p)` returns that many numbers; with `writes`, `function(x, u, p, a, b)` writes to one
-    or two arrays of those shapes, which it gets as zeros.
+    or two arrays of those shapes, which are zero on entry.
 
     Attributes:
       level: compiled or plain.
       states, controls: sizes of x and u.
       parameters: names in p; their values follow `offset` other numbers in the data.
-      unused: (index, name) of the entries of (x, u) that the value is stated not to depend on.
-      held: the object to keep alive and the address, once there is one.
-      stopped: set it to end the solves that call back, in any thread.
+      unused: (index, name) of the entries of (x, u) on which the value does not depend, according to the user.
+      held: the object to keep alive and the address, once there is an address.
+      stopped: setting it ends the solves that call the function, in any thread.
       entries: names of the returned values in messages; empty for a single number.
       columns: size of the rows in which the values are returned; 0 for a flat list.
       with_control: False for a `function(x, p)`.
-      is_memory: whether the address is that of numbers, not of a function.
+      is_memory: whether the address is the address of numbers instead of a function.
     """
 
     function: Callable[..., Any]
@@ -220,24 +220,24 @@ class UserFunction:
 
     @property
     def name(self) -> str:
-        """Its name in messages."""
+        """The name in messages."""
         of = "x, u, p" if self.with_control else "x, p"
         return f"{name_of(self.function)}({of}{', ...' if self.writes else ''})"
 
     @cached_property
     def identity(self) -> str:
-        """Its part of a problem's digest: its fingerprint, or else its byte code."""
+        """The function's part of a problem's digest: its fingerprint, or else its byte code."""
         code = getattr(getattr(self.function, "py_func", self.function), "__code__", None)
         return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
 
     def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
-        """Call it in plain Python.
+        """Call the function in plain Python.
 
         Returns:
           The returned values as one vector, or the arrays that it wrote.
 
         Raises:
-          InputError: it fails, or does not return what it should.
+          InputError: the function fails, or returns an unsuitable result.
         """
         plain = getattr(self.function, "py_func", self.function)
         if not self.held:  # before the first call compiles its helpers
@@ -252,9 +252,9 @@ class UserFunction:
                     raise InputError(f"got {excerpt(returned)} returned, want the result written to the last {last}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
-        except Exception as error:  # whatever a user's function may raise becomes one line
+        except Exception as error:  # any exception of a user's function becomes one line
             raise InputError(
-                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {first_numbers(x)}"
+                f"{self.name}: got {type(error).__name__} ({error}), want no exception at x = {first_numbers(x)}"
             ) from error
         return written or [self._vector(returned)]
 
@@ -264,7 +264,7 @@ class UserFunction:
             if array.dtype.kind not in "biufO":  # no text, no complex numbers
                 raise TypeError
             vector = np.array([float(entry) for entry in array.reshape(-1)])
-        except (TypeError, ValueError, OverflowError):  # the last for an int beyond all floats
+        except (TypeError, ValueError, OverflowError):  # OverflowError for an int beyond all floats
             raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
         if self.columns and array.shape != (wanted := (self.values // self.columns, self.columns)):
             raise InputError(f"{self.name}: got shape {array.shape}, want {wanted}: {self._wanted()}")
@@ -307,7 +307,7 @@ class UserFunction:
                             array[:] = values_written.reshape(-1)
                     else:
                         arrays[0][:] = self._vector(self.function(*given, p))
-            except BaseException as error:  # Ctrl-C, too: C code cannot pass it on, so the solver checks `raised`
+            except BaseException as error:  # even Ctrl-C: C code cannot pass it on, so the solver checks `raised`
                 self._thread.raised = error
                 for array in arrays:
                     array[:] = np.nan
@@ -319,11 +319,11 @@ class UserFunction:
 
     @property
     def raised(self) -> BaseException | None:
-        """The exception that it raised in this thread when called back; it is not called again before `forget`."""
+        """The exception that the function raised in this thread. Until `forget`, the function is not called again."""
         return getattr(self._thread, "raised", None)
 
     def forget(self) -> None:
-        """Forget the exception, so that it is called again."""
+        """Forget the exception, so that the function is called again."""
         self._thread.raised = None
 
     def adapter(self) -> tuple[str, dict[str, Any]]:
@@ -382,14 +382,14 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class Term:
-    """A part of a problem, made for one system: what gets compiled, and the numbers it reads.
+    """A part of a problem, for one system: the source to compile, and the numbers that it reads.
 
     Attributes:
-      source: text that defines the functions of its kind of term, or a Source, of a module of the package's.
-        `codegen/language.py` says what it may contain. N, M, W, sqrt, exp and the like are at hand, by their bare
-        names: `cos`, not `math.cos` or `np.cos`, which are refused; and the functions of `kernels/signed_distance.py`
-        and `kernels/rotation_ratios.py`.
-      data: (any,) float64; the source can index it, but not ask for its length.
+      source: text that defines the functions of its kind of term, or a Source, from a module of the package.
+        `codegen/language.py` defines what it may contain. N, M, W and functions such as sqrt and exp are available by
+        their bare names: `cos`, not `math.cos` or `np.cos`, which are refused. So are the functions of
+        `kernels/signed_distance.py` and `kernels/rotation_ratios.py`.
+      data: (any,) float64; the source can index it, but cannot determine its length.
       functions: functions that the source calls with `call`; their addresses come first in its data.
     """
 
@@ -409,7 +409,7 @@ class Term:
 
     @property
     def numbers(self) -> int:
-        """Number of entries in compiled code's data that belong to this."""
+        """Number of entries in compiled code's data that belong to this term."""
         return len(self.functions) + len(self.data)
 
     def __post_init__(self) -> None:
@@ -441,7 +441,7 @@ def numbers_of(part: Part) -> Array:
 
 
 def raise_again(functions: Sequence[UserFunction]) -> None:
-    """Raise the exception that one of the functions raised when compiled code called it, if one did."""
+    """Raise the exception, if any, that one of the functions raised when compiled code called it."""
     for function in functions:
         if (error := function.raised) is not None:
             function.forget()
@@ -472,16 +472,16 @@ def check_depends_on(who: str, names: object, of: str) -> tuple[str, ...] | None
 def axes_of(
     who: str, depends_on: Sequence[str] | None, names: Sequence[str]
 ) -> tuple[tuple[int, ...], tuple[tuple[int, str], ...]]:
-    """The indices of the names that a function depends on, and the others with theirs. Raises InputError."""
+    """The indices of the names that a function depends on, and the other names with indices. Raises InputError."""
     wanted = names if depends_on is None else depends_on
     axes = tuple(sorted({names.index(check_name(f"{who}: depends_on", name, names)) for name in wanted}))
     return axes, tuple((i, name) for i, name in enumerate(names) if i not in axes)
 
 
 def check_derivative(field: str, derivative: Any, function: Any, level: str, arguments: str) -> None:
-    """Raises InputError unless a derivative takes these arguments, and its function's level lets it have one."""
+    """Raises InputError unless a derivative takes these arguments, and is allowed at its function's level."""
     if level == "symbolic":
-        got = f"one for {name_of(function)}, which is symbolic"
+        got = f"a derivative of {name_of(function)}, which is symbolic"
         raise InputError(f"{field}: got {got}, want none (it is derived) or level='compiled' or 'plain'")
     check_function(field, derivative, f"a function of ({arguments})")
     level_of(derivative, level)
@@ -489,7 +489,7 @@ def check_derivative(field: str, derivative: Any, function: Any, level: str, arg
 
 
 def plain_calls(functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> list[Callable[..., None]]:
-    """The functions for `plain_functions`: each writes the values that the user's function returns."""
+    """The functions for `plain_functions`. Each writes the values that the user's function returns."""
 
     def calling(function: UserFunction) -> Callable[..., None]:
         def run(x: Array, u: Array, data: Array, *outputs: Array) -> None:

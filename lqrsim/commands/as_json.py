@@ -74,7 +74,7 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     """The outcomes of a rollout's trials, as in the tables of a stress test.
 
     Args:
-      problem: for the costs; there are none without it, or if it has another horizon.
+      problem: the problem, for the costs; without it, or with another horizon, there are no costs.
     """
     from lqrsim.stress.outcome_table import outcomes
 

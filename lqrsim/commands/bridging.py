@@ -1,4 +1,4 @@
-"""The command that controls a robot by messages of ROS 2, or is that robot."""
+"""The command that controls a robot through ROS 2 messages, or simulates such a robot."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +14,8 @@ class Bridge:
     """Run a policy on a robot, by messages of ROS 2; needs lqrsim[ros].
 
     Reads states from an Odometry or a JointState and publishes a Float64MultiArray in each control period. The safe
-    command is published last: at the end, if states stay away, on an error and on Ctrl-C. docs/bridge.md has units,
-    frames, and what happens when. Exits with 1 if it had to stop early.
+    command is published last: at the end, if states stay away, on an error and on Ctrl-C. docs/bridge.md describes
+    units, frames and reactions to events. Exits with 1 if it had to stop early.
 
       lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --safe 0 0 0 0
       lqrsim bridge runs/quadrotor/solution.npz --odometry /odom --commands /rotors/commands --robot  # in place of it
@@ -84,7 +84,7 @@ class Bridge:
 
         solution = save_load.load(self.policy, Solution)
         if not self.scenario and not solution.scenario:
-            raise InputError("--scenario: got none, and the solution names none, want the one to run with --robot")
+            raise InputError("--scenario: got none, and the solution names none, want the scenario to run with --robot")
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
         with bridge.SimulatedRobot(solution, **topics) as robot:
             rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough(None, None))

@@ -1,4 +1,4 @@
-"""Shared by the commands: output, progress, and an early check whether the results can be written."""
+"""Functions that the commands share: output, progress, and an early check that the results can be written."""
 
 import contextlib
 import os
@@ -34,13 +34,13 @@ class Runnable(Protocol):
 
 
 def run(command: Runnable, name: str) -> int:
-    """Run a command. With `--json` it prints one JSON object, also for bad input, and everything else to stderr.
+    """Run a command. With `--json` it prints one JSON object, even for bad input, and everything else to stderr.
 
     Returns:
       The exit code.
 
     Raises:
-      InputError: the command's own.
+      InputError: raised by the command.
       process.Unprintable: stdout cannot be written.
     """
     if not getattr(command, "json", False):
@@ -83,7 +83,7 @@ def wrote(path: Path) -> None:
 
 
 def say(text: str = "") -> None:
-    """Print immediately, also to a file or a pipe, and above any progress bar.
+    """Print immediately, even to a file or a pipe, and above any progress bar.
 
     Raises:
       process.Unprintable: stdout cannot be written.
@@ -118,7 +118,7 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
 
 @contextlib.contextmanager
 def keeping(write: Callable[[Any], object]) -> Iterator[None]:
-    """A block after which `write` is called with what Ctrl-C left, if it did (see `process.keeping`)."""
+    """Run a block. If Ctrl-C ends it and leaves a partial result, call `write` with that; see `process.keeping`."""
     try:
         yield
     except KeyboardInterrupt as stop:
@@ -128,7 +128,7 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
 
 
 def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":
-    """Solve a scenario; print each iteration as it ends, then the status. The options are those of the solver."""
+    """Solve a scenario; print each iteration as it ends, then the status. The options are the solver's options."""
     from lqrsim.results.solution_parts import Iteration
     from lqrsim.scenarios import solutions
 
@@ -149,13 +149,14 @@ def bar(**options: Any) -> "tqdm[Any]":
     """A progress bar, with the options of tqdm."""
     from tqdm import tqdm
 
-    # tqdm's own lock is also one of processes: a named semaphore, of which Python complains if a signal ends this one.
+    # tqdm's own lock also locks processes: it is a named semaphore, about which Python complains if a signal ends this
+    # process.
     tqdm.set_lock(threading.RLock())
     return tqdm(**options)
 
 
 class Progress:
-    """How far something is: a bar on a terminal; elsewhere a line now and then. Call it with how much is done.
+    """The progress of some work: a bar on a terminal, elsewhere occasional lines. Call it with the amount done.
 
     The first call starts the clock: preparations before it, such as compiling, do not count.
     """
@@ -168,7 +169,7 @@ class Progress:
         self._before = 0
 
     def __call__(self, done: int, total: int, found: str = "") -> None:
-        """Show that `done` of `total` are done, and what has been found so far."""
+        """Show that `done` of `total` are done, and the result so far."""
         now = time.monotonic()
         if self._bar is None:
             self._begun, self._last_line, self._before = now, now, done

@@ -1,4 +1,4 @@
-"""The commands that write source files: of a new robot, and a policy as C."""
+"""Commands that write source files: a new robot, or a policy as C."""
 
 import builtins
 import importlib.util
@@ -25,12 +25,12 @@ TAKEN = {
 class New:
     """Write the files of a new robot.
 
-    The folder has an MJCF, dynamics, a scenario and a test. They work as they are: a disc is pushed round a crate.
-    Prints the commands that solve, simulate, render and test it. docs/new_robot.md says what to change.
+    The folder contains an MJCF, dynamics, a scenario and a test. They work unchanged: a disc is pushed round a crate.
+    Prints the commands that solve, simulate, render and test it. docs/new_robot.md explains the changes to make.
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """Name of the robot, as Python can import it: small letters, digits and underscores."""
+    """Name of the robot, a name that Python can import: lower-case letters, digits and underscores."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path(".")
     """Folder in which the robot's folder is made."""
 
@@ -79,11 +79,11 @@ class Export:
     number: Literal["float", "double"] = "float"
     """Type of the numbers, except the time, which is a double."""
     gains: Literal["full", "int16"] = "full"
-    """int16: matrices take 16 bits an entry. What that changes of the commands is printed, and is in the header."""
+    """int16: matrices take 16 bits an entry. The largest change of the commands is printed and in the header."""
     interpolate: bool = False
     """Blend the laws of two knots, for loops that are faster than the plan; not with a filter."""
     name: str = "policy"
-    """Name of the files and the functions: small letters, digits and underscores."""
+    """Name of the files and the functions: lower-case letters, digits and underscores."""
     json: Json = False
 
     def run(self) -> int:
@@ -92,7 +92,7 @@ class Export:
         from lqrsim.results.export_c import export_c
 
         console.check_output("--c", self.c)
-        policy: Any = save_load.load(self.policy)  # what cannot be exported is refused
+        policy: Any = save_load.load(self.policy)  # `export_c` refuses anything that cannot be exported
         found = export_c(
             policy, self.c, number=self.number, gains=self.gains, interpolate=self.interpolate, name=self.name
         )
@@ -104,10 +104,10 @@ class Export:
 
 
 def check_robot_name(name: str) -> None:
-    """Raise InputError unless the name can be that of a new module."""
+    """Raise InputError unless a new module can have this name."""
     from lqrsim.errors import InputError, excerpt
 
-    wanted = "small letters, digits and underscores, a letter first, such as my_robot"
+    wanted = "lower-case letters, digits and underscores, beginning with a letter, such as my_robot"
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise InputError(f"name: got {excerpt(name)}, want {wanted}")

@@ -46,7 +46,7 @@ class Reproduce:
     Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes some hours,
     the longest being robust_policies and adaptive_quad_bench. Includes other solvers and controllers with the extra
     bench, other simulators with rotorpy and crazyflow, and an emulated board with arm-none-eabi-gcc and
-    qemu-system-arm. What is not installed is skipped, and named.
+    qemu-system-arm. Programs that are not installed are skipped, and named.
 
     Exits with 1 if an experiment failed, whether or not the paper's statements hold.
     """

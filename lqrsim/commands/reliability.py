@@ -19,7 +19,7 @@ class FailureOptions(PolicyOptions):
     """Options of `rare` and `break`."""
 
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
-    """Disturbances, as in `lqrsim stress`. By default those of the scenario's demo."""
+    """Disturbances, as in `lqrsim stress`. By default the disturbances of the scenario's demo."""
     failure: Literal["collision", "miss"] = "collision"
     """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal."""
 
@@ -99,7 +99,7 @@ class Break(FailureOptions):
     """Find the smallest disturbance that causes a failure.
 
     It is the failure nearest to the undisturbed trial, measured over all random numbers of a trial in standard
-    deviations. Prints that distance, the first-order estimate of the failure probability, the share of each
+    deviations. Prints that distance, the first-order estimate of the failure probability, the contribution of each
     disturbance, and the largest values in physical units. Writes rollout.npz, with that trial, for `lqrsim render`, and
     break.json, with settings, results and the random numbers. Ctrl-C keeps the result of the rounds that are done.
 
@@ -146,7 +146,7 @@ class Certify:
     repetitions: Annotated[int | None, optional("INT")] = None
     """Number of its repetitions to run, at least 2. By default all."""
     seed: Annotated[int | None, optional("INT")] = None
-    """Another seed, for fresh random numbers: then the intervals are compared. By default that of the certificate."""
+    """Another seed, for fresh random numbers: then the intervals are compared. By default the certificate's seed."""
     scenario: OwnScenario = None
     json: Json = False
 
@@ -211,9 +211,9 @@ class FunnelCommand(PolicyOptions):
     """
 
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ("scenario",)
-    """Sets by name, as in `lqrsim simulate`. By default those of the scenario's demo."""
+    """Sets by name, as in `lqrsim simulate`. By default the disturbances of the scenario's demo."""
     rate: float = 0.99
-    """Wanted share of runs that reach the goal."""
+    """Wanted fraction of runs that reach the goal."""
     confidence: float = 0.95
     """Probability that all levels are right."""
     knots: Annotated[tuple[int, ...], optional("N ...")] = ()
@@ -241,7 +241,7 @@ class FunnelCommand(PolicyOptions):
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
         knots, states = self.knots or None, self.states or None
         options = self.rate, self.confidence, knots, states, self.failures, None, self.seed
-        FunnelOptions.of(space, steps, *options)  # before it is solved
+        FunnelOptions.of(space, steps, *options)  # checked before the solve
         scenario.target_radius(self.goal_radius, self.goal_tolerance)
         disturbances = []
         for one in (one for name in self.disturbances for one in disturbance_set(name, scenario)):

@@ -15,11 +15,11 @@ from lqrsim.errors import InputError, check_name
 from lqrsim.machine import description
 from lqrsim.results.save_load import replacing
 
-# In the wheel experiments/ lies inside the package, in the repository beside it.
+# In the wheel, experiments/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "experiments", Path(__file__).parents[2] / "experiments"]
 EXPERIMENTS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
-# In the order of the page. With --json each prints its result, its report in Markdown, and its statements.
+# In the order of the page. With --json each script prints its result, its report in Markdown, and its statements.
 SCRIPTS = (
     "figure_2",
     "figure_3",
@@ -38,10 +38,10 @@ SCRIPTS = (
     "export_c",
 )
 
-TIDYING = 20.0  # s, for a stopped script to remove unfinished files
+TIDYING = 20.0  # s, time for a stopped script to remove unfinished files
 VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
 
-ScriptResult = dict[str, Any]  # what a script of experiments/ prints with --json
+ScriptResult = dict[str, Any]  # output of a script of experiments/ with --json
 
 # Runs a script as usual, but a signal lets it remove unfinished files, and end silently.
 _START = "import sys; from lqrsim.process import run_script; run_script(sys.argv[1:])"
@@ -49,7 +49,7 @@ _START = "import sys; from lqrsim.process import run_script; run_script(sys.argv
 
 @dataclass(frozen=True)
 class Failure:
-    """A script that failed."""
+    """A failed script."""
 
     script: str
     code: int
@@ -61,7 +61,7 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
     Args:
       scripts: names in `SCRIPTS`; none means all.
       out: output folder.
-      quick: run a small part of each.
+      quick: run a small part of each script.
       keep: whether results of other scripts in `results.json` stay.
 
     Returns:
@@ -110,19 +110,19 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool, keep: bool = Fa
 
 
 def _kept(file: Path, *, quick: bool) -> dict[str, Any]:
-    """What an earlier call saved. Raises InputError if it cannot be read, or is of a run of another size."""
+    """The results that an earlier call saved. Raises InputError if they cannot be read, or if --quick differs."""
     try:
         saved = json.loads(file.read_text(encoding="utf-8"))
         other = saved["quick"] is not quick
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"--keep: got {file}, want a file that `lqrsim reproduce` wrote") from None
     if other:
-        raise InputError(f"--keep: got results {'without' if quick else 'with'} --quick in {file}, want the same")
+        raise InputError(f"--keep: got {file}, written {'without' if quick else 'with'} --quick, want the same option")
     return saved
 
 
 def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
-    """Run a script in a process of its own, so that scripts do not affect each other. Returns its result."""
+    """Run a script in its own process, so that scripts do not affect each other. Returns its result."""
     script = EXPERIMENTS / f"{name}.py"
     command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
     below = os.environ | {"TQDM_POSITION": "1"}  # its bars go below ours
@@ -149,7 +149,7 @@ def _end(running: subprocess.Popen[str]) -> None:
 
 
 def results_page(saved: Mapping[str, Any]) -> str:
-    """All results in Markdown: verdicts on the paper's statements, what was run, and the report of each script."""
+    """All results in Markdown: verdicts on the paper's statements, the runs, and the report of each script."""
     results: dict[str, ScriptResult] = saved["results"]
     statements = [statement for one in results.values() for statement in one["statements"]]
     versions = next(iter(results.values()))["result"]["versions"]
@@ -190,7 +190,7 @@ def results_page(saved: Mapping[str, Any]) -> str:
 
 
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
-    """How many statements hold, as text."""
+    """Text with the number of statements that hold."""
     counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
     said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."

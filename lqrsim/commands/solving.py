@@ -83,7 +83,7 @@ class Solve:
     clearance: Annotated[float | None, optional("METRES")] = None
     """Constrain the distance to all obstacles to at least this, at the steps. By default obstacles only add cost."""
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
-    """Limits of every control for planning, in its unit. By default those of the actuators."""
+    """Limits of every control for planning, in its unit. By default the actuators' limits."""
     figure: Annotated[Path | None, optional("FILE")] = None
     """Also plot the policy to FILE.png, .pdf or .svg: the predicted tube under the scenario's disturbances, the
     cost-to-go along the plan, and the gains over time."""
@@ -111,7 +111,7 @@ class Solve:
             "--paper-start": self.paper_start,
         }
         if self.solver != "smooth" and (wrong := [name for name, given in of_smooth.items() if given]):
-            raise InputError(f"{', '.join(wrong)}: got it for {self.solver}, want it with --solver smooth")
+            raise InputError(f"{', '.join(wrong)}: got --solver {self.solver}, want --solver smooth")
         given = {name: getattr(self, name) for name in ("tolerance", "max_iterations", "time_limit", "starts")}
         options = {"stop": self.stop, **{name: value for name, value in given.items() if value is not None}}
         if self.finish == "none":
@@ -133,7 +133,7 @@ class Solve:
         return 0 if solution.success else 1
 
     def _start(self, scenario: "Scenario") -> "StartLike":
-        """The start of the solve. Raises InputError for several, or one that the scenario does not have."""
+        """The start of the solve. Raises InputError for several starts, or a start that the scenario lacks."""
         from lqrsim.errors import InputError
         from lqrsim.scenarios.solutions import stored_start
 
@@ -145,7 +145,7 @@ class Solve:
             return stored_start(scenario, self.start)
         if self.paper_start:
             if scenario.paper_start is None:
-                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario of the paper")
+                raise InputError(f"--paper-start: got {scenario.name}, want a scenario of the paper")
             return scenario.paper_start
         return None if self.starts is not None else scenario.start
 
@@ -169,7 +169,7 @@ class Simulate:
     """Robot and scene, as in `lqrsim solve`. By default the scenario that was solved, if `lqrsim list` has it. Files
     never choose code to run: name your own function here."""
     out: Folder = None
-    """Folder for rollout.npz. By default that of the solution."""
+    """Folder for rollout.npz. By default the folder of the solution."""
     open_loop: bool = False
     """Run the plan without feedback: its controls, whatever the state."""
     controller: ControllerName = "feedback"
@@ -178,7 +178,7 @@ class Simulate:
     design_disturbances: DesignSet = None
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
-    those of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
+    the set of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
     strength: Strength = 1.0
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
@@ -210,13 +210,13 @@ class Simulate:
         from lqrsim.stress.policies import check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
-            raise InputError(f"--open-loop: got it with --controller {self.controller}, want one of them")
+            raise InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
         solution = save_load.load(self.solution, Solution)
         if not self.scenario and not solution.scenario:
             raise InputError(
-                "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
+                "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
             )
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
         if self.open_loop:

@@ -34,7 +34,7 @@ class Stress:
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """As in `lqrsim solve`."""
     sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("light",)
-    """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for those of the scenario's demo;
+    """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for its demo's disturbances;
     NAME:KIND for one kind alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """Factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate."""

@@ -1,6 +1,4 @@
-"""Commands that render and view runs.
-
-The command that verifies runs from pixels."""
+"""Commands that render and view runs, and that verify runs from pixels."""
 
 import contextlib
 import os
@@ -62,7 +60,7 @@ class Render:
     quality: Quality = "standard"
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
-    """In pixels. By default that of the quality, and half of it for a GIF, but not less than 480 x 270."""
+    """In pixels. By default the size of the quality, and half of it for a GIF, but not less than 480 x 270."""
     fps: Annotated[float | None, optional("RATE")] = None
     """Frames per second of a video. By default 30, and 15 for a GIF."""
     speed: float = 1.0
@@ -90,7 +88,7 @@ class Render:
         if out.suffix.lower() not in (".mp4", ".gif", ".png"):
             raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png or .rrd")
         if not is_still and (self.time is not None or self.every is not None):
-            raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they belong to stills")
+            raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
         console.check_output("--out", out.parent, out.name)
         runs = [save_load.load(path, Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:
@@ -310,7 +308,7 @@ class Verify:
         solution = None
         if self.solution or os.path.isfile(beside):
             solution = save_load.load(self.solution or beside, Solution)
-            # The solution file beside a run may belong to another run; one that is given is used in any case.
+            # The solution file next to a run may belong to another run; a given solution is used in any case.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:

@@ -1,1 +1,1 @@
-"""Controllers, which run on a robot."""
+"""Controllers that run on a robot."""

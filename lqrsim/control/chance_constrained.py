@@ -1,11 +1,11 @@
-"""Plans that keep so far from obstacles, step by step, that they collide no more often than is asked.
+"""Plans whose chance of collision is bounded, by a clearance from obstacles at each step.
 
-The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
-for all steps. It is chosen such that the chance of any collision, as `collision_chance.py` computes it, is the
-requested one. A plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+The clearance at a step is a multiple of the standard deviation of the robot's predicted position. The multiple is the
+same for all steps. It is chosen so that the chance of any collision, as `collision_chance.py` computes it, equals the
+requested one. Each plan has its own tube, so the multiple is found by solving again a few times.
 
-Where no such clearance is safe enough, or there is no room for it, obstacles cost more and more instead. Such plans use
-all the room that there is, where a constraint says only that it is too little.
+If no clearance is safe enough, or there is no room for it, the weights of the obstacles are raised instead. Such plans
+use all the room that there is. A constraint would only report that there is too little.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -37,10 +37,10 @@ from lqrsim.solvers.smoother import smooth
 
 # A plan whose chance is below the requested one by no more than this factor is not made cheaper.
 ENOUGH = 0.5
-HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
+HELD = 1e-3  # m; a clearance that exceeds its margin by at most this is determined by the margin
 AIM = 0.8  # target for the next plan, relative to the requested chance
-PATIENCE = 2  # plans in a row that are not safer than the safest, after which wider margins, or weights, are given up
-HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # times the weight of the obstacles' cost
+PATIENCE = 2  # stop widening margins, or raising weights, after this many plans in a row without a safer one
+HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # factors of the weight of the obstacles' cost
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
@@ -50,14 +50,14 @@ class SafePlan:
 
     Attributes:
       problem: the problem, with the clearances that were found as constraints; or with heavier obstacles.
-      solution: solution of it.
+      solution: the solution of that problem.
       controller: the controller that follows the plan, an OffsetFree or a policy.
       tube: the prediction of its runs; `tube.collision_chance` is the chance.
       asked: the requested chance.
-      rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
-      weight: by how much the weight of the problem's obstacles is multiplied, in its own cost as well; mostly by 1.
-      instead: if it is not safe enough, the predicted chances on the same plan with actuators that do not lag, twice
-        their range, exact sensors, and all of these: what limits it.
+      rounds: for each plan that was solved for: smallest and largest margin in m, cost, and predicted chance.
+      weight: factor of the weight of the problem's obstacles, in its own cost as well; usually 1.
+      instead: if the plan is not safe enough, the predicted chances on the same plan with actuators without lag, with
+        twice their range, with exact sensors, and with all of these. They show what limits the safety.
     """
 
     problem: Problem
@@ -109,20 +109,20 @@ def smooth_chance_constrained(
 ) -> SafePlan:
     """A plan whose predicted chance of collision is at most the requested one, at little additional cost.
 
-    It ends when the chance is between half of the requested one and the requested one, or when the plan without any
-    clearance is safe enough. If no clearance is safe enough, the problem's obstacles get 10 to 3000 times their weight.
-    If that does not do either, it returns the safest plan found, with `success` False: print(plan) says how far it got;
-    allow a higher chance, estimate better, or permit another way round.
+    The search ends when the predicted chance is between half the requested chance and the requested chance, or when the
+    plan without any clearance is safe enough. If no clearance is safe enough, the weights of the problem's obstacles
+    are multiplied by 10 to 3000. If that fails too, the safest plan found is returned, with `success` False.
+    `print(plan)` then shows how close it came. Allow a higher chance, improve the estimation, or permit another route.
 
     Args:
       problem: a problem with obstacles in its costs or constraints.
       uncertainty: the uncertainty in a run; see `uncertainty_of`.
       chance: chance of collision, between 0 and 1.
-      controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
-        OffsetFree for the uncertainty, with tolerances chosen for the second plan.
-      rounds: plans with clearances to solve for, at most.
-      progress: called with the plans that are done, the most that there may be, with margins and then with heavier
-        obstacles, and what the last one found as text.
+      controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
+        an OffsetFree for the uncertainty, with tolerances chosen for the second plan.
+      rounds: the largest number of plans with clearances.
+      progress: called with the number of plans that are done, the largest possible number of plans, and a text about
+        the last one. The largest number counts plans with margins and plans with heavier obstacles.
 
     Returns:
       The SafePlan.
@@ -139,7 +139,7 @@ def smooth_chance_constrained(
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.kept:
-        raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
+        raise InputError("problem: got a problem without obstacles, want an ObstacleCost or a Clearance in it")
     search = _Search(problem, uncertainty, chance, controller, surroundings)
     most = rounds + (len(HEAVIER) if problem.obstacle_costs else 0)
 
@@ -164,9 +164,9 @@ def smooth_chance_constrained(
 
 
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
-    """Predicted chances of collision on a plan, if one thing after another were better, and if all were.
+    """Predicted chances of collision on a plan, with one improvement at a time, and with all of them.
 
-    An OffsetFree is made for that.
+    Each prediction uses an OffsetFree made for it.
     """
     policy = plan.solution.policy
     space = policy.control_coordinates
@@ -192,7 +192,7 @@ def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float
 
 
 class _Search:
-    """The plans so far, and the number of standard deviations that each kept."""
+    """The plans so far, and the number of standard deviations of clearance in each."""
 
     def __init__(
         self, problem: Problem, uncertainty: Uncertainty, asked: float, make: MakeController | None,
@@ -201,18 +201,18 @@ class _Search:
         self.problem, self.uncertainty, self.asked = problem, uncertainty, asked
         self.make, self.surroundings = make, surroundings
         self.plans: list[SafePlan] = []
-        self.margin = np.zeros((1, 1))  # that the last of them kept, (T+1, O)
+        self.margin = np.zeros((1, 1))  # margin of the last plan, (T+1, O)
         self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
-        # Numbers of standard deviations: the largest that is too small, the smallest that is enough, the smallest
-        # without a plan.
+        # Numbers of standard deviations: the largest that is too small, the smallest that is enough, and the smallest
+        # for which no plan was found.
         self.too_few, self.enough, self.impossible = 0.0, np.inf, np.inf
-        self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances then
+        self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances at these numbers
 
     def solve(self, deviations: float | None) -> None:
         """Plan with a margin of that many standard deviations, and predict the outcome."""
         problem, start, margin = self.problem, None, self.margin
-        # Whose clearances are the same at all steps: the place of the first matters little.
+        # The second plan has the same margin at all steps, because the position of the first plan matters little.
         second = len(self.plans) == 1
         if deviations is not None:
             base = self.plans[-1]
@@ -221,7 +221,7 @@ class _Search:
                 margin = np.full_like(margin, np.sqrt((margin**2).mean()))
             kept = self.surroundings.keep_away(margin)
             problem = replace(problem, constraints=(*problem.constraints, *kept))
-            # The first plan may cut through obstacles: from there the way round would be as it happens.
+            # The first plan may cut through obstacles: a solve from it would choose the route by chance.
             start = None if second else base.solution.trajectory
         solution = smooth(problem, start=start) if start is not None else smooth(problem)
         if not solution.success and start is not None:
@@ -236,7 +236,7 @@ class _Search:
         if tube.collision_chance > self.asked:
             if deviations > self.too_few:
                 self.too_few, self.log_of_too_few = deviations, np.log(tube.collision_chance)
-        elif not second and deviations < self.enough:  # the second plan's margins are others, and may be too large
+        elif not second and deviations < self.enough:  # the second plan has other margins, perhaps too large
             self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
 
     def _keep(self, problem: Problem, solution: Solution, weight: float) -> Tube:
@@ -253,7 +253,7 @@ class _Search:
         return tube
 
     def heavier(self) -> Iterator[float]:
-        """The weights of obstacles to try, as long as no plan is safe enough and heavier ones help."""
+        """The weights of obstacles to try, as long as no plan is safe enough and larger weights help."""
         if self.problem.obstacle_costs:
             first = len(self.plans)
             for times in HEAVIER:
@@ -271,7 +271,7 @@ class _Search:
             self._keep(problem, solution, times)
 
     def _gave_up(self, first: int) -> bool:
-        """Whether the last plans, of those from the first on, were no safer than the safest of these."""
+        """Whether the last plans, counted from the given one on, were no safer than the safest of them."""
         chances = [plan.tube.collision_chance for plan in self.plans[first:]]
         return len(chances) > PATIENCE and min(chances[-PATIENCE:]) >= min(chances[:-PATIENCE])
 
@@ -279,7 +279,7 @@ class _Search:
         if self.make is not None:
             return self.make(problem, solution)
         law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
-        if len(self.plans) == 1:  # one law for all later plans, so that of two the one with more room is the safer
+        if len(self.plans) == 1:  # one law for all later plans, so that the plan with more room is safer
             self.tolerate = tuple((law.weights.state**-0.5).tolist())
         return law
 
@@ -289,7 +289,7 @@ class _Search:
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
     def next_deviations(self) -> float | None:
-        """How many standard deviations to try next; None where more would not help."""
+        """The number of standard deviations to try next; None if more would not help."""
         plan = self.plans[-1]
         chance = plan.tube.collision_chance
         first = len(self.plans) == 1 and self.impossible == np.inf
@@ -300,7 +300,7 @@ class _Search:
             return None
         if self._gave_up(0):
             return None
-        if np.isfinite(self.impossible):  # between a margin that has a plan and one that has none
+        if np.isfinite(self.impossible):  # between a margin with a plan and a margin without
             low = self.too_few if not np.isfinite(self.enough) else None
             if low is None or self.impossible - low < 0.05 * self.impossible:
                 return None
@@ -312,18 +312,19 @@ class _Search:
             return None
         if self.too_few == 0 and self.too_few < wanted < self.enough:
             return wanted
-        # Between the two the logarithm of the chance is taken to be linear.
+        # Between the two, the logarithm of the chance is assumed to be linear.
         share = (self.log_of_too_few - np.log(AIM * self.asked)) / (self.log_of_too_few - self.log_of_enough)
         return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
         """The number of standard deviations at which the plan would be exactly as safe as requested.
 
-        If all that is nearer moved out there, and what only keeps the margin that it must moved in.
+        Assumes that all smaller clearances grow to it, and that clearances that only just keep a larger margin shrink
+        to it.
         """
         clearance, std, correlation = self._spread(plan)
         clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
-        # The moments' chance of the next plan is taken to be as wrong as that of this one.
+        # The moments are assumed to misjudge the next plan's chance by the same factor as this plan's.
         wanted, tube = AIM * self.asked, plan.tube
         if tube.collision_chance > 0:
             wanted *= tube.linear_chance / tube.collision_chance
@@ -343,7 +344,7 @@ class _Search:
         return min(self.plans, key=lambda plan: (not plan.solution.success, plan.tube.collision_chance))
 
     def last(self) -> str:
-        """The last plan, for the progress."""
+        """A text on the last plan, for `progress`."""
         low, high, cost, chance = self.lines[-1]
         weight = self.plans[-1].weight
         how = f"margins of {low:.3g} to {high:.3g} m" if weight == 1 else f"{weight:g} times the weight of obstacles"

@@ -2,8 +2,8 @@
 
 The clearance of each obstacle is linearised about the mean, so that it is normally distributed. A collision is counted
 when it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring
-steps are nearly the same number, so to add up or to multiply the chances of single steps would count each collision
-many times.
+steps are nearly the same number, so adding or multiplying the chances of single steps would count each collision many
+times.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,15 @@ from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear, ShapeInWorld, each_once
 from lqrsim.problem.problem import Problem
 
-FAR = 12.0  # standard deviations of clearance, with which the chance of a collision is below 1e-32
+FAR = 12.0  # standard deviations of clearance; beyond, the chance of a collision is below 1e-32
 
 
 class Spread(NamedTuple):
     """Distribution of the clearances to O obstacles at T+1 knots.
 
     Attributes:
-      mean: in m, (T+1, O). std: in m, (T+1, O). correlation: of each with that of the knot before, (T, O).
+      mean: mean in m, (T+1, O). std: standard deviation in m, (T+1, O). correlation: correlation of each clearance with
+        the same clearance at the previous knot, (T, O).
     """
 
     mean: Array
@@ -37,9 +38,10 @@ class Surroundings:
     """Obstacles of a problem, as its robot sees them.
 
     Attributes:
-      kept: the costs and constraints that keep the robot away from obstacles, each kind once.
-      shapes: for each of these the robot among its obstacles.
-      place: the states that are its position. position: the same, or, with balls or geoms, all states that move it.
+      kept: the costs and constraints that keep the robot away from obstacles, without repetitions.
+      shapes: for each of these, the shape of the robot among its obstacles.
+      place: the states that are the robot's position. position: the same; with balls or geoms, all states that move
+        these.
       std: standard deviation of an obstacle's position, in m.
     """
 
@@ -70,9 +72,9 @@ class Surroundings:
         return [Clearance(one.world, **one.shape, margin=own) for one, own in pairs]
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
-        """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p), and its variance (O,).
+        """At states (K, n): the distance to each obstacle (K, O), its gradient (K, O, p) and its variance (O,).
 
-        With balls it is the clearance of the ball nearest to the obstacle.
+        With balls, the distance is measured from the ball nearest to the obstacle.
         """
         if not self.shapes:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
@@ -86,11 +88,11 @@ class Surroundings:
 
     @property
     def by_mujoco(self) -> bool:
-        """Whether distances are those of MuJoCo's geoms."""
+        """Whether MuJoCo computes the distances, between geoms."""
         return any("geoms" in one.shape for one in self.kept)
 
     def displacements(self, rng: np.random.Generator, trials: int) -> list[Array]:
-        """By how much the obstacles of each world are off in K trials, (K, O, 3), in their plane; planes stay."""
+        """Random displacements of each world's obstacles in K trials, (K, O, 3), in their plane; planes stay."""
         axes, worlds = np.arange(3) < (len(self.place) or 3), [shape.world.obstacles for shape in self.shapes]
         std = [np.array([self.std * axes * (one.kind != "plane") for one in world]) for world in worlds]
         return [own * rng.standard_normal((trials, *own.shape)) for own in std]
@@ -102,7 +104,7 @@ class Surroundings:
         return np.min(found, axis=0, initial=np.inf) if found else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
-        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""
+        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the previous knot."""
         place = list(self.position)
         clearance, normal, displaced = self.clearances(states)
         variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
@@ -117,7 +119,8 @@ def collision_chance(
     """The chance of being in collision at each knot (T+1,), and of colliding at all.
 
     Args:
-      states: means, (T+1, n). covariance: (T+1, n, n). across: of each state with the one before it, (T, n, n).
+      states: means, (T+1, n). covariance: (T+1, n, n). across: covariance of each state with the previous state, (T, n,
+        n).
     """
     if not surroundings.kept:
         return np.zeros(len(states)), 0.0
@@ -129,7 +132,7 @@ def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, floa
     """`collision_chance` of clearances in standard deviations (T+1, O) and their correlations with the knot before."""
     each = ndtr(-margin)
     begins, near = np.zeros_like(correlation), margin[1:] < FAR
-    # In collision at a knot and not at the one before.
+    # In collision at a knot, but not at the previous knot.
     before = both_below(-margin[1:][near], -margin[:-1][near], correlation[near])
     begins[near] = np.maximum(each[1:][near] - before, 0.0)
     expected = each[0].sum() + begins.sum()
@@ -138,8 +141,8 @@ def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, floa
 
 def both_below(first: Array, second: Array, correlation: Array) -> Array:
     """P(a < first, b < second) of standard normal numbers with that correlation, elementwise, by Owen's T (1956)."""
-    # T needs ratios to both numbers, and to the spread of one given the other: what is tiny counts as 1e-200. No chance
-    # tells 40 from infinity.
+    # T needs ratios to both numbers, and to the spread of one given the other; tiny numbers count as 1e-200. Beyond 40,
+    # chances do not change.
     a, b = (np.where(np.abs(one) < 1e-200, 1e-200, np.clip(one, -40.0, 40.0)) for one in (first, second))
     spread = np.maximum(np.sqrt((1 - correlation) * (1 + correlation)), 1e-100)
     with np.errstate(over="ignore"):

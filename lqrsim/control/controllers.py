@@ -1,7 +1,7 @@
 """Controllers of a run: a policy, a function or a `Controller`; and the state of one run.
 
-Affine laws run compiled for many trials at once, and each trial gets the same bits as it would alone. `AffinePolicy`
-has the same law in NumPy, for a robot; its module's docstring says why there are two.
+Affine laws run compiled, for many trials at once. Each trial gets bit-identical controls to those it would get alone.
+`AffinePolicy` implements the same law in NumPy, for a robot; its module's docstring says why there are two.
 """
 
 import abc
@@ -26,9 +26,9 @@ from lqrsim.results.policy import AffinePolicy
 
 
 def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
-    """What evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
+    """A function that evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
 
-    As `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
+    It works like `AffinePolicy.__call__`, but each trial gets the same bits as it would alone.
     """
     limits, turning = Limits(np.array(controls.low), np.array(controls.high)), turning_of(states)
     laws = _laws(len(states), len(controls))
@@ -62,7 +62,7 @@ ControlFunction = Callable[[Array, float], npt.ArrayLike]
 
 
 class ControllerRun(abc.ABC):
-    """One run of a controller: its memory of K trials, and what it records."""
+    """One run of a controller: its memory of K trials, and its records."""
 
     @abc.abstractmethod
     def control(self, step: int, measured: Array) -> Array:
@@ -79,10 +79,10 @@ class ControllerRun(abc.ABC):
         """
 
     def estimator_diverged(self) -> Mapping[int, str]:
-        """Trials whose estimate is useless, each with the reason in one line.
+        """Trials whose estimate is useless, each with a reason in one line.
 
-        They end in that period and count as diverged. It is called after each control period; controllers that estimate
-        nothing need not override it.
+        They end in that period and count as diverged. The method is called after each control period. Controllers
+        without an estimator need not override it.
 
         Returns:
           Row of the trial -> the reason.
@@ -95,7 +95,7 @@ class ControllerRun(abc.ABC):
 
 
 class Controller(abc.ABC):
-    """Decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
+    """Computes the controls. Subclass it for your own controller, unless a function of state and time is enough.
 
     Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
@@ -103,10 +103,10 @@ class Controller(abc.ABC):
 
     @abc.abstractmethod
     def start(self, trials: int) -> ControllerRun:
-        """Begin a run.
+        """Begin a run of trials.
 
         Args:
-          trials: K, how many run at once.
+          trials: K, the number of trials that run at once.
 
         Returns:
           The run; after `simulate` it is the rollout's `controller_run`.
@@ -115,7 +115,7 @@ class Controller(abc.ABC):
     @property
     @abc.abstractmethod
     def digest(self) -> str:
-        """Hash of all that the controls depend on."""
+        """Hash of everything that the controls depend on."""
 
     @property
     @abc.abstractmethod
@@ -124,7 +124,7 @@ class Controller(abc.ABC):
 
     @property
     def plan(self) -> Plan | None:
-        """The plan that it follows, if it has one of its own: then `simulate` needs no other."""
+        """The controller's own plan, or None. A controller with its own plan can be simulated without another."""
         return None
 
 
@@ -137,9 +137,9 @@ def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dyn
     """The controller of a run, and the plan that the run is about.
 
     Args:
-      given: what runs; None for the policy of the plan.
-      plan: None for the controller's own.
-      dynamics: dynamics of the robot that it runs on.
+      given: the controller; None for the policy of the plan.
+      plan: the plan; None for the controller's own.
+      dynamics: dynamics of the robot that the controller runs on.
 
     Raises:
       InputError: the object is no controller, or there is no plan.
@@ -247,7 +247,7 @@ class FunctionController(Controller):
 
     @property
     def digest(self) -> str:
-        """Hash of what the function does, where that can be determined, else of its name."""
+        """Hash of what the function does, if that can be determined, else of its name."""
         known = fingerprint(self.function) or f"function {getattr(self.function, '__qualname__', type(self.function))}"
         return sha256(f"{known} {self.dt!r}")[:16]
 

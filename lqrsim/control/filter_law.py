@@ -26,8 +26,8 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: the plan that it follows, as solved.
-      model: the linear model about it, which the filter assumes.
+      plan: the plan that the law follows, as solved.
+      model: the linear model about the plan, which the filter assumes.
       filter: its gains and covariances.
       weights: weights of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
@@ -46,7 +46,7 @@ class FilterLaw:
     def of(
         cls, plan: Plan, model: PlanModel, kalman: KalmanFilter, weights: Weights, granted: Array | None = None
     ) -> "FilterLaw":
-        """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes, by default 0."""
+        """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes; 0 by default."""
         trajectory = model.plan
         granted = np.zeros(len(model.transition)) if granted is None else granted
         gain, offset = tracking_laws(model, weights)
@@ -75,21 +75,21 @@ class FilterRun(ControllerRun):
     commands since, to the time at which the next command acts.
 
     Args:
-      law: to begin with.
-      trials: K.
+      law: the law at the beginning.
+      trials: K, the number of trials.
       records: arrays for `estimates` and `innovations`, to be filled; None to record nothing.
 
     Attributes:
-      law: in force.
-      first: the step that its plan begins at.
+      law: the law in force.
+      first: the step at which the law's plan begins.
       z: the current estimates, (K, Z), at the knot of the newest measurement.
       estimates: the recorded estimates, (T+1, K, Z), or None; see `OffsetFree`.
-      innovations: likewise, (T+1, K, Y).
+      innovations: the recorded innovations, (T+1, K, Y), or None.
     """
 
     def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
         self.law, self.first = law, 0
-        self.model = law.model  # for predictions, independent of what a later plan assumes about the unknowns
+        self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
         # If the first measurement is lost, the plan's first state is shown.
@@ -130,7 +130,7 @@ class FilterRun(ControllerRun):
             self.estimates[at], self.innovations[at] = self.z, self._differences
 
     def command(self, step: int) -> Array:
-        """The controls of a step, whose measurement was taken in."""
+        """The controls of a step, after its measurement was used."""
         law, model = self.law, self.model
         ahead = self.z
         if self._commands:
@@ -161,7 +161,7 @@ class FilterRun(ControllerRun):
 
 
 def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:
-    """Arrays of NaN for the estimates and innovations of K trials."""
+    """Arrays, filled with NaN, for the estimates and innovations of K trials."""
     knots, model = law.model.plan.steps + 1, law.model
     return np.full((knots, trials, model.size), np.nan), np.full((knots, trials, model.sensor.size), np.nan)
 
@@ -169,7 +169,7 @@ def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:
 def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     """The law as an `OutputFeedbackPolicy`, linear about the plan.
 
-    Commands under way are part of its state and move up by one place in each period. If measurements are late by k
+    Commands under way are part of the state, and advance by one place in each period. If measurements are late by k
     periods, z is k periods behind, and the law acts on the prediction of z with the commands since, which is linear.
     """
     model, plan = law.model, law.model.plan
@@ -187,7 +187,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     }  # fmt: skip
     measured = _expected(law)
     for t in range(steps):
-        knot = max(t - latency, 0)  # of z
+        knot = max(t - latency, 0)  # the knot of z
         under_way = min(t, latency) + delay  # commands, the newest last
         first = width - under_way * m
         arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
@@ -217,7 +217,7 @@ def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int,
     now["transition"][:size, :size] = np.eye(size)
     if moves:
         now["transition"][:size, :size], now["drift"][:size] = F, f
-        if late:  # by the oldest command
+        if late:  # the oldest command acts
             now["transition"][:size, size : size + m] = G
         else:
             now["input"][:size] = G
@@ -236,7 +236,7 @@ def _expected(law: FilterLaw) -> Array:
 
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:
-    """Coordinates of the measured numbers: those of the states, if they are states."""
+    """Coordinates of the measured numbers: the coordinates of the states, if states are measured."""
     space, names = law.coordinates[0], law.model.sensor.names
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))

@@ -1,8 +1,9 @@
-"""The Kalman filter about a plan, in square-root form: its gains depend on no measurement, so they are computed ahead.
+"""The Kalman filter about a plan, in square-root form, with gains that are computed in advance.
 
-The filter propagates square roots of its covariances by orthogonal transformations, and never subtracts covariances.
-They stay positive semidefinite, and the standard deviation of each entry keeps its own relative precision, whether
-sensors are exact, measure the same twice, or unknowns are nearly the same.
+The gains can be computed in advance because they do not depend on the measurements. The filter propagates square roots
+of its covariances by orthogonal transformations, and never subtracts covariances. The covariances stay positive
+semidefinite, and each standard deviation keeps its own relative precision. This holds even if sensors are exact, if two
+sensors measure the same quantity, or if two unknowns are nearly identical.
 """
 
 from typing import NamedTuple
@@ -14,10 +15,10 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import triangular_root
 from lqrsim.errors import Array, InputError
 
-# The least noise of a measured number, relative to the standard deviation with which it is predicted. It makes the
-# covariance of exact or redundant sensors invertible, and continuous where a decision on the rank would jump.
+# The least noise of a measured number, relative to the standard deviation of its prediction. It makes the covariance of
+# exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
 RESOLUTION = 1e-6
-NOTHING = 1e-150  # the same, where there is no doubt about the prediction: its square is still a number
+NOTHING = 1e-150  # the least noise if the prediction is certain: its square is still a positive number
 
 
 class KalmanFilter(NamedTuple):
@@ -26,8 +27,8 @@ class KalmanFilter(NamedTuple):
     Attributes:
       gain: K, (T+1, Z, Y).
       predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
-      corrected: after it, (T+1, Z, Z).
-      corrected_root: lower triangular square roots of these, (T+1, Z, Z).
+      corrected: covariance of that error after the measurement, (T+1, Z, Z).
+      corrected_root: lower triangular square roots of `corrected`, (T+1, Z, Z).
       innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
     """
 
@@ -43,7 +44,8 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
 
     Args:
       known: square root (Z, Z) of the covariance after the measurement of the first knot, if that measurement has been
-        used already: the gain there is zero. By default the filter begins before it, with the model's start.
+        used already; the gain there is then zero. By default the filter begins before that measurement, with the
+        model's start.
     """
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
     gain, innovation = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))

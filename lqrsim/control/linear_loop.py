@@ -1,9 +1,9 @@
 """Mean and covariance of a closed loop about its plan, by the recursion of LQG-MP.
 
-The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
-law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: for u normal with
-mean mu and std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
-Of commands that get lost it has the exact moments, those of a mixture; their distribution is not Gaussian.
+The true state and the estimate are jointly Gaussian: X = (z, zhat), with zhat before the measurement of the same knot.
+For a law without an estimate X = z. Control limits enter by statistical linearisation: for u normal with mean mu and
+std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
+For lost commands the moments of the mixture are exact; the distribution itself is not Gaussian.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class LoopMoments(NamedTuple):
     Attributes:
       mean: mean of X, (T+1, X).
       covariance: covariance of X, (T+1, X, X).
-      across: covariance of the deviation of the states with that at the knot before, (T, n, n).
+      across: covariance of the states' deviation with their deviation at the previous knot, (T, n, n).
       command: standard deviation of each command, before it is limited, (T, m).
-      saturation: share of the commands that are beyond the limits, (T, m).
+      saturation: fraction of the commands that are beyond the limits, (T, m).
     """
 
     mean: Array
@@ -36,11 +36,11 @@ class LoopMoments(NamedTuple):
 
 @dataclass
 class LinearLoop:
-    """A closed loop about a plan as matrices.
+    """The matrices of a closed loop about a plan.
 
     Attributes:
-      model: model of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
-      filter_gain: K, (T+1, Z, Y); None for a law of the states that are shown.
+      model: model of the true system. gain, offset: the law's, (T, m, Z or n) and (T, m), in deviations from the plan.
+      filter_gain: K, (T+1, Z, Y); None for a law of the measured states.
       low, high: limits of the controls, (m,).
       assumed: the model that the filter assumes, by which Z is that of its estimates; by default that of the true
         system.
@@ -70,7 +70,7 @@ class LinearLoop:
         for t in range(steps):
             seen, noise = self._seen(t)
             gain, planned, P = self.gain[..., t, :, :], model.plan.controls[t], covariance[..., t, :, :]
-            law = gain @ seen  # of X
+            law = gain @ seen  # as a function of X
             response = law @ P
             spread = (response * law).sum(axis=-1) + (gain @ noise * gain).sum(axis=-1)
             std[..., t, :] = np.sqrt(np.maximum(spread, 0.0))
@@ -99,9 +99,9 @@ class LinearLoop:
         return LoopMoments(mean, covariance, across, std, saturation)
 
     def _without_control(self, step: Step, t: int, seen: Array) -> tuple[Array, Array, Array]:
-        """Transition of X without control deviations, their input matrix and the drift: (X, X), (X, m) and (X,).
+        """Transition of X without control deviations, the input matrix of these, and the drift: (X, X), (X, m), (X,).
 
-        The estimates' are those of the mean over commands, for the filter is not told which are lost.
+        The rows of the estimates are means over commands, because the filter is not told which commands are lost.
         """
         F, G, c = step.F[t], step.G[t], step.c[t]
         if self.filter_gain is None:
@@ -135,7 +135,7 @@ def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, 
     below, above = ndtr(a), ndtr(-b)
     density_a, density_b = (np.exp(-0.5 * np.minimum(x * x, 1500.0)) / np.sqrt(2 * np.pi) for x in (a, b))
     a, b = np.where(np.isfinite(a), a, 0.0), np.where(np.isfinite(b), b, 0.0)
-    # Moments of min(max(x, a), b) of a standard normal x; a side without a limit has no share.
+    # Moments of min(max(x, a), b) of a standard normal x; a side without a limit contributes nothing.
     first = density_a - density_b + a * below + b * above
     second = inside + a * density_a - b * density_b + a * a * below + b * b * above
     variance = np.maximum(second - first * first - inside * inside, 0.0) * sigma * sigma

@@ -1,6 +1,6 @@
 """Output feedback without steady errors, by the linear model.
 
-A Kalman filter estimates the state, the actuators' outputs and the unknowns; a tracking law acts on all of it.
+A Kalman filter estimates the state, the actuators' outputs and the unknowns. A tracking law acts on all the estimates.
 """
 
 from dataclasses import replace
@@ -34,18 +34,18 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution
 
 MEMORY = 5.0  # s
-# The least errors that a filter assumes, relative to the tolerated effort: of each control; and of each state's
-# prediction, as if so much effort had moved it. A model is never exact: what acts does not act evenly over a control
-# period, integration has errors, and the gains are those about the plan. With exact sensors a filter that does not
-# know this reads unknowns from the last digits of its prediction errors.
+# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
+# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
+# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
+# without this assumption would infer unknowns from the last digits of its prediction errors.
 INEXACT = 0.02
-# By how much the command in force may differ from the one that got lost, relative to the tolerated effort. A choice of
-# ours: up to a loss of one half nothing between 0.3 and 1 does better.
+# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
+# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
 HELD = 0.3
 
 
 class OffsetFree(Controller):
-    """Keeps to a plan with estimates of the state, the actuators and the unknowns.
+    """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
@@ -57,7 +57,7 @@ class OffsetFree(Controller):
 
     Args:
       problem: the problem that was solved.
-      solution: its solution, or any with a plan of the same system.
+      solution: its solution, or another solution with a plan of the same system.
       uncertainty: uncertainty of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean,
         and constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
@@ -69,25 +69,25 @@ class OffsetFree(Controller):
         stated: constants do not change, what varies has the mean zero, so that a steady disturbance leaves an error,
         and a lag is there.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
-      replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
-        without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
-        the horizon is solved from there. If the solve fails, the law stays in force. By default, no checks. Costs that
-        depend on the step's number are then not supported.
+      replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
+        simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the
+        goal without a collision, the rest of the horizon is solved from that state. If the solve fails, the law stays
+        in force. Costs that depend on the step's number are not supported with re-planning.
       replan_always: whether to solve at each of these times without a check.
 
-    A run of it, which is a rollout's `controller_run`, has these attributes:
+    Its run, a rollout's `controller_run`, has these attributes:
 
-    - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot: NaN
-    at knots whose measurement was not used: the last one, and one more for each period of latency. Their errors
-      have the covariances `filter.corrected`. Else None.
-    - `innovations`: likewise the differences of measurements from their predictions, (T+1, K, Y), of the covariances
-      `filter.innovation`; NaN where a measurement got lost, too. Both covariances are of the first plan: with
-      `replan_every` they are those of a run up to its first solve.
-    - with `replan_every`, `plans`: the new plans of each trial, by the step that they begin at; and `log`, how the
-      solves went, as of a `Replanner`.
+    - `estimates`: with `record`, the estimates (T+1, K, Z) of the K trials, each with the measurement of its knot; else
+      None. They are NaN at knots whose measurement was not used: the last knot, and one more for each period of
+      latency. The covariances of their errors are `filter.corrected`.
+    - `innovations`: with `record`, the differences between measurements and predictions, (T+1, K, Y), with the
+      covariances `filter.innovation`. They are also NaN where a measurement got lost. Both covariances belong to the
+      first plan: with `replan_every` they hold up to a run's first solve.
+    - with `replan_every`, `plans`: the new plans of each trial, by the step at which they begin; and `log`, the log of
+      the solves, as in a `Replanner`.
 
     Attributes:
-      model: the linear model about the plan, with z = (state, what the actuators have reached, unknowns).
+      model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
       weights: the law's weights of deviations from the plan.
       gain: gain of the law, (T, m, Z).
@@ -139,7 +139,7 @@ class OffsetFree(Controller):
         late = self.uncertainty.latency, self.uncertainty.delay
         if any(late):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
-            raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
+            raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty with neither")
         problem = replace(self.problem, dynamics=self.model.dynamics)
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
@@ -184,7 +184,7 @@ class OffsetFree(Controller):
         """Return the closed loop about the plan as matrices, under the uncertainty as stated.
 
         Raises:
-          InputError: with `replan_every`, which makes other plans.
+          InputError: with `replan_every`, which leads to other plans.
         """
         self._check_one_plan("loop")
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
@@ -242,7 +242,7 @@ def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.
     moved = unit_means(space.units, reach_of(model, effort, 2)[2])
     control = per_entry("Uncertainty: control", stated.control, controls)
     lost = stated.command_loss
-    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # for the filter expects the mean
+    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
     error = per_entry("Uncertainty: model_error", stated.model_error, space)
     behind = doubt * Lag.of(stated.lag, model.plan.dt).mean * effort
     directly = [

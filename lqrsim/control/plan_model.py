@@ -1,12 +1,13 @@
-"""The linear model about a plan that tracking laws, filters and tubes are made of.
+"""The linear model about a plan, on which tracking laws, filters and tubes are based.
 
-A deviation from the plan is z = (e, a, d): of the state (n), of the actuators' states (m if they lag, else none), and
-the states of the unknowns (D). With u the deviation of the command,
+A deviation from the plan is z = (e, a, d): the deviation of the state (n), the deviation of the actuators' states (m if
+they lag, else none), and the states of the unknowns (D). With u the deviation of the command,
 
     z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
 
-c is the effect of the lag on a plan made without it: nominally the actuators are where the planned controls take them.
-If commands get lost, F, G and c are means: those of a command that arrives, and of one that is lost, where the
+c is the effect of actuator lag on a plan that was made without lag. The nominal states of the actuators are those to
+which the planned controls drive them.
+If commands get lost, F, G and c are means over two cases: a command that arrives, and a lost command, after which the
 actuators stay as they are.
 """
 
@@ -51,7 +52,7 @@ class Sensor(NamedTuple):
 
     Attributes:
       source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
-      data: their parameters. size: Y, the number of measured values. names: their names in messages.
+      data: their parameters. size: Y, the number of measured values. names: names of the values in messages.
     """
 
     source: Source
@@ -77,7 +78,7 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     if isinstance(listed, (list, tuple)) and all(isinstance(one, str) for one in listed):
         names = check_items("sensors", listed, str, f"a tuple of names of states, of {', '.join(space.names)}")
         if not names or len(set(names)) < len(names):
-            raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, and each once")
+            raise InputError(f"sensors: got {excerpt(listed)}, want at least one state, each at most once")
         chosen = [space.names.index(check_name("sensors", name, space.names)) for name in names]
         source = "def measure(x, data, out):\n" + "".join(f"    out[{i}] = x[{j}]\n" for i, j in enumerate(chosen))
         source += "def measure_slope(x, data, out):\n"
@@ -115,7 +116,7 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
     return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
 
 
-STEP = 1e-5  # of a parameter for differences, relative to its value where that is larger than 1
+STEP = 1e-5  # step of a parameter for differences, relative to its value if that is larger than 1
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ class Lag:
     """A first-order lag of the actuators over a control period.
 
     Attributes:
-      left: the remaining share of the distance to the command at its end. mean: the same, averaged over it.
+      left: the remaining fraction of the distance to the command at the end of the period. mean: its average over the
+        period.
     """
 
     left: float
@@ -141,7 +143,7 @@ class Step(NamedTuple):
     """The linear model of all steps, for commands of one kind.
 
     Attributes:
-      share: of the commands. F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
+      share: fraction of commands of this kind. F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
     """
 
     share: float
@@ -169,7 +171,7 @@ class PlanModel:
     def of(
         cls, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
     ) -> "PlanModel":
-        """Raises InputError where the uncertainty does not fit the dynamics."""
+        """Raises InputError if the uncertainty does not fit the dynamics."""
         uncertainty.check(dynamics)
         return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
 
@@ -197,7 +199,7 @@ class PlanModel:
 
     @cached_property
     def lag(self) -> Lag:
-        """In the mean over commands that arrive and that get lost."""
+        """The steps as means over commands that arrive and commands that get lost."""
         lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
         return Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
 
@@ -214,14 +216,14 @@ class PlanModel:
 
     @property
     def size(self) -> int:
-        """Of z."""
+        """Number of entries of z."""
         return self.n + self.lagging + len(self.transition)
 
     # Effects of the unknowns.
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
-        """Those of the dynamics that are unknown."""
+        """The parameters of the dynamics that are unknown."""
         named = (name for one in self.uncertainty.unknowns for name in one.shares)
         return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
 
@@ -243,7 +245,7 @@ class PlanModel:
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
     def _column(self, unknown: Unknown) -> Array:
-        """Its shares of these values, (P + 2 m,)."""
+        """The weights of an unknown in these values, (P + 2 m,)."""
         controls, own = self.dynamics.control_coordinates.names, len(self.parameters)
         column = np.zeros(own + 2 * self.m)
         for name, share in unknown.shares.items():
@@ -276,24 +278,24 @@ class PlanModel:
 
     @cached_property
     def compiled_dynamics(self) -> DynamicsModel:
-        """The dynamics as compiled code takes them."""
+        """The dynamics in the form that compiled code takes."""
         return dynamics_model(self.dynamics)
 
     @cached_property
     def compiled_sensor(self) -> SensorModel:
-        """The sensor likewise."""
+        """The sensor in the form that compiled code takes."""
         module = module_of(self.sensor.source, "sensors", N=self.n, M=self.m, W=self.n + self.m)
         measure, slope = module.addresses("measure", "measure_slope")
         return SensorModel(measure, slope, self.sensor.data)
 
     @cached_property
     def turning(self) -> AngularStates:
-        """Which states are angles."""
+        """Flags of the states that are angles."""
         return turning_of(self.dynamics.state_coordinates)
 
     @cached_property
     def places(self) -> Array:
-        """Where the unknown parameters are among the numbers."""
+        """Indices of the unknown parameters among the numbers."""
         places = self.dynamics.places
         return np.array([places[name] for name in self.parameters], dtype=np.float64)
 
@@ -348,7 +350,7 @@ class PlanModel:
 
     @cached_property
     def steps_of_commands(self) -> list[Step]:
-        """The model for a command that arrives; and for one that is lost, if any are."""
+        """The model for a command that arrives; and for a lost command, if commands get lost."""
         lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
         kinds = [(1 - lost, arrived), (lost, Lag(1.0, 1.0))] if lost else [(1.0, arrived)]
         return [self._step(share, lag) for share, lag in kinds]
@@ -403,7 +405,7 @@ class PlanModel:
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         commanded = self.steps_of_commands[0].G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
         if self.uncertainty.lag == 0:
-            commanded[:, n:first] = 0.0  # what a lost command leaves in force has new noise
+            commanded[:, n:first] = 0.0  # the command that stays in force after a loss has new noise
         white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
         pushed = np.zeros((steps, self.size, len(white)))
         if white:
@@ -422,7 +424,7 @@ class PlanModel:
 
     @cached_property
     def shown_std(self) -> Array:
-        """Standard deviation of the noise on each state that is shown, (n,)."""
+        """Standard deviation of the noise on each measured state, (n,)."""
         return per_entry("Uncertainty: measurement", self.uncertainty.measurement, self.dynamics.state_coordinates)
 
     @cached_property
@@ -432,7 +434,7 @@ class PlanModel:
 
 
 def _diagonal(blocks: list[Array]) -> Array:
-    """The blocks along the diagonal."""
+    """A matrix of these blocks along the diagonal."""
     size = sum(len(block) for block in blocks)
     whole, at = np.zeros((size, size)), 0
     for block in blocks:

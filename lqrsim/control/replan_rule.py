@@ -1,6 +1,6 @@
-"""Re-planning: what is solved, when and from where, and the log of the solves.
+"""Re-planning: the rule that determines the problem, time and start of each solve; and the log of the solves.
 
-`replanner.py` runs it, in simulations or on a robot; `replanned.py` runs it within output feedback.
+`replanner.py` applies the rule in simulations or on a robot. `replanned.py` applies it within output feedback.
 """
 
 import math
@@ -35,31 +35,31 @@ from lqrsim.solvers.prepared import prepare
 
 @dataclass(frozen=True)
 class ActivePlan:
-    """A plan in force, or that will be.
+    """A plan that is in force, or will be.
 
     Attributes:
       plan: the plan, with its law.
-      first: the control period that it begins at.
+      first: the control period at which it begins.
     """
 
     plan: Plan
     first: int
 
     def row(self, step: int) -> int:
-        """The index of its law at a step; after its horizon, the last one.
+        """The index of the plan's law at a step; after the horizon, the index of the last law.
 
         Args:
           step: number of the control period.
 
         Returns:
-          A row of its gains.
+          The index of a row of the gains.
         """
         return min(max(step - self.first, 0), self.plan.trajectory.steps - 1)
 
 
 @dataclass(frozen=True)
 class SolveRequest:
-    """A solve to be done: at a step, for a plan that begins at a later one, from a state (n,) and with a law."""
+    """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step."""
 
     step: int
     first: int
@@ -70,18 +70,18 @@ class SolveRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplanRecord:
-    """How one solve went.
+    """The record of one solve.
 
     Attributes:
       step: control period in which the solve began.
       trial: number of a simulation, else 0.
       status: how the solve ended.
-      iterations: how many it took.
-      seconds: how long it took.
+      iterations: number of iterations.
+      seconds: duration of the solve.
       cost: cost of the new plan.
       before: cost of continuing with the law in force.
-      used: whether its plan came into force.
-      reason: why not, or why it is no better; empty if all went well.
+      used: whether the new plan came into force.
+      reason: why the plan was not used, or why it is no better; empty if all went well.
     """
 
     step: int
@@ -101,12 +101,12 @@ class ReplanRecord:
 
 
 class ReplanLog:
-    """How the solves of one run went.
+    """The log of the solves of one run.
 
     Attributes:
-      records: a `ReplanRecord` of each.
-      solved: how many were used, of all trials.
-      kept: why others were not used, so that the previous law continued: reason -> number.
+      records: a `ReplanRecord` of each solve.
+      solved: number of solves that were used, over all trials.
+      kept: reason why a solve was not used, and the previous law continued -> number of such solves.
     """
 
     def __init__(self) -> None:
@@ -120,10 +120,10 @@ class ReplanLog:
           step: control period in which the solve began.
           trial: number of a simulation, else 0.
           replan: the answer of the solve.
-          late: whether it came after the deadline.
+          late: whether the answer came after the deadline.
 
         Returns:
-          Whether its plan is to be used.
+          Whether the new plan is to be used.
         """
         reason = "" if replan.success else replan.status.name
         if late:
@@ -149,15 +149,15 @@ class ReplanLog:
         """Count a solve that did not begin.
 
         Args:
-          reason: why.
+          reason: why it did not begin.
         """
         self.kept[reason] += 1
 
     def summary(self, *, times: bool = False) -> str:
-        """The number of solves, and the reasons why the previous law continued, in a line.
+        """The number of solves, and the reasons why the previous law continued, in one line.
 
         Args:
-          times: whether to include how long solves took.
+          times: whether to include the durations of the solves.
 
         Returns:
           A line of text.
@@ -191,16 +191,16 @@ class ReplanRule:
 
     Args:
       who: name for messages. problem: the problem that was solved. solution: its solution.
-      every: seconds between two solves. deadline: seconds until its answer comes into force, by default a control
-        period, or `at_least` as long. Both are rounded to control periods, the deadline up.
-      horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
-      predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
+      every: seconds between two solves. deadline: seconds until an answer comes into force; by default a control
+        period, or `at_least` if that is longer. Both are rounded to control periods, the deadline up.
+      horizon: "shrinking", to the end of the first plan, or "moving", always as long as the first plan.
+      predict: whether to solve from the state that the law in force reaches by the deadline, or from the present state.
       when: a funnel of the solution, if solves are only for states outside it.
-      share: share of the funnel's level that counts as its boundary.
-      changes: (time in s, problem) -> the problem as it is known by then.
+      share: fraction of the funnel's level that counts as its boundary.
+      changes: (time in s, problem) -> the problem as known at that time.
 
     Attributes:
-      periods: control periods between two solves. delay: until the answer comes into force.
+      periods: control periods between two solves. delay: control periods until the answer comes into force.
       solver: the prepared solver.
 
     Raises:
@@ -251,13 +251,13 @@ class ReplanRule:
         self.solver = prepare(problem)
 
     def problem_at(self, step: int, problem: Problem) -> Problem:
-        """A problem as it is known in a control period, with the result of `changes`."""
+        """A problem as known in a control period, with the result of `changes`."""
         if self.changes is None:
             return problem
         return self.checked(f"{self._who}: changes", self.changes(step * self.problem.dt, problem))
 
     def checked(self, who: str, problem: Problem) -> Problem:
-        """The problem. Raises InputError if it cannot take the place of the rule's own while a plan is in force."""
+        """The problem. Raises InputError if it cannot replace the rule's own problem while a plan is in force."""
         check_kind(who, problem, Problem, "a Problem")
         for field, what in _FIXED.items():
             got, want = what(problem), what(self.problem)
@@ -273,7 +273,8 @@ class ReplanRule:
     def outside(self, active: ActivePlan, step: int, state: Array, *, late: float = 0.0) -> bool:
         """Whether a state (n,), measured `late` seconds after a control period began, is outside the funnel.
 
-        The funnel is about the plan in force, which is interpolated between two knots. Without a funnel all is outside.
+        The funnel is about the plan in force, which is interpolated between two knots. Without a funnel, every state is
+        outside.
         """
         if self.when is None:
             return True
@@ -318,10 +319,10 @@ class ReplanRule:
 
 
 def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str) -> Funnel | None:
-    """Raises InputError unless it is None, or a funnel of the solution, whose end stays where it is."""
+    """Raises InputError unless it is None, or a funnel of the solution with a fixed end."""
     check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
     if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
-        raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
+        raise InputError(f"{who}: when: got a funnel of another plan, want a funnel of the solution")
     if when is not None and horizon != "shrinking":
-        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end')
+        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want horizon="shrinking"')
     return when

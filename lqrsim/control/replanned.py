@@ -1,12 +1,12 @@
 """Output feedback that re-plans if its law no longer leads to the goal, with its estimates in the model.
 
-At each of these steps, and for each trial, the law is simulated with the model from the estimated state, with the
-unknown constants at their estimated values. Where that collides or misses the goal, the rest of the horizon is solved
-from there, and law and filter are made anew about the new plan. Elsewhere a new plan would do harm: it has a lower
-cost, and goes as close to obstacles as its constraints permit. The estimates continue unchanged; the law acts on their
-difference from the values that the new plan assumes. Gusts pass, and plans do not know of them; gains and offsets of
-the controls and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no
-time in the simulation.
+At each check, and for each trial, the law is simulated with the model, from the estimated state and with the unknown
+constants at their estimated values. If the simulated run collides or misses the goal, the rest of the horizon is solved
+from that state, and the law and the filter are recomputed about the new plan. Otherwise a new plan would do harm: it
+would have a lower cost, and go as close to obstacles as its constraints permit. The estimates continue unchanged. The
+law acts on their difference from the values that the new plan assumes. Some disturbances are left to the law: gusts,
+because they pass and plans do not model them; and gains and offsets of the controls and the lag of the actuators,
+because they are not parameters of the model. A solve takes no time in the simulation.
 """
 
 from collections.abc import Mapping
@@ -34,16 +34,16 @@ class ReplannedRun(ControllerRun):
 
     Args:
       rule: the periods in which to check whether a solve is needed.
-      law: to begin with.
-      trials: K.
-      records: as of `FilterRun`, of all trials.
+      law: the law at the beginning.
+      trials: K, the number of trials.
+      records: as for `FilterRun`, of all trials.
       always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
-      plans: plans of each trial, by the step that they begin at; without the first.
-      log: how the solves went.
-      estimates: as of `FilterRun`.
-      innovations: likewise.
+      plans: plans of each trial, by the step at which they begin; without the first plan.
+      log: the log of the solves.
+      estimates: as in `FilterRun`.
+      innovations: as in `FilterRun`.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class ReplannedRun(ControllerRun):
         return near and (clearance is None or bool(clearance.min() >= 0))
 
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:
-        """Replace the law of a trial by one about a new plan, if needed and found."""
+        """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
         law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
         granted = np.where(_constant_parameters(model), z[n + model.lagging :], 0.0)
@@ -114,13 +114,13 @@ class ReplannedRun(ControllerRun):
             return
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
-        # The filter begins with a measurement that is taken in already.
+        # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 
 def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:
-    """Which of the unknowns' states are constant, to the end of the horizon, and change only parameters, (D,)."""
+    """Flags (D,) of the unknowns' states that are constant to the end of the horizon and change only parameters."""
     beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
     found = (model.output != 0).any(axis=0) & ~beyond
     for one, own in zip(model.remembered, model.own_states, strict=True):

@@ -32,12 +32,12 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.plan import Plan, Replan
 from lqrsim.solvers.parallel import workers
 
-SPARE = 0.5e-3  # s, between the end of a solve and its deadline: for handing the answer over
+SPARE = 0.5e-3  # s, time between the end of a solve and its deadline, for handing over the answer
 
 
 @dataclass
 class _Solve:
-    """A solve that was asked for, and its answer when it is there."""
+    """A requested solve, and its answer as soon as there is one."""
 
     request: SolveRequest
     deadline: float  # on the clock
@@ -50,19 +50,19 @@ class LiveReplanner:
     """One run of a `Replanner` on a robot, made by `Replanner.live`: its own loop calls `step` as often as it likes.
 
     `step` only evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
-    period in which one is due. Its answer comes into force at the deadline. What is not ready then is not used, and the
-    previous law continues. All is compiled before the first step.
+    period in which one is due. Its answer comes into force at the deadline. An answer that is not ready then is not
+    used, and the previous law continues. Everything is compiled before the first step.
 
     Args:
-      rule: what is solved, when and from where.
+      rule: the rule that determines the problem, time and start of each solve.
       interpolate: as in `Replanner.live`.
-      clock: likewise.
+      clock: as in `Replanner.live`.
 
     Attributes:
       problem: the problem that is solved from now on.
-      active: the plan in force, `active.plan`, and the control period that it begins at, `active.first`.
-      log: how the solves went: `log.records`, a `ReplanRecord` of each; `log.solved`, the number used; and `log.kept`,
-        why others were not used, so that the previous law continued: reason -> number.
+      active: the plan in force, `active.plan`, and the control period at which it begins, `active.first`.
+      log: the log of the solves: `log.records`, a `ReplanRecord` of each; `log.solved`, the number of solves that were
+        used; and `log.kept`, reason why a solve was not used, and the previous law continued -> number.
 
     Raises:
       InputError: as `Replanner.live`.
@@ -87,13 +87,13 @@ class LiveReplanner:
     def __enter__(self) -> Self:
         """Start the thread that solves."""
         if self._thread is not None:
-            raise InputError("LiveReplanner: got entered twice, want one `with replanner.live() as live:` for each run")
+            raise InputError("LiveReplanner: got a second `with` on it, want a new replanner.live() for each run")
         self._thread = threading.Thread(target=self._work, name="lqrsim re-planner", daemon=True)
         self._thread.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """End it, after the solve that it is at."""
+        """End the thread, after its current solve."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join()
@@ -112,7 +112,7 @@ class LiveReplanner:
           **parts: field of `Problem` -> new value.
 
         Raises:
-          InputError: the problem is none; it would have to be compiled; or something changes that cannot.
+          InputError: the result is no valid problem; it would have to be compiled; or something changes that cannot.
         """
         try:
             changed = replace(self.problem, **parts)
@@ -125,7 +125,7 @@ class LiveReplanner:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start.
 
         Args:
-          state: (n,), measured.
+          state: (n,), the measured state.
           t: seconds since the start, 0 or more.
 
         Returns:
@@ -161,7 +161,7 @@ class LiveReplanner:
         self._queue.put(solve)
 
     def _take(self, step: int) -> None:
-        """Put an answer into force when its time has come; an answer that is late is not used."""
+        """Put an answer into force at its deadline. A late answer is not used."""
         solve = self._solve
         if solve is None or step < solve.request.first:
             return
@@ -189,7 +189,7 @@ Computing = float | str | Callable[[np.random.Generator], float]
 
 
 class Replanner(Controller):
-    """Solves again and again from where the robot will be when the answer comes; until then the previous law continues.
+    """Solves repeatedly, from where the robot will be when the solve ends. Until then the previous law stays in force.
 
         rollout = ls.simulate(plant, controller=replanner)  # in a simulation
 
@@ -198,32 +198,32 @@ class Replanner(Controller):
                 robot.apply(live.step(robot.state(), t))
 
     Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
-    plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported. A
-    re-planner is not changed by running it, so several runs can have the same one.
+    plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported.
+    Running a re-planner does not change it, so several runs can share it.
 
-    In a simulation a solve takes as long as `computing` says. With a number or a function the results are the same to
-    the last bit wherever they are computed; "measured" is as fast as this machine is. The rollout's `controller_run`
-    has a `log` of the solves, as a `LiveReplanner` has, and the plans in force, `active`.
+    In a simulation a solve takes as long as `computing` says. With a number or a function, the results are
+    bit-identical on all machines. With "measured" they depend on the speed of the machine. The rollout's
+    `controller_run` has a `log` of the solves, like a `LiveReplanner`, and the plans in force, `active`.
 
     Args:
       problem: the problem that was solved.
-      solution: its solution, or another plan of it.
+      solution: its solution, or another plan for it.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
-        default one control period, or as long as `computing` takes, where that is a number and longer.
-      horizon: "shrinking", the rest of the first plan's, or "moving", always as long as the first plan's.
-      predict: whether to solve from where the law in force leads by the deadline, by the model. Without it, plans begin
-        where the robot was, not where it is.
-      changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
-        goals, obstacles or parameters. dt, steps, states and controls cannot change, nor anything that would have to be
-        compiled.
-      when: a funnel of the solution, for the horizon "shrinking": solve only for states that are outside at the time,
-        about the plan in force. The certificate is for the first plan; about a later one, or after a change, the same
-        ellipsoids are a rule of thumb.
-      share: share of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and
-        loses fewer trials, for a plan that begins at the boundary often comes too late.
-      computing: how long a solve takes in simulations, in seconds: a number; a function of a `numpy.random.Generator`,
-        which draws it; or "measured".
+        default one control period, or `computing` if that is a number and longer.
+      horizon: "shrinking", to the end of the first plan, or "moving", always as long as the first plan.
+      predict: whether to solve from the state that the model predicts for the deadline, under the law in force. If
+        False, a plan begins where the robot was when the solve began.
+      changes: a function of the time in seconds and the problem that returns the problem as known at that time, with
+        other goals, obstacles or parameters. dt, steps, states and controls cannot change, nor can anything that would
+        have to be compiled.
+      when: a funnel of the solution, for the horizon "shrinking": solve only for states outside the funnel about the
+        plan in force. The certificate is for the first plan. About a later plan, or after a change, the same ellipsoids
+        are a rule of thumb.
+      share: fraction of the funnel's level at which to solve; 1 is its boundary. Planning earlier takes more solves and
+        loses fewer trials, because a plan that begins at the boundary often comes too late.
+      computing: duration of a solve in simulations, in seconds: a number; a function that draws it from a
+        `numpy.random.Generator`; or "measured".
       seed: seed of the random numbers for `computing`.
 
     Raises:
@@ -297,7 +297,7 @@ class Replanner(Controller):
 
 
 class ReplannerRun(ControllerRun):
-    """K trials of a simulation, with the plan that is in force in each.
+    """K trials of a simulation, with the plan in force in each.
 
     Attributes:
       log: how the solves went.
@@ -308,7 +308,7 @@ class ReplannerRun(ControllerRun):
         self._of, self._rule, self._evaluate = of, of.rule, evaluator(*of.coordinates)
         self.log = ReplanLog()
         self.active = [ActivePlan(of.solution, 0)] * trials
-        self._next: list[ActivePlan | None] = [None] * trials  # for the step that they begin at
+        self._next: list[ActivePlan | None] = [None] * trials  # put into force at the step at which they begin
 
     def control(self, step: int, measured: Array) -> Array:
         self._activate(step)
@@ -331,7 +331,7 @@ class ReplannerRun(ControllerRun):
                 self.active[trial], self._next[trial] = plan, None
 
     def _replan(self, step: int, measured: Array) -> None:
-        """Solve for all trials for which that is due."""
+        """Solve for all trials for which a solve is due."""
         rule = self._rule
         problem = rule.problem_at(step, rule.problem)
         trials = [k for k, active in enumerate(self.active) if rule.outside(active, step, measured[k])]
@@ -341,7 +341,7 @@ class ReplannerRun(ControllerRun):
                 self._next[trial] = ActivePlan(replan, request.first)
 
     def _solve(self, requests: list[SolveRequest]) -> list[Replan]:
-        """All at once; one after the other where it matters how long each takes."""
+        """The answers to all requests: computed at once, or one after the other if their durations are measured."""
         rule, measured = self._rule, self._of.computing == MEASURED
         if len(requests) <= 1 or measured:
             limit = max(rule.deadline, 1e-3) if measured else None

@@ -1,9 +1,9 @@
-"""Trials of a closed loop by the model that its filter predicts with, and the chance of collision that they show.
+"""Trials of a closed loop, simulated with the filter's prediction model, and the chance of collision that they show.
 
-The moments of `linear_loop.py` are those of small deviations. A robot whose commands stay at their limits leaves its
-plan, where its dynamics are others. Here the nonlinear dynamics run, with limits, lag, delays, and lost commands and
-measurements, without MuJoCo. A seed draws the same numbers for all plans and laws, so that two of them are compared on
-the same trials.
+The moments of `linear_loop.py` are valid for small deviations. A robot whose commands stay at their limits leaves its
+plan, and far from the plan its dynamics differ. These trials run the nonlinear dynamics without MuJoCo, with limits,
+lag, delays, and lost commands and measurements. A seed draws the same numbers for all plans and laws, so that two of
+them are compared on the same trials.
 """
 
 from collections import deque
@@ -20,20 +20,21 @@ from lqrsim.control.plan_model import Lag, PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array
 
-# Collisions that a predicted chance counts for beside those of the trials: with fewer than these the prediction is the
-# better known of the two.
+# The weight of a predicted chance, as a number of collisions that is combined with the collisions of the trials. If the
+# trials
+# have fewer, the prediction is the more precise of the two.
 PRIOR = 4.0
-REFUTED = 0.025  # It does not count if the trials have so many more, or so many fewer, with this chance.
+REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions has a tail probability below this
 
 
 @dataclass(frozen=True)
 class SampledLoop:
-    """K trials.
+    """The result of K trials.
 
     Attributes:
-      mean: of the states' deviations from the plan, (T+1, n). covariance: (T+1, n, n). across: covariance with the
-        deviation at the knot before, (T, n, n). All three of the trials whose states stay finite.
-      command: standard deviation of each command, (T, m). saturation: share of the commands at their limits, (T, m).
+      mean: mean of the states' deviations from the plan, (T+1, n). covariance: (T+1, n, n). across: covariance with the
+        deviation at the previous knot, (T, n, n). All three are over the trials whose states stay finite.
+      command: standard deviation of each command, (T, m). saturation: fraction of the commands at their limits, (T, m).
       collided: whether each trial collides at a knot, or its state is not finite, (K,).
       farthest: largest distance of each trial from its plan in m, (K,).
     """
@@ -47,7 +48,7 @@ class SampledLoop:
     farthest: Array
 
     def chance(self, predicted: float) -> float:
-        """The chance of collision by these trials and a prediction; 0 only if that is 0 and no trial collides."""
+        """The chance of collision by these trials and a prediction. 0 only if both have none."""
         trials, found = len(self.collided), int(self.collided.sum())
         low = float(betaincinv(found, trials - found + 1, REFUTED)) if found else 0.0
         high = float(betaincinv(found + 1, trials - found, 1 - REFUTED)) if found < trials else 1.0
@@ -70,7 +71,7 @@ def sample_loop(
     displaced, place = surroundings.displacements(robots.rng, trials), list(surroundings.place)
     collided, farthest = np.zeros(trials, dtype=bool), np.zeros(trials)
     states, commands = np.empty((plan.steps + 1, trials, n)), np.empty((plan.steps, trials, model.m))
-    with np.errstate(over="ignore", invalid="ignore"):  # trials that are lost
+    with np.errstate(over="ignore", invalid="ignore"):  # of lost trials
         for t in range(plan.steps + 1):
             states[t] = robots.states(t)
             finite = np.isfinite(states[t]).all(axis=1)
@@ -92,20 +93,20 @@ def sample_loop(
 
 
 class _Robots:
-    """The true systems of K trials: their z as in `plan_model.py`, in absolute numbers; and the links to them."""
+    """The true systems of K trials: their z as in `plan_model.py`, but in absolute numbers; and the links to them."""
 
     def __init__(self, model: PlanModel, limits: tuple[Array, Array], trials: int, rng: np.random.Generator) -> None:
         plan, told = model.plan, model.uncertainty
         self.model, self.limits, self.rng, self._trials = model, limits, rng, trials
         start = np.concatenate([plan.states[0], model.reached[0], np.zeros(len(model.transition))])
         self.z = start + self._normal(model.size) @ model.start_root.T
-        # Noise on controls counts before their limits, so not as noise on states.
+        # Noise on controls is added before the limits, so it does not count as noise on states.
         self._shaken = per_entry("Uncertainty: control", told.control, model.dynamics.control_coordinates)
         self._roots = replace(model, uncertainty=replace(told, control=0.0)).process_root
         arrived = Lag.of(told.lag, plan.dt)
         self._predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
-        # What is under way: until the first measurement arrives it is repeated; until the first command does, the
-        # plan's controls are applied.
+        # Measurements and commands under way. The first measurement is repeated until it arrives. The plan's controls
+        # are applied until the first command arrives.
         self._late_measured = deque[Array]()
         first = [np.tile(plan.controls[min(i, plan.steps - 1)], (trials, 1)) for i in range(told.delay)]
         self._late_commands = deque(first)
@@ -123,7 +124,7 @@ class _Robots:
         return x
 
     def measure(self, t: int) -> Array:
-        """What is shown, (K, n)."""
+        """The measured states, (K, n)."""
         told, measured = self.model.uncertainty, self._late_measured
         measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.shown_std)
         shown = measured.popleft() if t >= told.latency else measured[0]
@@ -132,7 +133,7 @@ class _Robots:
         return self._shown
 
     def advance(self, t: int, commands: Array) -> Array:
-        """Advance by a control period, under commands (K, m). Returns those that were applied."""
+        """Advance by a control period, under commands (K, m). Returns the applied commands."""
         told, model = self.model.uncertainty, self.model
         self._late_commands.append(commands)
         lost = self.rng.random((self._trials, 1)) < told.command_loss

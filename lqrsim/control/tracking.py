@@ -2,11 +2,11 @@
 
 The chosen tolerances have the smallest predicted chance of failure: of a collision, or of an end farther from the
 plan's end than the goal's radius. All of them follow from one number, the time in which a deviation should vanish: each
-state may deviate by as much as random controls of the tolerated effort move it in that time. So units do not matter,
-and no state is held much more tightly than the controls can hold it. Weights that are tuned one by one can have better
-predictions, but only of the linear model that they are tuned for.
+state may deviate by as much as random controls of the tolerated effort move it in that time. Units therefore do not
+matter, and no state is held much more tightly than the controls permit. Weights that are tuned one by one can have
+better predictions, but only with the linear model for which they are tuned.
 
-The linear model is wrong where controls are often at their limits, so saturation counts against a law, too.
+The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law.
 """
 
 from collections.abc import Callable
@@ -29,12 +29,13 @@ from lqrsim.results.goal import scale_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 
-PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may take to decay
-# The chance of failure that a tube of twice the narrowest width counts for: small, so that width decides only where the
-# plan is far from everything, or collides with any law.
+PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control periods in which a deviation may decay
+# The chance of failure that a tube of twice the narrowest width is charged. It is small, so that width decides only if
+# the plan is far from all obstacles, or collides with any law.
 NARROW = 0.02
-# What the square of the share of commands beyond the limits adds to the chance of failing. A choice of ours: small
-# where few commands are limited, and near 1 where half of them are, for then the linear model says little.
+# Factor of the squared fraction of commands beyond the limits, as an addition to the chance of failing. This value is
+# our choice: the addition is small if few commands are limited, and near 1 if half of them are, because the linear
+# model then says little.
 FRAGILE = 3.0
 
 
@@ -43,7 +44,7 @@ class StateMoments(NamedTuple):
 
     Attributes:
       mean: (C, T+1, n). covariance: (C, T+1, n, n). across: (C, T, n, n).
-      saturation: share of the commands beyond the limits, (C,).
+      saturation: fraction of the commands beyond the limits, (C,).
     """
 
     mean: Array
@@ -54,7 +55,7 @@ class StateMoments(NamedTuple):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Prediction for a law: chance of failure, mean width of the tube, share of commands beyond the limits."""
+    """Prediction for a law: chance of failure, mean width of the tube, fraction of commands beyond the limits."""
 
     chance: float
     width: float
@@ -68,7 +69,7 @@ def choose_tolerances(
     """Choose the tolerances whose law is predicted to fail least often.
 
     Args:
-      effort: the most that may be added to each control, (m,).
+      effort: largest change of each control, (m,).
       at_end: as in `track`.
       moments: predicts the moments under the laws of C weights and the limits of the controls.
     """
@@ -108,7 +109,7 @@ def worth_of(told: list[Prediction], least: float) -> list[float]:
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
-    """How far random controls of an effort move each state, (n,), in each number of periods: rms over the plan."""
+    """The motion of each state, (n,), by random controls of an effort, in each number of periods: rms over the plan."""
     n, steps = model.n, model.plan.steps
     A, B = model.jacobian[:, :, :n], model.jacobian[:, :, n:]
     moved, total, reach = B * effort, np.zeros(n), dict[int, Array]()
@@ -166,8 +167,8 @@ def _beyond(bound: Array | float, off: Array | float, std: Array | float) -> Arr
 def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array]) -> StateMoments:
     """Moments under the laws of C weights that follow a filter's estimates.
 
-    The filter is assumed to be right about the noise. Then its error is independent of its estimate, and there is less
-    to compute than in `linear_loop.py`.
+    The filter is assumed to be right about the noise. Its error is then independent of its estimate, which needs less
+    computation than `linear_loop.py`.
     """
     n, own, steps, count = model.n, model.n + model.lagging, model.plan.steps, len(weights.state)
     gain, offset = tracking_laws(model, weights)
@@ -203,9 +204,9 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits
 
 
 def of_states(model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array]) -> StateMoments:
-    """Moments under C laws of the states that are shown, (C, T, m, n) and (C, T, m), in deviations from the plan.
+    """Moments under C laws of the measured states, (C, T, m, n) and (C, T, m), in deviations from the plan.
 
-    The moments are those of `linear_loop.py`. No law moves the unknowns: their rows are the same for all, and of the
+    `linear_loop.py` defines the moments. No law moves the unknowns: their rows are the same for all, and of the
     covariance's next one only the rows for the state and the actuators are computed.
     """
     n, own, steps, count, size = model.n, model.n + model.lagging, model.plan.steps, len(gain), model.size
@@ -226,14 +227,15 @@ def of_states(model: PlanModel, gain: Array, offset: Array, limits: tuple[Array,
         slope, level, left = limited(centre, std, *limits)
         beyond += (1 - slope) / steps
         law, response = slope[:, :, None] * law, slope[:, :, None] * response
-        # M P for M = F + G law: the covariance with what was. All of them in one product, for P is symmetric.
+        # M P for M = F + G law: the covariance with the previous deviation. P is symmetric, so one product serves all
+        # laws.
         free = np.ascontiguousarray((covariance.reshape(-1, size) @ F.T).reshape(count, size, own).swapaxes(1, 2))
         moved, base = free + G @ response, mean @ F[:, :own].T
         pushed = moved[:, :, :n] @ law.swapaxes(1, 2)
         pushed += G @ ((law * shown) @ law.swapaxes(1, 2))
         pushed[:] += G * left[:, None, :]
         ahead, spread = base + (level - planned) @ G.T + arrives.c[t, :own], 0.0
-        if lost:  # what is in force stays, as if the law were to ask for it
+        if lost:  # the command in force stays, as if the law requested it
             (other,), kept = lost, slice(n, own)
             moved_on, ahead_on = free + G @ covariance[:, kept], base + mean[:, kept] @ G.T + other.c[t, :own]
             off = (ahead_on - ahead)[:, :, None]
@@ -263,22 +265,23 @@ def track(
     """Return the policy that minimises squared deviations from a plan.
 
     The policy of `smooth` is optimal for the problem's cost, which often does not penalise deviations from the plan.
-    This one is optimal for staying on it. It runs as `simulate(plant, solution, controller=track(...))`, and is saved
-    and drawn as any other policy.
+    The policy of `track` is optimal for staying on the plan. Run it with `simulate(plant, solution,
+    controller=track(...))`; it is saved and drawn like any other policy.
 
     Args:
       problem: the problem that was solved.
-      solution: its solution, or any with a plan of the same system.
-      tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
-        the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
-        under the uncertainty.
-      effort: the most that may be added to each control to return to the plan; by default a quarter of its range.
-      at_end: the tolerances of the position at the plan's end, relative to before; of all states if there is no
-        position.
-      uncertainty: the uncertainty in a run, as from `uncertainty_of`, for choosing tolerances, and for what a lost
-        command leaves in force.
-      risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise along the plan;
-        above 0 it penalises large deviations more. Tolerances must then be given.
+      solution: its solution, or another solution with a plan of the same system.
+      tolerate: the tolerated deviation of each state, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s":
+        0.2}. Only
+        the ratios to one another and to `effort` matter. By default, the tolerances with which the robot is least
+        likely to fail under the uncertainty.
+      effort: the largest change of each control for returning to the plan; by default a quarter of its range.
+      at_end: factor on the tolerances of the position at the end of the plan; on the tolerances of all states if there
+        is no position.
+      uncertainty: the uncertainty in a run, as from `uncertainty_of`. It serves for choosing tolerances, and for the
+        effect of lost commands.
+      risk: theta: minimise (1/theta) log E exp(theta/2 * sum of squares) under the problem's noise along the plan. A
+        theta above 0 penalises large deviations more. Tolerances must then be given.
 
     Returns:
       The policy.
@@ -313,7 +316,7 @@ def track(
 
         weights = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments)
     gain, offset = _laws(problem, solution, model, weights, risk)
-    gain = gain[..., : model.n]  # what a lost command leaves in force is nothing to a command that arrives
+    gain = gain[..., : model.n]  # the command in force has no effect on a command that arrives
     return AffinePolicy(
         gain=gain,
         offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
@@ -325,7 +328,7 @@ def track(
 
 
 def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> tuple[Array, Array]:
-    """The laws, with the risk if it is not 0. Raises InputError if it is too high, with the largest that is not."""
+    """The laws, with the risk if it is not 0. If the risk is too high, raises InputError with the largest possible."""
     if not risk or problem.noise is None:
         return tracking_laws(model, weights)
     plan = solution.trajectory

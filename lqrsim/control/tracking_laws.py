@@ -1,6 +1,6 @@
-"""Tracking laws: one more backward pass, which minimises deviations from a plan instead of its cost.
+"""Tracking laws: a further backward pass that minimises deviations from a plan instead of its cost.
 
-It minimises, with z = (e, a, d) as in `plan_model.py` and u the deviation of the command,
+With z = (e, a, d) as in `plan_model.py` and u the deviation of the command, it minimises
 
     sum_t  e' Q e + (u + M_t d)' R (u + M_t d)  +  e_T' Q_T e_T.
 
@@ -8,8 +8,9 @@ M_t d is the control that cancels the unknowns' effect on the next state as far 
 otherwise a steady disturbance would leave a steady error. For the same reason a law assumes that the current
 disturbance continues: a law that expects a wind to abate yields to one that does not.
 
-If commands get lost, it is the expected sum, over which of them do (Schenato 2009: LQG with a hold). What a lost
-command leaves in force may be large, which makes the law gentle; the effort of a lost command does not count.
+If commands get lost, the law minimises the expected sum over the losses (Schenato 2009: LQG with a hold). When a
+command is lost, the previous one is held. It may be large, which makes the law gentle. The effort of a lost command
+does not count.
 """
 
 from dataclasses import dataclass
@@ -24,9 +25,9 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
 from lqrsim.results.solution import Solution
 
-CONTROL_SHARE = 0.25  # of the range between its limits that a control may be changed by, by default
-# The tolerances of the position at the plan's end, relative to those before. Whether a goal is reached depends on the
-# position alone; controls that also bring the velocity to rest there have less left for it.
+CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
+# The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
+# alone; controls that also bring the velocity to rest there have less effort left for it.
 AT_END = 0.1
 
 
@@ -35,9 +36,9 @@ class Weights:
     """Weights of deviations from a plan: a deviation that is just tolerated costs 1.
 
     Attributes:
-      state: the diagonal of Q, (n,); or of several to compare, (C, n).
+      state: the diagonal of Q, (n,); or C diagonals to compare, (C, n).
       control: diagonal of R, (m,).
-      end: diagonal of Q_T, likewise.
+      end: the diagonal of Q_T, (n,) or (C, n).
     """
 
     state: Array
@@ -49,10 +50,11 @@ class Weights:
         """The weights for tolerances in the states' units and efforts (m,) in the controls'.
 
         Args:
-          at_end: tolerance of the position at the end, relative to before; of all states if there is no position.
+          at_end: factor on the tolerances of the position at the end; on the tolerances of all states if there is no
+            position.
 
         Raises:
-          InputError: a name or unit that there is not, or a tolerance that is not positive.
+          InputError: there is no such name or unit, or a tolerance is not positive.
         """
         space = dynamics.state_coordinates
         state = per_entry("tolerate", tolerate, space, above=0.0)
@@ -71,7 +73,7 @@ class Weights:
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
-    """Return the tolerated effort of each control, (m,); by default a share of its range.
+    """Return the tolerated effort of each control, (m,); by default a fraction of its range.
 
     Raises:
       InputError: as `Weights.of`, or there is neither an effort nor a range.
@@ -91,7 +93,7 @@ class Averse:
     """Noise on the states about a plan, and the aversion to large deviations.
 
     Attributes:
-      matrices: M (T, n, k), at each step. risk: theta, of 1/2 the sum that the law minimises.
+      matrices: M (T, n, k), at each step. risk: theta, for half the sum that the law minimises.
     """
 
     matrices: Array

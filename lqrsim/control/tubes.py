@@ -1,8 +1,8 @@
 """Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion. The chance of collision is that of
-these moments as far as trials of the nonlinear model do not refute it; `sampled_loop.py` has them.
+are jointly Gaussian, and their distribution is known before any run; `linear_loop.py` has the recursion. The chance of
+collision follows from these moments, unless trials of the nonlinear model refute it; see `sampled_loop.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -28,9 +28,9 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
-# Trials by default: as many as this many numbers in all, z at each step; at least and at most.
+# The default number of trials: such that all z at all steps are NUMBERS numbers, but at least FEWEST and at most MOST.
 NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
-STRAY = 6.0  # standard deviations of the position, of the direction and the knot with the largest
+STRAY = 6.0  # largest standard deviations of the position, over directions and knots
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,19 +42,19 @@ class Tube:
       state_coordinates: names and units of the states.
       mean: mean of the deviation of the state, (T+1, n).
       covariance: covariance of that deviation, (T+1, n, n).
-      across: covariance of the deviation with that at the knot before, (T, n, n).
+      across: covariance of the deviation with the deviation at the previous knot, (T, n, n).
       estimate_covariance: covariance of the error of the estimate, before each measurement, (T+1, n, n); None without a
         filter.
       command: standard deviation of each command, before it is limited, (T, m).
-      saturation: share of the commands that are beyond the limits, (T, m).
+      saturation: fraction of the commands that are beyond the limits, (T, m).
       step_chance: the chance of being in collision at each knot by these moments, (T+1,); bounded by the sum over
         obstacles.
       linear_chance: chance of colliding at all, by these moments.
-      collision_chance: the same by moments and sampled trials: the share of the trials that collide, if that refutes
-        the moments' chance, else both together.
+      collision_chance: chance of colliding at all, by moments and sampled trials: the fraction of trials that collide,
+        if it refutes the moments' chance, else both combined.
       samples: number of sampled trials.
-      strays: share of these that get farther from the plan than six of the position's largest standard deviations.
-        They are not what the moments describe.
+      strays: fraction of the trials that get farther from the plan than six of the position's largest standard
+        deviations. The moments do not describe them.
 
     Raises:
       InputError: arrays that do not fit together.
@@ -79,7 +79,7 @@ class Tube:
 
     @cached_property
     def position_covariance(self) -> Array:
-        """(T+1, 2 or 3, 2 or 3)."""
+        """Covariance of the position, (T+1, 2 or 3, 2 or 3)."""
         place = list(self.state_coordinates.position)
         return self.covariance[:, place][:, :, place]
 
@@ -93,13 +93,13 @@ class Tube:
           The rollout with its `tube` and `collision_chance`.
 
         Raises:
-          InputError: it is a run of another plan, or of a robot without a position.
+          InputError: the rollout is a run of another plan, or the robot has no position.
         """
         check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not self.state_coordinates.position:
             raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan than that of the tube, want a run of the tube's plan")
+            raise InputError("rollout: got a run of another plan, want a run of the tube's plan")
         return replace(rollout, tube=self.position_covariance, collision_chance=self.step_chance)
 
 
@@ -117,20 +117,20 @@ def predict_tube(
     Args:
       problem: the problem that was solved, with the obstacles in its costs and constraints.
       solution: the solution whose plan is run.
-      uncertainty: the uncertainty in a run. With a latency or a delay mean and covariance are those of the samples that
-        stay finite.
+      uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
+        samples that stay finite.
       controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
         written in plain Python, and with distances by MuJoCo.
-      seed: of these.
+      seed: seed of these trials.
 
     Returns:
       The Tube.
 
     Raises:
-      InputError: something does not fit the system; the controller is of another kind; samples are asked for where
-        distances are MuJoCo's; or there is a latency or a delay and there are no samples.
+      InputError: something does not fit the system; the controller is of another kind; samples are requested with
+        MuJoCo's distances; or there is a latency or a delay, but no samples.
     """
     check_plan("predict_tube", problem, solution)
     check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
@@ -155,7 +155,7 @@ def predict_tube(
         affordable = min(max(NUMBERS // (plan.steps * loop.model.size), FEWEST), MOST)
         samples = 0 if slow or not (surroundings.kept or late) else affordable
     if samples and surroundings.by_mujoco:
-        raise InputError(f"predict_tube: samples: got {samples} and distances by MuJoCo, want 0")
+        raise InputError(f"predict_tube: samples: got {samples} for distances by MuJoCo, want 0: trials lack them")
     if late and not samples:
         raise InputError(
             f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"
@@ -168,7 +168,7 @@ def predict_tube(
 def _tube(
     loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings
 ) -> Tube:
-    """The tube by moments, or else by the trials' own."""
+    """The tube by the moments, or else by the moments of the trials."""
     model, n, size, estimate = loop.model, loop.model.n, loop.model.size, None
     if moments is not None and loop.filter_gain is not None:
         whole = moments.covariance

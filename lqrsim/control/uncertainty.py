@@ -1,7 +1,7 @@
-"""The uncertainty in a run that its plan does not know, in numbers: the basis of filters, tracking laws and tubes.
+"""The uncertainty in a run that its plan ignores, in numbers: the basis of filters, tracking laws and tubes.
 
-All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one from the disturbances of `simulate`; for a robot
-of your own you can state one.
+All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes an `Uncertainty` from the disturbances of `simulate`.
+For your own robot you can also state one directly.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,25 +27,25 @@ from lqrsim.errors import (
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates, PerEntry
 
-MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to its own
+MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to the unknown's
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that the plan takes for granted and that is not so: a stationary Gaussian process about that value.
+    """A quantity that differs from the value that the plan assumes: a stationary Gaussian process about that value.
 
     Args:
       of: a parameter or a disturbance of the dynamics ("mass", "wind_x"), or "gain of <control>", of which 0.1 is 10 %
-        more than commanded, or "offset of <control>"; or several of them with their shares, {"wind_x": 0.6, "wind_y":
-        0.8} for what blows in that direction.
+        more than commanded, or "offset of <control>"; or several of them with their weights, such as {"wind_x": 0.6,
+        "wind_y": 0.8} for wind in that direction.
       std: standard deviation from the plan's value, in its unit.
       time_constant: seconds in which the correlation falls to 1/e; infinite for a constant, 0 for a value that is drawn
         anew in each control period.
       order: 1, or 2 for noise filtered by (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and
         upward.
-      drift: random walk of a constant, per square root of a second; other unknowns have none.
+      drift: random walk of a constant, per square root of a second; must be 0 for other unknowns.
 
     Raises:
       InputError: a number is out of range.
@@ -77,44 +77,44 @@ class Unknown:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Parameters or disturbances, with their shares."""
+        """Parameters or disturbances, with their weights."""
         return {self.of: 1.0} if isinstance(self.of, str) else dict(self.of)
 
     @property
     def name(self) -> str:
-        """Its name in messages."""
+        """The name in messages."""
         return " and ".join(self.shares)
 
     @property
     def constant(self) -> bool:
-        """Whether it is drawn once, though it may drift."""
+        """Whether it is drawn once. It may still drift."""
         return self.time_constant == np.inf
 
     @property
     def white(self) -> bool:
-        """Whether there is nothing to remember of it."""
+        """Whether it is white noise, without a state to remember."""
         return self.time_constant == 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
-    """All that a run meets and that its plan does not know.
+    """The uncertainty in a run that its plan does not take into account.
 
-    Numbers for states or controls are one for all, one for each, or by name or unit: {"m": 0.005, "m/s": 0.05}.
+    Values for states or controls are one number for all, one for each, or by name or unit: {"m": 0.005, "m/s": 0.05}.
 
     Attributes:
       unknowns: parameters, winds, forces, actuators' gains and offsets.
-      start: standard deviation of where a run begins, of each state.
+      start: standard deviation of each state at the start of a run.
       control: strength of white noise on each control.
       measurement: strength of white noise on each measured state.
       model_error: strength of the model's error in each state over one control period, white noise as well. A filter
-        assumes some whatever is stated here; see `OffsetFree`.
+        always assumes some model error; see `OffsetFree`.
       lag: time constant in s with which the actuators follow their commands.
-      delay: control periods by which commands come late.
-      latency: delay of measurements.
-      loss: share of the measurements that get lost.
-      command_loss: share of the commands that get lost; the actuators keep to the last one that arrived.
-      obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
+      delay: delay of commands in control periods.
+      latency: delay of measurements in control periods.
+      loss: fraction of the measurements that get lost.
+      command_loss: fraction of the commands that get lost; the actuators then keep the last command that arrived.
+      obstacles: standard deviation of an obstacle's position in m, along each of the world's axes; planes stay.
       left_out: disturbances that no linear model can represent, for the record.
 
     Raises:
@@ -141,7 +141,7 @@ class Uncertainty:
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
                 check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
             if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
-                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want a number, or one for each")
+                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
         keep(self, lag=check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
             keep(self, **{name: check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)})
@@ -152,7 +152,7 @@ class Uncertainty:
         keep(self, left_out=check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts"))
 
     def check(self, dynamics: Dynamics) -> None:
-        """Check that it fits a system.
+        """Check that the uncertainty fits a system.
 
         Args:
           dynamics: dynamics of the system.
@@ -168,14 +168,14 @@ class Uncertainty:
                 check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))
 
     def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
-        """The same for a filter: varying unknowns may have a mean that is not zero, and constant ones may change.
+        """The uncertainty for a filter: varying unknowns may have a nonzero mean, and constant unknowns may change.
 
         In the linear model, this leaves no steady error: a filter that assumes a constant stops adapting, and one that
         assumes a wind of mean zero is biased for a steady wind.
 
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
-          share: standard deviation of a varying unknown's mean, relative to its own.
+          share: standard deviation of a varying unknown's mean, relative to the unknown's.
 
         Returns:
           An Uncertainty.
@@ -197,12 +197,12 @@ class Uncertainty:
 
     @property
     def as_steady(self) -> "Uncertainty":
-        """This, with the unknowns in the order of `steady`: means that are zero have a standard deviation of 0."""
+        """This uncertainty with unknowns in the order of `steady`: zero means have a standard deviation of 0."""
         return self.steady(np.inf, share=0.0)
 
 
 def possible_unknowns(dynamics: Dynamics) -> list[str]:
-    """All that an Unknown can be of."""
+    """All names that an Unknown can have."""
     controls = dynamics.control_coordinates.names
     own = dynamics.parameters | dynamics.disturbances
     return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
@@ -214,13 +214,13 @@ def check_seconds(field: str, value: float, **bounds: float) -> float:
 
 
 def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float | None = None) -> Array:
-    """Numbers as one for each entry, (len(space),); those by name win over those by unit, the rest are 0.
+    """One number for each entry, (len(space),). A name takes precedence over a unit; entries without a number are 0.
 
     Args:
       above: a bound that each must exceed; by default numbers may be 0, and names may be left out.
 
     Raises:
-      InputError: a name or unit that there is not, another number of them, or one that is out of range.
+      InputError: there is no such name or unit, the count is wrong, or a number is out of range.
     """
     if isinstance(numbers, Mapping):
         given = space._by_name(field, numbers, check_number)
@@ -261,8 +261,8 @@ class ShapingFilter(NamedTuple):
 def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
     """The shaping filter of an unknown for a control period of dt seconds.
 
-    That of second order has the states p and p', with p'' + 2 p' + p = 2 w in time constants. Stationary, they have
-    variance 1 and are uncorrelated.
+    The second-order filter has the states p and p', with p'' + 2 p' + p = 2 w in time constants. In the stationary
+    state they have variance 1 and are uncorrelated.
     """
     std, drift = unknown.std, unknown.drift
     if unknown.white:
@@ -273,7 +273,7 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
         fresh = np.hypot(std * np.sqrt(-np.expm1(-2 * step)), drift * np.sqrt(dt))  # one of the two is zero
         return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std))
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
-    # The integral of e^As b b' e^A's over the period. I - F F' is the same and cancels if the period is short.
+    # The integral of e^As b b' e^A's over the period. It equals I - F F', but that form cancels if the period is short.
     nodes, weights = np.polynomial.legendre.leggauss(32)
     length = min(step, 40.0)
     s = 0.5 * length * (nodes + 1)
@@ -282,9 +282,9 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
 
 
 def triangular_root(root: Array) -> Array:
-    """The lower triangular (..., n, n) whose product with its transpose is that of root (..., n, k).
+    """The lower triangular L (..., n, n) with L L' = root root', for a root (..., n, k).
 
-    By an orthogonal transformation: nothing is squared, so that each row keeps its own relative precision.
+    It is found by an orthogonal transformation. Nothing is squared, so each row keeps its own relative precision.
     """
     rows, columns = root.shape[-2:]
     if columns < rows:
@@ -293,7 +293,7 @@ def triangular_root(root: Array) -> Array:
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
-    """Several as one: those of the same kind add up.
+    """Combine several uncertainties; noises of the same kind add up.
 
     Raises:
       InputError: the numbers of two are not of the same form.
@@ -304,7 +304,7 @@ def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
         total = Uncertainty(
             unknowns=(*total.unknowns, *one.unknowns),
             **numbers,
-            lag=total.lag + one.lag,  # of two in a row, about
+            lag=total.lag + one.lag,  # approximately right for two lags in series
             delay=total.delay + one.delay,
             latency=total.latency + one.latency,
             loss=1 - (1 - total.loss) * (1 - one.loss),
@@ -316,13 +316,11 @@ def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
 
 
 def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
-    """Standard deviations of the sum of two."""
+    """Standard deviations of the sum of two noises."""
     for one, other in ((first, second), (second, first)):
         if not isinstance(one, Mapping) and np.ndim(one) == 0 and one == 0:
             return other
     if isinstance(first, Mapping) or isinstance(second, Mapping):
-        raise InputError(
-            f"Uncertainty: {name}: got two by name or unit, {excerpt(first)} and {excerpt(second)}, want one"
-        )
+        raise InputError(f"Uncertainty: {name}: got two dictionaries, {excerpt(first)} and {excerpt(second)}, want one")
     both = np.hypot(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     return float(both) if both.ndim == 0 else tuple(both.tolist())

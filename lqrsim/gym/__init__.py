@@ -1,4 +1,4 @@
-"""Scenarios as environments of Gymnasium; needs the extra `gym`.
+"""Scenarios as Gymnasium environments; needs the extra `gym`.
 
     import gymnasium
     import lqrsim.gym
@@ -6,9 +6,9 @@
     env = gymnasium.make("lqrsim/Quadrotor-v0", disturbances="moderate")
     env = lqrsim.gym.make_env("my_robot.py:hallway")
 
-Importing this registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. Programs that only
-have a name to give, such as a trainer's configuration, import it by that: "lqrsim.gym:lqrsim/Quadrotor-v0". Gymnasium
-reads no entry points since its version 1.0.
+Importing this module registers lqrsim/Quadrotor-v0, lqrsim/DifferentialDrive-v0 and lqrsim/Scenario-v0. If only a name
+can be given, as in a trainer's configuration, "lqrsim.gym:lqrsim/Quadrotor-v0" imports the module, too. Gymnasium
+has not read entry points since version 1.0.
 """
 
 from typing import Any
@@ -31,9 +31,9 @@ def make_env(scenario: str | Scenario, **options: Any) -> gymnasium.Env[Any, Any
     """Make the environment of any scenario, with Gymnasium's usual wrappers.
 
     Args:
-      scenario: a Scenario, or a reference as on the command line: a name with settings, "quadrotor,query=3"; a function
-        of yours, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
-      options: those of `Environment`, and those of `gymnasium.make`.
+      scenario: a Scenario, or a reference as on the command line: a name with settings, "quadrotor,query=3"; your own
+        function, "my_robot.py:hallway"; an MJCF, "cartpole.xml,start={'pole': 3.14}".
+      options: options of `Environment` and of `gymnasium.make`.
 
     Raises:
       InputError: as `Environment` does.
@@ -45,7 +45,7 @@ def make_vec(scenario: str | Scenario, num_envs: int, **options: Any) -> gymnasi
     """Make many environments of one scenario, run by MuJoCo as one batch: see `VectorEnvironment`.
 
     Args:
-      scenario: as in `make_env`. num_envs: number of environments. options: those of `VectorEnvironment`.
+      scenario: as in `make_env`. num_envs: number of environments. options: options of `VectorEnvironment`.
 
     Raises:
       InputError: as `VectorEnvironment` does.

@@ -1,4 +1,4 @@
-"""Scenarios as environments of Gymnasium, one or many at once, and controllers as agents."""
+"""Scenarios as Gymnasium environments, one or many at once, and controllers as agents."""
 
 import os
 from collections.abc import Sequence
@@ -34,29 +34,33 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
     """The closed loop of `simulate` with an agent instead of the policy.
 
     An observation is the measured state, (n,), angles in the representative nearest the plan, followed by the time as a
-    share of the horizon. An action is a control; it is clipped to the limits, as in `simulate`. The reward is minus the
-    stage cost of the scenario's problem, for the true state and the applied control; the last one includes minus the
+    fraction of the horizon. An action is a control; it is clipped to the limits, as in `simulate`. The reward is minus
+    the
+    stage cost of the scenario's problem, for the true state and the applied control; the last reward includes minus the
     final cost. An episode is truncated at the horizon, and terminates with a collision or an unstable simulation.
 
-    Episodes are trials: `reset(seed=s)` begins trial 0 of seed s, each following `reset()` the next one. Each is
-    bit-identical to that trial in `simulate` with the same commands.
+    Episodes are trials: `reset(seed=s)` begins trial 0 of seed s, and each following `reset()` begins the next trial.
+    Each episode is bit-identical to that trial in `simulate` with the same commands.
 
     Options of `reset`, for that episode only: `disturbances` and `strength` as below; `preset`, a name as in
-    `lqrsim.disturbances.preset`; `trial`, its number. The info has `seed`, `trial`, `time` in s, the true `state` (n,)
+    `lqrsim.disturbances.preset`; `trial`, the number of the trial. The info has `seed`, `trial`, `time` in s, the true
+    `state` (n,)
     and the `clearance` in m; at the end also `outcome`, as in `Rollout.outcome`, and `is_success`.
 
     Args:
       scenario: a reference as on the command line, such as "quadrotor,query=3", or a Scenario.
-      solution: a Solution, or the path of one. Its plan gives the first state, the duration and the reference of
+      solution: a Solution, or the path of a saved solution. Its plan gives the first state, the duration and the
+        reference of
         disturbances. By default the scenario's problem is solved at the first `reset`.
       disturbances: a name as in `lqrsim simulate --disturbances`, or a tuple of names and disturbances. strength:
-        factor by which they are scaled.
+        factor by which the disturbances are scaled.
       actions: "normalized": from -1 to 1, between the limits of each control; "controls": the controls themselves in
         their units, within their limits.
-      render_mode: None or "rgb_array". camera, size: of its pictures; any camera of `render` except "chase".
+      render_mode: None or "rgb_array". camera, size: camera and size of the pictures; any camera of `render` except
+        "chase".
 
     Attributes:
-      task: the scenario and its plant. solution: with the plan.
+      task: the scenario and its plant. solution: the solution with the plan.
 
     Raises:
       InputError: there is no such scenario, disturbance, camera or mode; or a control has no limits.
@@ -141,8 +145,8 @@ class Expert:
         observation, info = env.reset(seed=0)
         observation, reward, *ended, info = env.step(expert(observation))
 
-    Called with the observation (n+1,) of an `Environment`, or those (K, n+1) of a `VectorEnvironment`, it returns the
-    action (m,), or the actions (K, m). At time 0 the controller starts anew.
+    For the observation (n+1,) of an `Environment` it returns the action (m,); for the observations (K, n+1) of a
+    `VectorEnvironment`, the actions (K, m). At time 0 the controller starts anew.
 
     Args:
       env: the environment, possibly in wrappers that change neither observations nor actions.
@@ -160,12 +164,12 @@ class Expert:
         self._run: ControllerRun | None = None
 
     def __call__(self, observation: npt.ArrayLike) -> Array:
-        """The action for an observation. Raises InputError unless it is one of the environment's."""
+        """The action for an observation. Raises InputError unless the environment can have made it."""
         size = len(self._task.plant.robot.dynamics.state_coordinates) + 1
         seen = vectors_of("observation", observation, size)
         rows = np.atleast_2d(seen)
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
-            raise InputError(f"observation: got {excerpt(rows[:, -1])} for the time, want a share of the horizon")
+            raise InputError(f"observation: got {excerpt(rows[:, -1])} as its time, want fractions of the horizon")
         step = round(float(rows[:, -1].max()) * self._steps)
         if step == 0 or self._run is None:
             self._run = self._law.start(len(rows))
@@ -182,10 +186,10 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     trial in `simulate` and in an `Environment`. The info has arrays with an entry per trial.
 
     Args:
-      num_envs: K. threads: of MuJoCo; by default one per processor.
+      num_envs: K. threads: number of MuJoCo's threads; by default one per processor.
       frames: whether `rollout()` can be drawn; it takes memory.
 
-    The others are those of `Environment`.
+    The other arguments are the arguments of `Environment`.
 
     Raises:
       InputError: as `Environment` does.
@@ -217,11 +221,11 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin all episodes. Raises InputError for more than one seed, or an invalid option."""
         if isinstance(seed, Sequence) and not isinstance(seed, str):
-            raise InputError(f"seed: got {len(seed)} of them, want one: episodes are trials 0, 1, 2, ... of it")
+            raise InputError(f"seed: got {len(seed)} seeds, want one: the episodes are its trials 0, 1, 2, ...")
         seed, options = None if seed is None else check_seed("seed", seed), reset_options(options)
         mask = options.pop("reset_mask", None)
         if mask is not None and not shaped("options: reset_mask", mask, (self.num_envs,)).all():
-            raise InputError("options: reset_mask: got some of the episodes, want all: they begin together")
+            raise InputError("options: reset_mask: got a part of the episodes, want all: they begin together")
         super().reset(seed=seed)
         count, frames, threads = self.num_envs, self._frames, self._threads
         episode = self._begin(seed, self.np_random, options, count, frames=frames, threads=threads)
@@ -241,7 +245,7 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
 
     def render(self) -> NoReturn:
         """Raises InputError: a batch has no pictures of its own; `lqrsim.render` draws its rollout."""
-        raise InputError("render: got a batch, want an Environment, or lqrsim.render(rollout()) with frames=True")
+        raise InputError("render: got a batch, want an Environment; or frames=True and lqrsim.render(rollout(), path)")
 
     def _info(self, episode: Episode) -> dict[str, Any]:
         numbers = episode.first + np.arange(self.num_envs)

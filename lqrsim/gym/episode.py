@@ -47,7 +47,7 @@ RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 class Task:
-    """The task of an environment. The arguments are those of `Environment`.
+    """The task of an environment. It takes the arguments of `Environment`.
 
     Attributes:
       scenario, plant: robot and problem of the episodes. low, high: limits of the controls, (m,) each.
@@ -84,7 +84,7 @@ class Task:
 
     @cached_property
     def solution(self) -> Solution:
-        """The given solution, or that of `smooth` for the scenario."""
+        """The given solution, or the solution of `smooth` for the scenario."""
         return solve(self.scenario) if self._given is None else self._given
 
     @cached_property
@@ -249,8 +249,8 @@ class Episode:
     """A run of K trials of a task. A trial that has ended keeps its observation, without a reward, until all have.
 
     Attributes:
-      seed, first: of the trials, numbers `first` to `first + K - 1` of this seed.
-      ended: (K,) whether each episode has ended. outcomes: (K,) how; empty for those still running.
+      seed, first: the episodes are the trials `first` to `first + K - 1` of this seed.
+      ended: (K,) whether each episode has ended. outcomes: (K,) outcome of each episode; empty while it is running.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ class Episode:
         rewards[running] = -self._costs.stage(step, before, loop.records.applied[:, step])[running]
         now = self._ended_at.any(axis=0) & running
         if now.any():
-            # A trial that has become unstable has no state; use the one before.
+            # A trial that has become unstable has no valid state; use the previous state.
             last = np.where(lost[:, None], before, self.states)
             rewards[now] -= self._costs.final(last, loop.records.applied[:, step])[now]
         self._last[running] = self._observe(lost)[running]
@@ -333,7 +333,7 @@ class Episode:
         return self._loop.so_far()
 
     def _observe(self, lost: Flags | None = None) -> Array:
-        """Measured states and time as a share of the horizon; the last valid ones of unstable trials."""
+        """Measured states, and time as a fraction of the horizon; for unstable trials the last valid states."""
         loop, plan = self._loop, self._plan
         seen = np.column_stack([self._near_plan(loop.measured), np.full(len(loop.measured), loop.step / plan.steps)])
         if lost is not None:

@@ -1,1 +1,1 @@
-"""What is compiled, in the subset of Python that `codegen/language.py` defines; read `declarations.py` first."""
+"""The compiled code, in the subset of Python that `codegen/language.py` defines. Read `declarations.py` first."""

@@ -1,21 +1,22 @@
-"""The augmented Lagrangian: the cost that is added for a constraint. The kernels' subset.
+"""The augmented Lagrangian: the cost that is added for a constraint. Written in the kernels' subset.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
     sum (max(0, lambda - mu d)^2 - lambda^2) / (2 mu)
 
 and for equalities d = 0, with multipliers of either sign, the same without the max: sum -lambda d + mu/2 d^2. At the
-optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is the value less
-the tolerance to which the constraint is solved, so that a plan within the tolerance satisfies the constraint itself. A
-constraint may have a price, in cost per unit of violation: no force is larger, and the Lagrangian is linear where its
-force would be. Only the part `mu n n'` of its curvature is used, with n the gradient of d: the rest can be negative.
+optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is the value
+minus the tolerance to which the constraint is solved. A plan within the tolerance therefore satisfies the constraint
+itself. A
+constraint may have a price, in cost per unit of violation. No force exceeds the price; where it would, the Lagrangian
+is linear. Of the curvature only the part `mu n n'` is used, with n the gradient of d: the rest can be negative.
 
 `multipliers` is one array per constraint: the penalty mu (0 where the constraint does not act yet), the number of rows
-at a step, the first step at which they act, the margin, which is the tolerance, the price (infinite where there is
-none), and from MULTIPLIERS on lambda, step by step. The indices are names of `declarations.py`; Python has the class
-`ConstraintMultipliers` of `solvers/compiled.py`.
+at a step, the first step at which they act, the margin, which is the tolerance, the price (infinite if there is none),
+and from MULTIPLIERS on lambda, step by step. The indices are names in `declarations.py`; Python uses the class
+`ConstraintMultipliers` in `solvers/compiled.py`.
 
-A constraint whose rows share numbers, such as the centres of a robot's balls, computes these once a step, by `places`.
+A constraint whose rows share numbers, such as the centres of a robot's balls, computes them once per step, by `places`.
 Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of state and control.
 """
 
@@ -40,7 +41,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.linear_algebra import fill
 
-SHARED = 0  # numbers that the rows share; 0 for a constraint on state and control
+SHARED = 0  # number of values that the rows share; 0 for a constraint on state and control
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
@@ -96,7 +97,7 @@ def augmentation_at(x, u, t, data, multipliers):
 
 
 def force_of(x, u, t, row, data, multipliers):
-    """The force lambda - mu d of one value, the same within its price, and its part of the Lagrangian times 2 mu."""
+    """The force lambda - mu d of one value, that force limited by the price, and the Lagrangian's part times 2 mu."""
     multiplier = multipliers[MULTIPLIERS + int(multipliers[ROWS]) * t + row]
     force = multiplier - multipliers[PENALTY] * (constraint_value(x, u, t, row, data) - multipliers[MARGIN])
     held, value = 0.0, -multiplier * multiplier
@@ -109,7 +110,7 @@ def force_of(x, u, t, row, data, multipliers):
 def constraint_values(x, u, t, acts, data, multipliers, values):
     """Write a constraint's values at step t, ordered as the multipliers are.
 
-    Where it does not act they are satisfied: infinite for an inequality, zero for an equality.
+    If the constraint does not act, the values are satisfied: infinite for an inequality, zero for an equality.
     """
     if SHARED:
         shared = stack(SHARED)

@@ -1,7 +1,7 @@
-"""Certification of a plan, computed from the problem on a short path of its own. The kernels' subset.
+"""Certification of a plan, computed from the problem on a separate, short path. Written in the kernels' subset.
 
 It uses only the problem's functions, their derivatives and a Cholesky factor: nothing from the passes, rollouts and
-line searches that found the plan. The cost is the value that comes with the derivatives, not what rollouts added up.
+line searches that found the plan. The cost is the value that comes with the derivatives, not the sum from rollouts.
 `certify.py` compares the results with a solver's claims.
 """
 
@@ -16,20 +16,21 @@ from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
 def certify(settings, own, plan, policy, to_go, model, found):
     """Write cost, residuals and predicted decrease of a plan and its policy.
 
-    The predicted decrease is `1/2 sum e' E^-1 e` with the gradients e of the cost in the offsets of the policy, later
-    controls responding with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the prediction
+    The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
+    later controls respond with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the
+    prediction
     of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their limits. Cost and
     decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
-      own: whether to compute the Hessians S (T+1, N, N) here, for the policy as it is with controls at their limits,
-        and write them to `to_go`: those of a Riccati pass assume that clamped controls respond.
+      own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
+        them to `to_go`. The Hessians of a Riccati pass assume that clamped controls respond.
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       found: row of CERTIFICATE, written.
-        scale: the curved part of the cost, if nothing in it cancelled; rounding errors are relative to it.
+        scale: size of the curved part of the cost without cancellation; rounding errors are relative to it.
         dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
         policy_residual: the largest difference of a control from the policy's, within its limits, relative to the terms
-        of that sum.
+        of the policy's sum.
         beyond_limits: the largest violation of a control's limit.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
@@ -53,7 +54,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
         cost += cost_alone(x, u, t, model.stage, 0.0, stage.hessian, stage.gradient)
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
-        if NOISY:  # for the policy as it is, the gradient of the cost-to-go is the costate
+        if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
             ahead = NextStep(
                 step.jacobian,
                 nowhere if own else arrived,
@@ -115,7 +116,7 @@ def predicted_decrease(step, stage, gain, S, room, costate):
 
     Args:
       step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. room: Limits of changes.
-      costate: (N,) at t + 1, overwritten by that at t; controls respond with the gain, but not at a limit.
+      costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
     slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
@@ -145,7 +146,7 @@ def predicted_decrease(step, stage, gain, S, room, costate):
 
 
 def singular_semidefinite(matrix):
-    """Whether a control block (M, M) is positive semidefinite up to rounding: definite with more on its diagonal."""
+    """Whether a control block (M, M) is positive semidefinite up to rounding: definite with a larger diagonal."""
     block, size = stack(M, M), 1e-300
     for i in range(M):
         size = max(size, abs(matrix[i, i]))
@@ -173,7 +174,7 @@ def start_decrease(stage, S, costate):
 
 
 def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
-    """Write the Hessian (N, N) of the policy's cost-to-go at t, given that at t + 1.
+    """Write the Hessian (N, N) of the policy's cost-to-go at t, given the Hessian at t + 1.
 
     A control at a limit, without room on one side, does not respond.
 
@@ -213,10 +214,10 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
 def box_decrease(matrix, slope, lowest, highest, best):
     """The decrease of `1/2 x'E x + e'x` at its minimiser within a box about zero; NaN unless E >= 0.
 
-    Where E is singular, it is that of e'x: an upper bound.
+    If E is singular, it is the decrease of e'x, an upper bound.
 
     Args:
-      matrix: E (M, M). slope: e (M,). lowest, highest: (M,) of the box. best: (M,), the minimiser, written.
+      matrix: E (M, M). slope: e (M,). lowest, highest: (M,) bounds of the box. best: (M,), the minimiser, written.
     """
     factor = stack(M, M)
     inside = True

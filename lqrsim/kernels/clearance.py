@@ -1,7 +1,7 @@
-"""Distances to obstacles minus the required ones: values of a constraint. The kernels' subset.
+"""Constraint values: distances to obstacles minus the required distances. Written in the kernels' subset.
 
-The robot is a point at its position; or balls, and then `value` and `slope` take their centres and the centres'
-Jacobian in place of state and control, as `augmented_lagrangian.py` has them.
+The robot is a point at its position, or a set of balls. For balls, `value` and `slope` take the centres and their
+Jacobian in place of state and control; see `augmented_lagrangian.py`.
 
 From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
 table hold from their step on. A row is an obstacle, for the first ball, then for the next; it has margin number `row`
@@ -20,7 +20,7 @@ AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane
 
 
 def value(x, u, t, row, data):
-    """The distance of one ball to one obstacle, less its radius and the margin."""
+    """The distance of one ball to one obstacle, minus its radius and the margin."""
     a, b, c = place(x, row, data)
     steps, each = int(data[AT + STEPS]), int(data[AT + EACH])
     margin = data[AT + RADII + max(BALLS, 1) + min(t, steps - 1) * each + row % each]
@@ -44,7 +44,7 @@ def slope(x, u, t, row, data, gradient):
 
 
 def place(x, row, data):
-    """The centre of the ball that a row is about, or the position of a robot that is a point."""
+    """The centre of a row's ball, or the position of a robot that is a point."""
     if BALLS:
         first = 3 * ball_of(row, data)
         return x[first], x[first + 1], x[first + 2]

@@ -1,10 +1,10 @@
-"""Limits of the controls. The kernels' subset.
+"""Limits of the controls. Written in the kernels' subset.
 
-A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
-The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the
-forward pass fixes the same ones; and wherever a control is applied, it is clamped. Where that settles, each control
-minimises the remaining cost within its limits: the first-order conditions, up to rounding, without a penalty or a
-multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
+A control that is at a limit and would go beyond it is *fixed*: a constant in step and cost, without a gain.
+The backward pass determines which controls are fixed, by minimising within the limits at the expected state. The
+forward pass fixes the same controls. Every control that is applied is clamped. At convergence each control minimises
+the remaining cost within its limits: the first-order conditions hold, up to rounding, without a penalty or a
+multiplier. iLQR's steps become steps of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
@@ -19,13 +19,13 @@ def limited_control(gain, offset, x, limits, u):
 
 
 def fix_controls_at_limits(u, gain, limits, stage, step):
-    """Fix the controls that the last backward pass fixed: those at a limit without a gain, (M, N).
+    """Fix the controls that the last backward pass fixed: the controls at a limit without a gain, (M, N).
 
     Args:
-      stage, step: about the origin, as `riccati_forward` takes them; changed in place.
+      stage, step: about the origin, in the form for `riccati_forward`; changed in place.
 
     Returns:
-      What the stage's constant gains.
+      The increase of the stage's constant.
     """
     constant, jacobian, c = 0.0, step.jacobian, step.offset
     for i in range(M):
@@ -80,7 +80,7 @@ def minimize_within(stage, x, limits, gain, feedforward, hessian, gradient):
         if not beyond:
             break
         coordinate_descent(stage, x, limits, u)
-        for i in range(M):  # all slopes first: a fixed control no longer shows in the slopes of the others
+        for i in range(M):  # all slopes first: a fixed control no longer affects the slopes of the others
             outward[i] = slope_at(stage, x, u, i)
         for i in range(M):
             if (u[i] == low[i] and outward[i] > 0) or (u[i] == high[i] and outward[i] < 0):

@@ -1,8 +1,11 @@
-"""The dual form: the cost-to-come by its moments, as a Kalman filter whose noise is the control. The kernels' subset.
+"""The dual form: a Kalman filter for the moments of the cost-to-come, in which the control acts as process noise.
+
+Written in the kernels' subset.
 
 The cost-to-come is `1/2 (x - mean)' covariance^-1 (x - mean) + constant`. The covariance may be singular, and is zero
 at a fixed start; neither inverse dynamics nor an invertible A is needed. In the backward pass the costate, the gradient
-of the cost-to-go at the smoothed state, leads from each step to the one before (the modified Bryson-Frazier smoother).
+of the cost-to-go at the smoothed state, is propagated from each step to the previous step (the modified Bryson-Frazier
+smoother).
 
 `cost_to_come_primal.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h =
 R^-1 r, the substitution u = w - F x - h eliminates the control: At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
@@ -19,8 +22,8 @@ from lqrsim.kernels.records import EliminatedControl
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     """Write the cost-to-come at 0, given c_0 quadratised at x.
 
-    Where c_0 has no curvature there is no covariance. It then gets a little curvature about x, relative to each state's
-    own, or to the cost-to-go's: an optimum stays one, and the next iteration moves x on.
+    If c_0 has no curvature, there is no covariance. It then gets a small curvature about x, relative to each state's
+    own curvature, or to the cost-to-go's. An optimum remains an optimum, and the next iteration moves x further.
 
     Args:
       Q, q, constant: c_0 about the origin, (N, N), (N,).
@@ -83,7 +86,7 @@ def forward_jacobian(x, u, model, arrived, step, spare):
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """Write the moments of the cost-to-come at t + 1, given those at t, and the smoother's gains at t.
+    """Write the moments of the cost-to-come at t + 1, given the moments at t, and the smoother's gains at t.
 
     Args:
       step: LinearStep, x_{t+1} = [A B] (x, u) + c. stage, constant: the cost at t about the origin.
@@ -160,7 +163,7 @@ def eliminate_control(step, stage, reduced):
     """Eliminate the control from a step and its stage; see EliminatedControl, which is written.
 
     Returns:
-      Whether R is positive definite; and a number that is zero where no cost couples states and controls.
+      Whether R is positive definite; and a number that is zero if no cost couples states and controls.
     """
     jacobian, cost, slope = step.jacobian, stage.hessian, stage.gradient
     factor, F, h, AT, BT, Q, q = reduced.factor, reduced.F, reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
@@ -236,13 +239,13 @@ def back_substitute(factor, rows):
 def update(V, Q, size):
     """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if it does not exist.
 
-    With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits, the
+    With Q = sum of d f f', one term is used at a time: V - K f'V with K = d V f / (1 + d f'V f). If digits cancel, the
     rest is computed in Joseph's form, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps V
-    semidefinite. It takes little time where Q has few entries, as those of obstacles have.
+    semidefinite. It takes little time if Q has few entries, as for obstacles.
 
     Args:
-      V: (N, N), overwritten. Q: (N, N), destroyed. size: (N,) diagonal of Q before the control was eliminated; far
-        smaller pivots are rounding.
+      V: (N, N), overwritten. Q: (N, N), destroyed. size: (N,) diagonal of Q before the control was eliminated; much
+        smaller pivots are rounding errors.
     """
     f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0
@@ -250,7 +253,7 @@ def update(V, Q, size):
         scale = max(scale, size[i])
     for i in range(N):
         d = Q[i, i]
-        if abs(d) <= 1e-14 * size[i]:  # then the row is zero, too, unless Q is indefinite
+        if abs(d) <= 1e-14 * size[i]:  # then the row is also zero, unless Q is indefinite
             for j in range(i + 1, N):
                 if not abs(Q[i, j]) <= 1e-6 * scale:
                     return False

@@ -1,4 +1,4 @@
-"""The primal form, the paper's: the cost-to-come as a quadratic, along inverse dynamics. The kernels' subset.
+"""The primal form of the paper: the cost-to-come as a quadratic, by inverse dynamics. Written in the kernels' subset.
 
 `cost_to_come_dual.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
 """
@@ -39,14 +39,14 @@ def linearize(x, u, model, arrived, step):
 
 
 def forward_jacobian(x, u, model, arrived, step, spare):
-    """The Jacobian (N, W) of the step forwards; computed only where there is a risk, and undefined elsewhere."""
+    """The Jacobian (N, W) of the step forwards; computed only if there is a risk, else undefined."""
     if NOISY and model.noise.risk[0] != 0:
         step_jacobian(x, u, model, model.dt, arrived, spare)
     return spare
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
-    """Write the cost-to-come at t + 1, given that at t, and the inverse policy at t. Eqs. (15)-(17), (19).
+    """Write the cost-to-come at t + 1, given the cost-to-come at t, and the inverse policy at t. Eqs. (15)-(17), (19).
 
     Args:
       step: LinearStep, the inverse step x_t = [Abar Bbar] (x_{t+1}, u_t) + cbar.

@@ -1,7 +1,7 @@
 """The safeguard: damped LQR smoothing near the best plan so far, for when undamped smoothing fails.
 
-The kernels' subset. Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost
-does not tell that the method will fail. It runs undamped until a pass fails or the lowest cost no longer falls; see
+Written in the kernels' subset. Rollouts on the way to an optimum can cost any multiple of the first, so a rising cost
+does not mean that the method will fail. It runs undamped until a pass fails or the lowest cost no longer falls; see
 `no_progress`. Damped iterations are to LQR smoothing what Levenberg-Marquardt is to Gauss-Newton.
 """
 
@@ -40,19 +40,19 @@ from lqrsim.kernels.rollouts import (
 
 
 def damped_iterations(first, last, settings, model, work, memory, log):
-    """Iterations from the best plan so far that never raise its merit: its cost and the augmented Lagrangian.
+    """Iterations from the best plan so far that never raise its merit: the cost plus the augmented Lagrangian.
 
     The forward pass linearises about the plan, the backward pass a fraction `reach` of the way from the plan to the
-    smoothed states, and a line search by halves follows the new policy. Where a tenth of the step does not lower the
+    smoothed states, and a line search by halves follows the new policy. If a tenth of the step does not lower the
     merit, the next iteration reaches less far. At reach 0 both passes linearise about the plan, and the step is iLQR's:
     a descent direction, unless the plan is stationary or rounding spoils the matrices. If it fails, changes of the
     controls (and of a soft start) get a weight in both passes, relative to the cost's own curvature, which grows
-    tenfold until it helps. After many iterations without convergence, too, reach 0 has its turn, each time for twice as
+    tenfold until it helps. After many iterations without convergence, reach 0 is also used, each time for twice as
     long.
 
     A small change of cost can come from a short step, so two in a row are required. Then one more undamped pass about
-    the plan measures its optimality, and computes the policy and the value functions of the answer. Where the
-    merit falls by nothing but rounding in IDLE steps in a row, as at a kink of the dynamics, it has stalled.
+    the plan measures its optimality, and computes the policy and the value functions of the answer. If the merit falls
+    only by rounding in IDLE steps in a row, as at a kink of the dynamics, the method has stalled.
 
     Arguments and results are as for `smoother_iterations`.
     """
@@ -91,7 +91,7 @@ def damped_step(settings, model, work, memory):
     """Both passes and the line search.
 
     Returns:
-      The new merit, the new cost, the fraction of the step that was taken, and the cost that is negligible.
+      The new merit, the new cost, the fraction of the step that was taken, and the negligible cost.
     """
     shift, reach = stack(N), memory.reach
     merit, cost, fraction, negligible = inf, inf, 0.0, 0.0
@@ -173,8 +173,8 @@ def relinearize(settings, settled, negligible, model, work, memory, row):
 def value_functions_at_plan(settings, model, work, memory, row):
     """Complete a backward pass about the plan: a policy that reproduces the plan, and the cost-to-come.
 
-    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: where motions are
-    unstable, rounding can spoil the cost-to-come while the rest is right.
+    Writes the residual to the log's row, and the gap between smoothed states and plan to the memory: if the dynamics
+    are unstable, rounding can spoil the cost-to-come while the rest is right.
     """
     steps, plan, policy = settings.steps, work.best, work.policy
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)

@@ -1,4 +1,4 @@
-"""The names that kernels are written against, and that mean something only when they are compiled.
+"""The names that kernels are written against. They get a meaning only when the kernels are compiled.
 
 Sizes become constants, and words of the language what `codegen/language.py` says. Open functions, which are empty here,
 are filled in. So each kernel can be read, linted and type-checked on its own.
@@ -14,20 +14,20 @@ W = N + M  # states and controls, joined
 NOISY = 0  # 1 for a problem with noise; `if NOISY` is not compiled for others
 EQUALITY = 0  # 1 for a constraint whose values must be zero
 
-# How iterations end; see `Status`. Outcomes without a status of their own: NO_START (the first trajectory is not
+# Outcomes of iterations; see `Status`. Some have no status of the same name: NO_START (the first trajectory is not
 # finite), STALLED (the line search found no lower cost), CYCLING (the same costs repeat), NO_PROGRESS (the lowest cost
-# so far no longer falls), TIMED_OUT (set by the callers: no kernel looks at a clock), RISK_TOO_HIGH (the expectation
-# does not exist) and IN_VALLEY (Newton's method can take over).
+# so far no longer falls), TIMED_OUT (set by the callers: no kernel reads a clock), RISK_TOO_HIGH (the expectation does
+# not exist) and IN_VALLEY (Newton's method can take over).
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
 NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH, IN_VALLEY = 10, 11, 12, 13
 LONGEST_CYCLE = 8
-# Iterations without a lower cost, and with a decrease below a thousandth, after which there is no progress. Neither
-# count is reached where the method converges on the paper's queries:
+# Numbers of iterations without a lower cost, and with a decrease below a thousandth, that count as no progress. Neither
+# number is reached if the method converges on the paper's queries:
 # `python experiments/benchmark_reliability.py --sections overhead`.
 NO_FALL, SLOW_FALL = 12, 30
-ROW = 16  # numbers of an obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
-# Where the numbers of a constraint stand in its array, and where its multipliers begin; see `augmented_lagrangian.py`.
+ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
+# Indices of a constraint's numbers in its array, and of its first multiplier; see `augmented_lagrangian.py`.
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
@@ -36,9 +36,10 @@ ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE = 0, 1, 2, 3, 4, 5
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
 
-# Damped iterations after which iLQR has its turn.
+# Number of damped iterations after which iLQR is tried.
 PATIENCE = 50
-# Relative improvements that may be rounding, and iterations in a row with no others after which damped ones stall.
+# Relative improvements that may be rounding, and the number of iterations with only these after which damped ones
+# stall.
 ROUNDING, IDLE = 1e-11, 12
 
 
@@ -63,8 +64,8 @@ def inline(function: Callable) -> Callable:
 def outline(function: Callable) -> Callable:
     """Decorate a kernel that is never inlined.
 
-    Inlined into a loop over trials, LLVM might vectorise across trials and round the remainder differently: the bits of
-    a trial would then depend on how many there are.
+    If it were inlined into a loop over trials, LLVM might vectorise across trials and round the remainder differently.
+    The bits of a trial would then depend on the number of trials.
     """
     return function
 
@@ -217,7 +218,7 @@ def forward_jacobian(x, u, model, arrived, step, spare):
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:
-    """Write the cost-to-come at t + 1, given that at t; return whether it exists."""
+    """Write the cost-to-come at t + 1, given the cost-to-come at t; return whether it exists."""
     return True
 
 

@@ -1,7 +1,7 @@
-"""Derivatives by central differences, for functions that come without. The kernels' subset.
+"""Central differences, for functions that come without derivatives. Written in the kernels' subset.
 
-First derivatives step by the cube root of the machine precision: truncation and rounding then both cost some 1e-10 of
-the function's size. Second derivatives of values step by its fourth root.
+The step for first derivatives is the cube root of the machine precision: truncation and rounding errors are then both
+about 1e-10 of the function's size. The step for second derivatives of values is its fourth root.
 """
 
 from lqrsim.kernels.declarations import M, N, W, noise_values, places, rate, stack, value, zeros
@@ -9,10 +9,10 @@ from lqrsim.kernels.linear_algebra import copy, entry, set_entry
 from lqrsim.kernels.records import WeightedStep
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
-FIRST, SECOND = 6e-6, 1.2e-4  # steps, relative to a number and at least to 1
+FIRST, SECOND = 6e-6, 1.2e-4  # steps, relative to a number whose size counts as at least 1
 AXES = (0,)  # entries of (x, u) that the function depends on
-BALLS = 1  # of `places`
-COLUMNS = 1  # of the noise matrix M
+BALLS = 1  # number of balls of `places`
+COLUMNS = 1  # number of columns of the noise matrix M
 
 
 def rate_jacobian(x, u, p, out, fx, fu):
@@ -116,7 +116,7 @@ def curvature_from_values(x, u, p, h, weights, out, jacobian, hessian):
 
 
 def weighted_step(x, u, t, data):
-    """The change of state over a step, times weights: the state itself is linear, and would only be rounded."""
+    """The change of state over a step, times weights; the state itself is linear and would only add rounding."""
     out, total = stack(N), 0.0
     advance(x, u, data.parameters, data.duration, out)
     for k in range(N):
@@ -137,7 +137,7 @@ def curvature_from_jacobians(x, u, p, h, weights, out, jacobian, hessian):
         for side in range(2):
             set_entry(y, v, j, z + far if side == 0 else z - far)
             step_jacobian(y, v, p, h, out, jacobian)
-            share = 0.25 / far if side == 0 else -0.25 / far  # half of it, because both triangles get it
+            share = 0.25 / far if side == 0 else -0.25 / far  # halved, because it is added to both triangles
             for k in range(W):
                 total = 0.0
                 for i in range(N):

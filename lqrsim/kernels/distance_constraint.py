@@ -1,4 +1,4 @@
-"""Distances from a model, minus margins. The kernels' subset.
+"""Distances from a model, minus margins. Written in the kernels' subset.
 
 `data` has the data of the distances, and from AT on the numbers below, and the margins, step by step; the last ones
 hold from their step on.
@@ -19,6 +19,6 @@ def value(at, u, t, row, data):
 
 
 def slope(at, moves, t, row, data, gradient):
-    """Add its gradient, of all distances and their derivatives in the states."""
+    """Add its gradient, given all distances and their derivatives in the states."""
     for i in range(N):
         gradient[i] += moves[row, i]

@@ -1,4 +1,4 @@
-"""The cost of obstacles at distances from a model. The kernels' subset.
+"""The cost of obstacles at distances from a model. Written in the kernels' subset.
 
 It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
 from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has the data of the
@@ -16,7 +16,7 @@ MOVED = 1  # states that the distances depend on: the first ones
 
 
 def value(x, u, t, data):
-    """The cost; none at the first step, whose state is given."""
+    """The cost; zero at the first step, whose state is given."""
     total = 0.0
     if t > 0:
         distances = stack(ROWS)

@@ -1,6 +1,7 @@
-"""The functions that Python calls: one for each solver, and single passes and rollouts. The kernels' subset.
+"""The functions that Python calls: one for each solver, and single passes and rollouts. Written in the kernels' subset.
 
-All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
+All code that a solve can need is compiled together, before the solve begins. Code that its parts share is compiled
+once.
 """
 
 from math import inf

@@ -1,4 +1,4 @@
-"""The steps of a Kalman filter for many trials at once, and derivatives along a plan. The kernels' subset.
+"""The steps of a Kalman filter for many trials at once, and derivatives along a plan. Written in the kernels' subset.
 
 An estimate is one row of Z numbers: the state x (N), the actuators' lagging controls (LAG: M numbers, or none), and the
 states of the unknowns' model (D). `output` times these are the unknowns: of P parameters of the dynamics, and of the
@@ -11,9 +11,9 @@ from lqrsim.kernels.declarations import M, N, call, outline, stack
 from lqrsim.kernels.linear_algebra import affine, clear, copy
 from lqrsim.kernels.policy_evaluation import to_nearest
 
-LAG, D, Y = 0, 1, 1  # lagging controls, states of unknowns, measured numbers
+LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
-NUMBERS, HELD = 1, 1  # parameters of the dynamics; D, and at least 1
+NUMBERS, HELD = 1, 1  # number of parameters of the dynamics; D, but at least 1
 FAR = 1e9  # an entry of an estimate beyond this has diverged, whatever its unit
 
 
@@ -40,7 +40,7 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
     """Write the derivatives (steps, N, P) of the steps of a plan in some parameters, by central differences.
 
     Args:
-      which: (P,) indices of the parameters. changes: (P,) by how much they are changed.
+      which: (P,) indices of the parameters. changes: (P,) steps of the differences.
     """
     p, q, more, less = dynamics.parameters, stack(NUMBERS), stack(N), stack(N)
     copy(p, NUMBERS, q)
@@ -60,9 +60,9 @@ def correct(count, measured, near, gain, sensor, angular, estimates, innovations
     """Update estimates (count, Z) with measurements, except where these were lost.
 
     Args:
-      measured: Measurements; its states are taken to the representatives nearest to the estimates.
-      near: (N,) to which the estimates are taken nearest first. gain: (Z, Y).
-      innovations: (count, Y) measured less expected, written; NaN where the measurement was lost.
+      measured: Measurements; its states are replaced by the representatives nearest to the estimates.
+      near: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
+      innovations: (count, Y) measurements minus expectations, written; NaN where the measurement was lost.
     """
     for k in range(count):
         correct_one(measured.shown[k], measured.lost[k], near, gain, sensor, angular, estimates[k], innovations[k])
@@ -130,7 +130,7 @@ def predict_one(control, predictor, z):
 def command(count, estimates, near, policy, limits, angular, out):
     """Write the controls (count, M), within their limits, of a policy with gains (M, Z) on the estimates (count, Z).
 
-    The estimates' angles are taken to the representatives nearest to `near` (N,).
+    The estimates' angles are replaced by the representatives nearest to `near` (N,).
     """
     for k in range(count):
         command_one(estimates[k], near, policy, limits, angular, out[k])

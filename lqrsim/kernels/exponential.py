@@ -1,4 +1,4 @@
-"""exp, computed by arithmetic alone. The kernels' subset.
+"""exp, computed by arithmetic alone. Written in the kernels' subset.
 
 Loops over it vectorise, which calls of the C library do not; and its bits are the same with every C library.
 """
@@ -9,12 +9,12 @@ from lqrsim.kernels.declarations import exact, power_of_two
 
 LOG2_E = 1.4426950408889634
 LN2_HIGH, LN2_LOW = 0.693145751953125, 1.4286068203094173e-06  # ln 2 in two parts; products with the first are exact
-LEAST, MOST = -708.0, 709.0  # below, exp x is taken to be zero; above, infinite
+LEAST, MOST = -708.0, 709.0  # below, exp x counts as zero; above, as infinite
 
 
 @exact
 def exponential(x):
-    """exp x, with a relative error of some 2e-16.
+    """exp x, with a relative error of about 2e-16.
 
     With k the whole number nearest to x / ln 2 it is 2^k exp r; Taylor's series for r, which is at most 0.35, has an
     error of 1e-17 after the twelfth power.

@@ -1,8 +1,9 @@
-"""Iterations of LQR smoothing and of iLQR, all in compiled code. The kernels' subset.
+"""Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
 
-Each function runs the iterations `first` to `last` - 1, and can be called again to continue: its state is in its
-arrays. The log gets a row per iteration. All return the number of iterations so far, the outcome (a name in
-`declarations.py`), and for a pass that failed whether it was the backward one, and its step, else -1.
+Each function runs the iterations `first` to `last` - 1, and can be called again to continue, because its state is in
+its arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the
+outcome
+(a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or -1.
 """
 
 from math import inf, isnan, nan
@@ -51,9 +52,9 @@ from lqrsim.kernels.rollouts import (
 
 
 def relative_improvement(old, cost, negligible):
-    """The decrease of cost relative to the new cost; 0 where it did not change, -inf where the cost is not finite.
+    """The decrease of cost relative to the new cost; 0 if it did not change, -inf if the cost is not finite.
 
-    Costs below `negligible` are rounding of zero, and would never settle.
+    Costs below `negligible` are rounding errors about zero, and would never settle.
     """
     if not abs(cost) < inf:
         return -inf
@@ -145,10 +146,10 @@ def failure(good, model):
 
 
 def cycling(log, done):
-    """Whether the costs repeat, up to rounding: then they always will.
+    """Whether the costs repeat, up to rounding; they then always will.
 
-    A cycle must repeat twice; one that the iterations still approach does not count. A cost that stays the same is a
-    cycle, too: iterations that have not converged by then never will.
+    A cycle must repeat twice; a cycle that the iterations still approach does not count. A constant cost is also a
+    cycle: iterations that have not converged by then never will.
     """
     same = done >= 5
     for i in range(5):
@@ -171,7 +172,7 @@ def no_progress(log, done):
     """Whether the lowest cost has not fallen for NO_FALL iterations, or by less than a thousandth for SLOW_FALL.
 
     A rising cost is no sign of failure, because the method passes through worse rollouts on its way. Costs that
-    oscillate, creep or stay infinite are.
+    oscillate, creep or stay infinite are a sign.
     """
     least, reference, since, slow = inf, inf, 0, 0
     for i in range(done + 1):
@@ -204,14 +205,14 @@ def write_row(row, cost, improvement, gap, left, residual, method):
 
 
 def relative_optimality(failed, decrease, cost, negligible):
-    """A predicted decrease relative to the cost; infinite where the pass that predicts it failed."""
+    """A predicted decrease relative to the cost; infinite if the pass that predicts it failed."""
     if failed >= 0 or not decrease < inf or not abs(cost) < inf:
         return inf
     return decrease / max(abs(cost), negligible, 1e-300)
 
 
 def outcome_of(settled, settings, left, cost, full):
-    """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last one."""
+    """The outcome of an iteration, given whether its cost settled, its optimality, and whether it was the last."""
     if settled and not settings.optimal:
         return COST_CONVERGED
     if settled and left < settings.tolerance:
@@ -251,7 +252,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
             damping[0] = 0.0
-        if NOISY:  # with the cost-to-go that the new policy has
+        if NOISY:  # with the new policy's cost-to-go
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
         cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.trial)

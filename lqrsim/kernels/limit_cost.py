@@ -1,7 +1,7 @@
-"""`1/2 sum of weight * depth^2`, the depth by which states are past bounds. The kernels' subset.
+"""`1/2 sum of weight * depth^2`, where depth is how far a state is past its bound. Written in the kernels' subset.
 
-`data` has the number of bounds, and of each the index of the state, 1 for a lower bound and -1 for an upper one, the
-bound, and the weight.
+`data` has the number of bounds, and for each bound: the index of the state, 1 for a lower bound or -1 for an upper one,
+the bound, and the weight.
 """
 
 

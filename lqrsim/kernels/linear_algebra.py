@@ -1,7 +1,7 @@
-"""Small dense linear algebra. The kernels' subset.
+"""Small dense linear algebra. Written in the kernels' subset.
 
 Innermost loops have constant length, so LLVM unrolls and vectorises them. Matrices are (N, N) or, for states and
-controls joined, (W, W); of symmetric ones the upper triangle is read.
+controls joined, (W, W). Of symmetric matrices the upper triangle is read.
 """
 
 from math import inf, sqrt
@@ -83,7 +83,7 @@ def clamp(u, limits):
 def cholesky(a, size):
     """Factor a = U'U in place: U in the upper triangle, reciprocals on its diagonal; False unless positive definite."""
     for k in range(size):
-        if not a[k, k] > 0:  # a NaN too
+        if not a[k, k] > 0:  # also for a NaN
             return False
         inverse = 1 / sqrt(a[k, k])
         a[k, k] = inverse

@@ -1,9 +1,9 @@
-"""Distances between the geoms of a robot and those of obstacles, by MuJoCo's `mj_geomDistance`. The kernels' subset.
+"""Distances between a robot's geoms and obstacle geoms, by MuJoCo's `mj_geomDistance`. Written in the kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
-of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's geom, how far both
-reach from their middles together, and whether the obstacle is a plane. A row is the least distance of its pairs. Pairs
-whose bounding spheres are farther apart than that are skipped.
+of interest, and for each pair: its row, the robot's geom and its body, the obstacle's geom, the sum of the radii of
+their bounding spheres, and whether the obstacle is a plane. A row is the least distance of its pairs. Pairs whose
+bounding spheres are farther apart than the least distance so far are skipped.
 """
 
 from math import sqrt
@@ -33,19 +33,19 @@ from lqrsim.kernels.mjcf_dynamics import (
 )
 from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio
 
-ROWS = 1  # how many there are
-LARGEST, PAIRS, PAIR = 3, 4, 6  # where they begin in data, and how many numbers each pair takes
+ROWS = 1  # number of rows
+LARGEST, PAIRS, PAIR = 3, 4, 6  # indices of the largest distance and the pairs in data, and count of numbers per pair
 TOUCHING = 1e-12  # m; the segment between two geoms that touch has no direction
 
 
 def distances(x, data, out):
-    """Write the least distance of each row, in metres; at most the largest of interest."""
+    """Write the least distance of each row, in metres; at most the largest distance of interest."""
     which, segments, nowhere = stack(ROWS), stack(ROWS, 6), stack(1)
     find(x, nowhere, -1, data, 0, out, which, segments)
 
 
 def distances_jacobian(x, data, out, slopes):
-    """Write these and their derivatives in the states (any, N), which are zeros when they come."""
+    """Write the distances and their derivatives in the states (any, N), which are zero on entry."""
     which, segments = stack(ROWS), stack(ROWS, 6)
     find_with_slopes(x, data, 0, out, slopes, which, segments)
 
@@ -53,7 +53,7 @@ def distances_jacobian(x, data, out, slopes):
 def distances_of(count, states, each, displaced, moved, data, out, which, segments):
     """Write the distances, row by row, at states (count, N).
 
-    If obstacles have moved, the same displacements, three numbers a row, hold for `each` consecutive states.
+    If obstacles have moved, the same displacements, three numbers per row, hold for `each` consecutive states.
     """
     rows = int(data[1])
     for i in range(count):
@@ -63,7 +63,7 @@ def distances_of(count, states, each, displaced, moved, data, out, which, segmen
 
 
 def slopes_of(count, states, data, out, slopes, which, segments):
-    """Write the distances and their derivatives (any, N), which are zeros when they come, at states (count, N)."""
+    """Write the distances and their derivatives (any, N), which are zero on entry, at states (count, N)."""
     rows = int(data[1])
     for i in range(count):
         find_with_slopes(states[i], data, rows * i, out, slopes, which, segments)
@@ -142,7 +142,7 @@ def look(p, one, data, displaced, moved, first, out, which, segments):
 
 
 def write_normal(one, own, other, distance, segment, normal):
-    """Write the direction from the robot's nearest point to the obstacle's; if they are one, from middle to middle."""
+    """Write the direction from the robot's nearest point to the obstacle's; if both coincide, from centre to centre."""
     length = 0.0
     for i in range(3):
         normal[i] = segment[3 + i] - segment[i]
@@ -160,7 +160,7 @@ def write_normal(one, own, other, distance, segment, normal):
 
 
 def turn_to_states(x, p, slope):
-    """Turn a derivative in angular velocities, in place, to one in the states' rotation vectors.
+    """Convert a derivative in angular velocities, in place, to a derivative in the states' rotation vectors.
 
     A rotation vector r that changes by dr turns the body by dr - cosine r x dr + cubic r x (r x dr), in its own axes.
     """

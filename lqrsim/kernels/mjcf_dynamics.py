@@ -1,13 +1,13 @@
-"""Dynamics that are MuJoCo's own control period: `mj_step` and its parts, called at their addresses.
+"""MuJoCo's own steps as dynamics: a control period by `mj_step` and its parts, called at their addresses.
 
-States are tangent coordinates: for each degree of freedom a position (of a ball or free joint's rotation three numbers
-of a rotation vector), then the velocities, then the actuators' own states. `p` has the wrench on the robot's body, then
-addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
-each takes a slot, two `MjData` that are its own for as long as it needs them. Where bodies carry loads, a slot also has
-a model of its own.
+States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
+states. The rotation of a ball or free joint is three numbers, a rotation vector. `p` has the wrench on the body, then
+addresses and sizes, at the indices named below; `scenes/mjcf_physics.py` writes it. Several threads may run these
+functions at once. Each takes a slot, two `MjData` that it owns for as long as it needs them. If bodies carry loads, a
+slot also has its own model.
 
-A step and what helps it are compiled apart. What does arithmetic here is therefore `outline` and `exact`: LLVM would
-reorder sums by where they are inlined, and bits would depend on the thread.
+A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and
+`exact`. Otherwise LLVM would reorder sums depending on where they are inlined, and bits would depend on the thread.
 """
 
 from math import atan2, cos, nan, pi, sqrt
@@ -30,14 +30,16 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
-# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which slot,
-# where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step, mj_forwardSkip
-# and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the physics, in s.
-# NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those is that the
-# controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of the
-# function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData,
-# mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model that distances are of. LOADED, LOADS: how many bodies
-# may carry a load, and where the loads are, in kg; the numbers of these bodies and their own masses follow. TABLE: the
+# The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: flags of the slots
+# in use, address of their numbers, number of slots. MODEL: MuJoCo's model. STEP, FORWARD, INTEGRATE: the addresses of
+# mj_step, mj_forwardSkip and the integrator; the last is 0 if parts of a step cannot be called separately. TIMESTEP:
+# timestep of the physics, in s. NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of
+# joints; ACTUATORS: address of the list of actuators that the controls drive. TEAM, JOB: addresses at which helper
+# threads find their work, 0 without helpers; YIELD: the address of the
+# function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics,
+# mj_resetData, mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of
+# bodies that may carry a load, and address of the loads, in kg; the numbers of these bodies and their own masses
+# follow. TABLE: the
 # joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
@@ -48,18 +50,18 @@ SLOT, SIZE = 28, 14
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 OWN_MODEL, MASSES = 12, 13
 
-# The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
-# many are done, whether to stop, how many helpers there are, whether a signal came: then all steps are NaN.
+# The words that a team shares: whether it is in use, the next column, combined with the number of the job, the number
+# of finished columns, whether to stop, the number of helpers, and whether a signal came, after which all steps are NaN.
 BUSY, TICKET, DONE, STOP, HELPERS, SIGNALLED = 0, 1, 2, 3, 4, 5
 JOBS = 65536  # the ticket is JOBS * job + column
-PATIENT = 2000  # looks at the ticket before a helper lets others run
+PATIENT = 2000  # number of looks at the ticket before a helper lets other threads run
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
 LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are no valid state
 
 
 def advance(x, u, p, h, out):
-    """Write the state after `h` seconds, (N,): a whole number of physics steps; NaN where it leaves all numbers."""
+    """Write the state after `h` seconds, (N,): a whole number of physics steps; NaN if it overflows."""
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
     if substeps < 1:
@@ -72,9 +74,9 @@ def advance(x, u, p, h, out):
 
 
 def step_jacobian(x, u, p, h, out, jacobian):
-    """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
+    """Write the same step and its Jacobian `[A B]` (N, W), by central differences over the whole step.
 
-    Free helpers compute columns, too; the bits do not depend on which thread computed one.
+    Free helpers also compute columns. The bits do not depend on which thread computed a column.
     """
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
@@ -110,7 +112,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
         fetch_add(team, DONE, 1)
         k = fetch_add(team, TICKET, 1) % JOBS
     patience = 0
-    while load(team, DONE) < W:  # a helper has still something to do, if it gets to run
+    while load(team, DONE) < W:  # a helper still has work to do, once it gets to run
         patience += 1
         if patience > PATIENT and p[YIELD] != 0:
             call(p[YIELD])
@@ -124,7 +126,7 @@ def step_jacobian(x, u, p, h, out, jacobian):
 def help_out(p):
     """Compute columns for the threads that linearise, until told to stop.
 
-    A thread takes a column first, and reads its job afterwards: until the column is done, nobody writes another job.
+    A thread takes a column first, and reads its job afterwards. Until the column is done, no other job is written.
     """
     team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
     address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)
@@ -166,7 +168,7 @@ def run(z, p, wrench, substeps, two, out):
 
 
 def linearize_here(z, p, wrench, address, warm):
-    """Have the first MjData of a slot at the state that columns differ from, and write MuJoCo's accelerations there."""
+    """Set the first MjData of a slot to the state that columns differ from, and write MuJoCo's accelerations there."""
     one = at(address)
     write_to(z, p, one)
     begin(p, wrench, one)
@@ -184,8 +186,8 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
 
     A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
     reused.
-    MuJoCo's solver starts at the solution of the step that is not perturbed, so that both sides end equally near to
-    their own: its tolerance is not divided by the difference.
+    MuJoCo's solver starts at the solution of the unperturbed step. Both sides then end equally near to their solutions,
+    so that the solver's tolerance is not divided by the difference.
     """
     one, two, nv = at(address), at(address + 8 * SIZE), int(p[NV])
     moved, ahead, behind = stack(W), stack(N), stack(N)
@@ -210,9 +212,9 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
 
 
 def steps_in(x, u, p, h, z):
-    """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN.
+    """The number of physics steps in `h` seconds; 0 if MuJoCo cannot step: backwards, or from NaN.
 
-    0, too, once a signal came. Writes the state and the control one after the other, (W,).
+    Also 0 after a signal. Writes the state and the control, one after the other, (W,).
     """
     for i in range(W):
         z[i] = x[i] if i < N else u[i - N]
@@ -260,7 +262,7 @@ def write_positions(x, p, qpos):
 
 
 def begin(p, wrench, one):
-    """Have the next step of an MjData depend on nothing that was before; and push the body."""
+    """Make the next step of an MjData independent of earlier steps, and apply the wrench to the body."""
     warm, push = at(one[WARM]), at(one[PUSH])
     for i in range(int(p[NV])):
         warm[i] = 0.0
@@ -269,21 +271,21 @@ def begin(p, wrench, one):
 
 
 def write_loads(p, one):
-    """Have bodies carry their loads at their centres of mass, in the model of the slot."""
+    """Add the loads to the bodies, at their centres of mass, in the model of the slot."""
     count, first, masses = int(p[LOADED]), int(p[LOADS]), at(one[MASSES])
     for k in range(count):
         masses[int(p[first + count + k])] = p[first + 2 * count + k] + p[first + k]
 
 
 def start_from(p, one, guess):
-    """Have the solver of the next step begin at these accelerations."""
+    """Let the solver of the next step begin at these accelerations."""
     warm = at(one[WARM])
     for i in range(int(p[NV])):
         warm[i] = guess[i]
 
 
 def step_from(z, p, one, two, guess, kept):
-    """A physics step to `two`; it reuses the stages of `one` that the state and control share."""
+    """Write a physics step to `two`, reusing the stages of `one` that do not change."""
     write_to(z, p, one)
     start_from(p, one, guess)
     call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(kept), int32(1))
@@ -306,7 +308,7 @@ def copy_between(source, target, first, count):
 
 
 def read_from(near, p, one, out):
-    """Write the state of an MjData, rotations by the vectors nearest to those of `near`; NaN if it is none."""
+    """Write the state of an MjData, with the rotation vectors nearest to the vectors in `near`; NaN if invalid."""
     nv, na = int(p[NV]), int(p[NA])
     qpos, qvel, act = at(one[QPOS]), at(one[QVEL]), at(one[ACT])
     for k in range(int(p[JOINTS])):
@@ -327,7 +329,7 @@ def read_from(near, p, one, out):
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
-        call(p[RESET], at(one[OWN_MODEL]), at(one[DATA]))  # so that nothing of it is left
+        call(p[RESET], at(one[OWN_MODEL]), at(one[DATA]))  # removes all traces of the invalid state
         for i in range(N):
             out[i] = nan
 
@@ -348,7 +350,7 @@ def write_quaternion(x, first, qpos, q):
 @outline
 @exact
 def rotation_vector_near(qpos, q, near, first, out):
-    """Write the rotation vector of a quaternion to out[first]: the one nearest to that of `near`."""
+    """Write a quaternion's rotation vector to out[first], the vector nearest to the vector in `near`."""
     sine, along, length = 0.0, 0.0, 0.0
     for i in range(3):
         sine += qpos[q + 1 + i] * qpos[q + 1 + i]
@@ -356,7 +358,7 @@ def rotation_vector_near(qpos, q, near, first, out):
         length += near[first + i] * near[first + i]
     sine = sqrt(sine)
     if sine < 1e-150:
-        # No turn, or whole ones, which have any axis: that of `near`.
+        # The identity has any axis; use the axis of `near`.
         turns = 2 * pi * nearest_whole(sqrt(length) / (2 * pi))
         scale = turns / sqrt(length) if turns > 0 else 0.0
         for i in range(3):

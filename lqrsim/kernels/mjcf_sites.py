@@ -1,8 +1,8 @@
-"""How far a site of an MJCF is from a place, and how far it is turned from an orientation. The kernels' subset.
+"""Errors of the position and orientation of a site of an MJCF. Written in the kernels' subset.
 
-`data` has the address that `mjcf_dynamics.py` calls p, the site's body, its place and axes (3 x 3) in those of the
-body, and the place and axes where it is wanted. The rows are three of the place, in the world's axes, and three of the
-rotation vector that turns the wanted axes to the site's; either or both.
+`data` has the address that `mjcf_dynamics.py` calls p, the site's body, its position and axes (3 x 3) in the body's
+axes, and the desired position and axes. The rows are three for the position, in world axes; or three for the rotation
+vector from the desired axes to the site's; or both.
 """
 
 from math import atan2, sqrt
@@ -28,7 +28,7 @@ from lqrsim.kernels.mjcf_dynamics import (
 )
 from lqrsim.kernels.rotation_ratios import cotangent_ratio
 
-PLACED = 1  # whether there are rows of the place
+PLACED = 1  # whether there are rows of the position
 TURNED = 1  # whether there are rows of the orientation
 BODY, OFFSET, AXES, WANTED, WANTED_AXES = 1, 2, 5, 14, 17  # layout of data
 
@@ -45,7 +45,7 @@ def errors(x, data, out):
 
 
 def errors_jacobian(x, data, out, slopes):
-    """Write them and their derivatives in the states (any, N), which are zeros when they come."""
+    """Write the rows and their derivatives in the states (any, N), which are zero on entry."""
     p = at(data[0])
     slot, nv, body = take_slot(p), int(p[NV]), int(data[BODY])
     one, point, moves, turns = at(p[SLOTS] + 8 * SLOT * slot), stack(3), stack(3 * N), stack(3 * N)
@@ -74,7 +74,7 @@ def errors_jacobian(x, data, out, slopes):
 
 
 def write_errors(one, data, out, point):
-    """Write the rows, and where the site is, of an MjData that has its positions."""
+    """Write the rows, and the position of the site, for an MjData with computed positions."""
     body = int(data[BODY])
     origins, axes = at(one[XPOS]), at(one[XMAT])
     for i in range(3):

@@ -1,4 +1,4 @@
-"""Calls of a problem's functions by their addresses: dynamics, costs, constraints, noise. The kernels' subset.
+"""Calls of a problem's functions by address: dynamics, costs, constraints, noise. Written in the kernels' subset.
 
 Passes and iterations are thereby compiled once for a size, and serve all problems of that size. See
 `records.ProblemModel`.
@@ -82,7 +82,7 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
 
 
 def cost_of_order(x, u, t, cost, share, hessian, gradient):
-    """As `cost_quadratic`, with a Hessian that is a `share` of the true one and 1 - `share` of the projected one."""
+    """As `cost_quadratic`, with a mixture of Hessians: `share` of the true one and 1 - `share` of the projected one."""
     own = cost_alone(x, u, t, cost, share, hessian, gradient)
     return own + augment_cost(x, u, t, cost, hessian, gradient)
 
@@ -118,7 +118,7 @@ def augment_cost(x, u, t, cost, hessian, gradient):
 
 
 def evaluate_constraints(steps, states, controls, constraints, values):
-    """Write the values of all constraints along a plan, each ordered as its multipliers are."""
+    """Write the values of all constraints along a plan, each in the order of its multipliers."""
     for t in range(steps + 1):
         u = controls[min(t, steps - 1)]
         for k in range(constraints.size):
@@ -145,7 +145,7 @@ def noise_quadratic(x, u, noise, ahead, convex, stage):
 
 
 def costs_of(count, steps, plans, model, costs):
-    """Write the sum of stage and final costs, (count,), of trajectories that stand one after the other.
+    """Write the sum of stage and final costs, (count,), of trajectories that are stored one after the other.
 
     Args:
       plans: Motion with states (count (steps + 1), N) and controls (count steps, M).

@@ -1,9 +1,9 @@
-"""Newton's method from the plan that smoothing has found. The kernels' subset.
+"""Newton's method from the plan that smoothing has found. Written in the kernels' subset.
 
-A pass is that of differential dynamic programming: iLQR's, with the true Hessians of the costs, not projected, and
-those of the dynamics times the costate. Where a control block is not positive definite, the pass is repeated with a
-smaller share of the second order, down to none, which is iLQR's. Near an optimum with enough curvature, convergence is
-quadratic.
+A pass is the backward pass of differential dynamic programming. It differs from iLQR's pass in two ways: the Hessians
+of the costs are not projected, and the Hessians of the dynamics times the costate are added. If a control block is not
+positive definite, the pass is repeated with a smaller fraction of these second-order terms, down to none, which is
+iLQR's pass. Near an optimum with enough curvature, convergence is quadratic.
 """
 
 from math import isnan, nan
@@ -26,28 +26,29 @@ from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.records import CostToGo, ModelOrder
 from lqrsim.kernels.rollouts import copy_plan, differential_pass, ilqr_pass, initial_step, line_search
 
-# Shares of the second order, tried in this order until a pass has a minimum.
+# Fractions of the second-order terms, tried in this order until a pass has a minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
-ARMIJO = 1e-4  # share of the predicted decrease that a step must achieve
-SMALLEST = 1e-3  # fraction of a step that the line search tries
-ROUNDING = 1e-12  # relative, of a merit
-SMALL, WEIGHTS = 1e-10, 8  # first weight on changes of controls, relative to the merit; how many, times 1000 each
-MORE = 3  # further steps at most, while the smoothed states are not at the plan
+ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
+SMALLEST = 1e-3  # smallest fraction of a step that the line search tries
+ROUNDING = 1e-12  # rounding error of a merit, relative to the merit
+SMALL, WEIGHTS = 1e-10, 8  # first weight on control changes, relative to the merit; number of weights, each times 1000
+MORE = 3  # largest number of further steps while the smoothed states are not at the plan
 
 
 def newton_iterations(first, last, settings, model, work, memory, log):
     """Newton steps from the plan, each of which lowers its merit.
 
-    If no fraction of a step lowers the merit, it is tried again without the second order; if that fails too, the method
-    has stalled.
-    At the end, the value functions are those of smoothing, without the second order: convex, so that the minimum of
-    their sum is at the plan. Where it is not, up to MORE further steps follow: in flat directions a plan may be far off
-    though the predicted decrease is small.
+    If no fraction of a step lowers the merit, the step is repeated without second-order terms. If that also fails, the
+    method has stalled.
+    At the end, the value functions are computed as in smoothing, without second-order terms. They are convex, so that
+    the
+    minimum of their sum is at the plan. If it is not, up to MORE further steps follow: in flat directions a plan may be
+    far off although the predicted decrease is small.
 
     Args:
       settings: IterationSettings. model: ProblemModel. work: SmootherArrays, with the plan.
-      memory: row of MEMORY, with the plan's cost and merit; its share is negative until there was a pass about it.
-      log: rows of LOG. An iteration's optimality is the decrease that the next step promises.
+      memory: row of MEMORY, with the plan's cost and merit; its share is negative until a pass about the plan was made.
+      log: rows of LOG. An iteration's optimality is the decrease that the next step predicts.
 
     Returns:
       As `iterations.py` says.
@@ -94,13 +95,13 @@ def newton_iterations(first, last, settings, model, work, memory, log):
 
 
 def newton_pass(settings, model, work, memory):
-    """A pass about the plan, with the largest share of the second order, up to the memory's, that has a minimum.
+    """A pass about the plan, with the largest fraction of second-order terms, up to the memory's, that has a minimum.
 
-    Where even convex models have none, for example where a control costs nothing, changes of the controls get a weight.
+    If even convex models have no minimum, for example if a control costs nothing, changes of the controls get a weight.
 
     Args:
-      work: SmootherArrays. The policy is written, relative to the plan; so is `x_hat`, where the start is to move. The
-        cost-to-go of second order takes the place of the cost-to-come.
+      work: SmootherArrays. The policy is written, relative to the plan; `x_hat` is also written, if the start is to
+        move. The second-order cost-to-go takes the place of the cost-to-come.
       memory: `share`, `damping`, `failed`, `decrease`, `promised` and `negligible` are written.
 
     Returns:
@@ -143,7 +144,7 @@ def newton_pass(settings, model, work, memory):
 
 
 def finish_at_plan(settings, model, work, memory, row):
-    """Compute the policy and value functions at the plan; return False, after another pass, if they call for a step."""
+    """Compute the policy and value functions at the plan; return False, after another pass, if these need a step."""
     convex_value_functions(settings, model, work, memory, row)
     if memory.final_gap < settings.gap_tolerance or memory.small_changes >= MORE:
         return True
@@ -153,9 +154,9 @@ def finish_at_plan(settings, model, work, memory, row):
 
 
 def convex_value_functions(settings, model, work, memory, row):
-    """Compute the value functions about the plan without the second order, and a policy that reproduces the plan.
+    """Compute the value functions about the plan without second-order terms, and a policy that reproduces the plan.
 
-    A control at a limit gets no gain, even if the next step would take it off the limit by less than the tolerance.
+    A control at a limit gets no gain, even if the next step would move it off the limit by less than the tolerance.
     """
     policy, controls = work.policy, work.best.controls
     if not NOISY:

@@ -1,22 +1,23 @@
-"""The expected cost of noise, as part of each stage. The kernels' subset.
+"""The expected cost of noise, as part of each stage. Written in the kernels' subset.
 
 With x' = g(x, u) + M(x, u) w and w ~ N(0, I), a quadratic cost-to-go v with Hessian S at t + 1 has the expectation
 
     E v(g + M w) = v(g) + 1/2 tr M'SM
 
-so noise is one more cost of the stage, which depends on S alone: the backward pass has just computed S, and the forward
-pass uses that of the last backward pass. Where dynamics and M are linear and costs quadratic, this is exact.
+so noise is an additional cost of the stage, which depends on S alone. The backward pass has just computed S; the
+forward pass uses S from the last backward pass. If dynamics and M are linear and costs quadratic, this is exact.
 
 With a risk theta it is (1/theta) log E exp(theta v(g + M w)), and with d = S g + s, the gradient of v there,
 
     v(g) + theta/2 d'M W M'd - 1/(2 theta) log det(I - theta M'SM),    W = (I - theta M'SM)^-1
 
-which exists where I - theta M'SM is positive definite. As theta goes to 0 it becomes the expectation. For theta above 0
-it is v at g + y, y = theta M W M'd the worst noise, less what that noise costs.
+which exists if I - theta M'SM is positive definite. As theta goes to 0 it becomes the expectation. For theta above 0 it
+is v at g + y minus the cost of y, where y = theta M W M'd is the worst noise.
 
-Gradients are exact. Hessians are Gauss-Newton's: second derivatives of M, and other parts that can be negative, are
-left out. The matrices here are compact: the rows of M that are not zero everywhere, and the entries of (x, u) that M
-depends on. Shapes: M (COUNT, SIZE), its derivatives by columns (SIZE, COUNT, PADDED_COUNT), S (COUNT, COUNT).
+Gradients are exact. Hessians are Gauss-Newton approximations: second derivatives of M, and other parts that can be
+negative, are left out. The matrices here are compact: they contain only the rows of M that are not zero everywhere, and
+only the entries of (x, u) that M depends on. Shapes: M (COUNT, SIZE), its derivatives by columns (SIZE, COUNT,
+PADDED_COUNT), S (COUNT, COUNT).
 """
 
 from math import inf, log1p, sqrt
@@ -29,10 +30,10 @@ from lqrsim.kernels.model_functions import advance, cost_value
 ROWS = (0,)  # the states that noise acts on directly
 COUNT = 1  # their number
 CONTIGUOUS = 0  # whether they are the first states, in order
-SIZE = 1  # of w
+SIZE = 1  # number of entries of w
 ACTIVE = (0,)  # entries of (x, u) that M depends on
 ACTIVE_COUNT = 1  # their number
-PADDED_COUNT = 4  # the same, rounded up to a multiple of four for vector code
+PADDED_COUNT = 4  # this number, rounded up to a multiple of four for vector code
 
 
 def constant_values(x, u, data, out):
@@ -60,10 +61,10 @@ def matrix_at(x, u, data, out):
 
 
 def noise_value(x, u, data, risk, ahead):
-    """The expected cost of noise at (x, u); infinite where the risk is too high.
+    """The expected cost of noise at (x, u); infinite if the risk is too high.
 
     Args:
-      data: what `noise_values` reads. risk: (2,), theta first. ahead: NextStep.
+      data: the data for `noise_values`. risk: (2,), theta first. ahead: NextStep.
     """
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
@@ -86,9 +87,9 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
     """Add the quadratic model of the expected cost to a stage at (x, u), and return its value.
 
     Args:
-      risk: (2,); the second entry is written: 1 where the risk is too high. The Hessian is then made indefinite, so
-        that the pass fails.
-      convex: 1 to keep the added terms positive semidefinite with a negative risk, too.
+      risk: (2,); the second entry is written: 1 if the risk is too high. The Hessian is then made indefinite, so that
+        the pass fails.
+      convex: 1 to keep the added terms positive semidefinite even with a negative risk.
     """
     values, slopes = stack(COUNT, SIZE), zeros(SIZE, COUNT, PADDED_COUNT)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
@@ -118,7 +119,7 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
 
 
 def noisy_costs(count, steps, start, policy, model, draws, costs):
-    """Write the costs (count,) of rollouts of a policy with noise drawn: draws (count steps, SIZE), run by run."""
+    """Write the costs (count,) of rollouts of a policy with the given noise: draws (count steps, SIZE), run by run."""
     x, u, ahead, values = stack(N), stack(M), stack(N), stack(COUNT, SIZE)
     for run in range(count):
         copy(start, N, x)
@@ -136,7 +137,7 @@ def noisy_costs(count, steps, start, policy, model, draws, costs):
 
 
 def noisy_block(S, compact):
-    """Write the rows and columns of S that noise acts on: once, because looking them up takes longer than the sums."""
+    """Copy the rows and columns of S that noise acts on, once, because looking them up takes longer than the sums."""
     for i in range(COUNT):
         row = i if CONTIGUOUS else ROWS[i]
         for j in range(COUNT):
@@ -193,7 +194,7 @@ def add_trace_model(S, weighed, slopes, stage):
 def factor_of_risk(theta, values, weighed, factor, root):
     """Factor I - theta M'SM = L D L'.
 
-    Pivots are kept as their distance from 1, so that no digits are lost where theta is small.
+    Pivots are stored as their distance from 1, so that no digits are lost if theta is small.
 
     Args:
       factor: (SIZE, SIZE), gets 1 - L below the diagonal. root: (SIZE,), gets the reciprocal square roots of D.
@@ -233,7 +234,7 @@ def risk_columns(theta, factor, root, values, mixed):
 
 
 def risk_column_slopes(theta, factor, root, slopes):
-    """Turn the derivatives of the columns of M into those of M V with V held, in place."""
+    """Convert the derivatives of the columns of M, in place, to derivatives of M V with fixed V."""
     for k in range(SIZE):
         for j in range(k):
             for i in range(COUNT):
@@ -269,8 +270,8 @@ def square_along(mixed, slope):
 def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
     """Add the model of theta/2 d'M W M'd: its gradient, and theta D'D of its Hessian, D the Jacobian of V'M'd.
 
-    D is taken at the worst noise y, for M and d both. With a negative risk it is that of d alone, so that the sum with
-    the cost-to-go's Hessian stays positive semidefinite.
+    D is evaluated at the worst noise y, for both M and d. With a negative risk it is the Jacobian for d alone, so that
+    the sum with the cost-to-go's Hessian stays positive semidefinite.
     """
     S, jacobian, slopes_along, line = ahead.hessian, ahead.jacobian, stack(SIZE, W), stack(W)
     pulled, steered, along, compact = stack(COUNT), stack(N), stack(SIZE), stack(COUNT, COUNT)

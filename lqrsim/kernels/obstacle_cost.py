@@ -1,4 +1,4 @@
-"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
+"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. Written in the kernels' subset.
 
 The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the numbers
 below, and the tables of obstacles, of which the last holds from its step on. What `places` reads comes before AT.

@@ -1,4 +1,4 @@
-"""The passes of LQR smoothing. The kernels' subset; `records.py` has their arguments.
+"""The passes of LQR smoothing. Written in the kernels' subset; `records.py` describes their arguments.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
@@ -41,7 +41,8 @@ def forward_pass(settings, model, about, work):
 
     Args:
       settings: IterationSettings. model: ProblemModel. about: Linearization.
-      work: SmootherArrays. `x_hat` is where c_0 is quadratised, and on return the smoothed state at T, where c_l was.
+      work: SmootherArrays. `x_hat` is the state at which c_0 is quadratised, and on return the smoothed state at T, at
+        which c_l was quadratised.
 
     Returns:
       The step at which it failed, or -1, and whether all numbers there were finite.
@@ -70,7 +71,7 @@ def forward_pass(settings, model, about, work):
     if about.guided:
         copy(about.plan.states[steps], N, x_hat)
     elif not smoothed_state(steps, to_go, to_come, costate, x_hat):
-        # In the first iteration there may be no minimum without c_l; the state of arrival is the next best.
+        # In the first iteration there may be no minimum without c_l; the state of arrival is then used.
         copy(arrived, N, x_hat)
     final_model(x_hat, steps, model, to_go)
     if not smoothed_state(steps, to_go, to_come, costate, x_hat):
@@ -81,16 +82,15 @@ def forward_pass(settings, model, about, work):
 def backward_pass(settings, model, about, work):
     """The backward extended LQR pass, Sec. V-A: cost-to-go and policy, given cost-to-come and inverse policy.
 
-    Linearises a fraction `about.reach` of the way from the plan to the smoothed states: all the way in the paper.
+    Linearises at a fraction `about.reach` of the way from the plan to the smoothed states; in the paper, at these.
 
     Args:
       work: SmootherArrays. On return `x_hat` is the smoothed state at 0, where c_0 was quadratised anew, and `x_hats`
         has all smoothed states. The rest is as for `forward_pass`.
 
     Returns:
-      The step at which it failed, or -1; whether all numbers there were finite; and the cost that is negligible. Where
-      the optimal cost is zero, squares of rounding errors remain of it, some 1e-13 of the constants of the stages'
-      models, which cancel.
+      The step at which it failed, or -1; whether all numbers there were finite; and the negligible cost. If the optimal
+      cost is zero, squares of rounding errors remain, about 1e-13 of the constants of the stages' models, which cancel.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, u, costate = stack(N), stack(N), stack(M), stack(N)
@@ -123,7 +123,7 @@ def backward_pass(settings, model, about, work):
 
 
 def opening_pass(steps, guided, guess, prior, model, policy, to_go):
-    """A backward pass before there is a cost-to-come: it linearises about the minimisers of the cost-to-go.
+    """A backward pass before the first cost-to-come: it linearises about the minimisers of the cost-to-go.
 
     From the minimiser of c_l, first quadratised at the guess, the dynamics run backwards with the guessed controls.
     With `guided`, the pass linearises about the guess.
@@ -168,7 +168,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
     """Write the stage cost, quadratised at (x, u), about the origin, Eqs. (26)-(27); return its constant.
 
     It includes the expected cost of noise; the prior, which is no part of the cost, but keeps the linearisations
-    sensible in the first iterations; and damping, which weighs how far the control moves from the plan's.
+    sensible in the first iterations; and damping, a weight on the control's distance from the plan's.
 
     Args:
       ahead: NextStep. convex: as in `noise_quadratic`. stage: QuadraticStage, written.
@@ -202,7 +202,7 @@ def final_model(x, steps, model, to_go):
 
 
 def initial_model(x, fixed, model, about, to_go, to_come):
-    """Write the cost-to-come at 0: c_0 quadratised at x, Eq. (23), or that of a fixed start.
+    """Write the cost-to-come at 0: c_0 quadratised at x, Eq. (23), or the cost-to-come of a fixed start.
 
     Returns:
       Whether it exists, and the constant of c_0's model about the origin.
@@ -232,7 +232,7 @@ def end_model(hessian, gradient, value, x, S, s):
 
 
 def towards(z, fraction, origin, size):
-    """Move a vector towards an origin until this fraction of the distance is left."""
+    """Move a vector towards an origin until this fraction of the distance remains."""
     for i in range(size):
         z[i] = origin[i] + fraction * (z[i] - origin[i]) if fraction > 0 else origin[i]
 

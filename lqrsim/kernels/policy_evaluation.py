@@ -1,4 +1,4 @@
-"""Feedback policies at many measured states. The kernels' subset. `AffinePolicy` has the same in NumPy."""
+"""Feedback policies at many measured states. Written in the kernels' subset. `AffinePolicy` does the same in NumPy."""
 
 from math import floor, pi, sqrt
 
@@ -44,8 +44,8 @@ def nearest_angle(x, nominal, i):
 
 
 def nearest_rotation(x, nominal, first):
-    """Replace the rotation vector at x[first] by the one nearest to the nominal among (angle + 2 pi k) axis, which are
-    all the same rotation; see coordinates.py.
+    """Replace the rotation vector at x[first] by the nearest to the nominal among (angle + 2 pi k) axis, which are all
+    the same rotation; see coordinates.py.
     """
     a, b, c = x[first], x[first + 1], x[first + 2]
     u, v, w = nominal[first], nominal[first + 1], nominal[first + 2]

@@ -1,4 +1,4 @@
-"""The nearest positive-semidefinite matrix. The kernels' subset."""
+"""The nearest positive-semidefinite matrix. Written in the kernels' subset."""
 
 from math import sqrt
 
@@ -10,7 +10,7 @@ SUPPORT = (0,)  # entries of (x, u) in which a cost may be nonconvex
 def project(hessian):
     """Set the negative eigenvalues of the SUPPORT's block of a symmetric Hessian (W, W) to zero.
 
-    By cyclic Jacobi rotations: for the 3 x 3 blocks of obstacle costs far faster than a call of LAPACK.
+    It uses cyclic Jacobi rotations, which for the 3 x 3 blocks of obstacle costs are far faster than a call of LAPACK.
     """
     a, v = stack(len(SUPPORT), len(SUPPORT)), stack(len(SUPPORT), len(SUPPORT))
     for i in range(len(SUPPORT)):

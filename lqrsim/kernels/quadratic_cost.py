@@ -1,4 +1,4 @@
-"""`1/2 (z - about)' weight (z - about)`, z the state or the control. The kernels' subset.
+"""`1/2 (z - about)' weight (z - about)`, z the state or the control. Written in the kernels' subset.
 
 `data` has `about` (size,), then `weight` (size, size), row by row.
 """

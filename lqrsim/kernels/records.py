@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 Arrays = Any  # an ndarray for Python, a pointer for compiled code
-StructuredArray = npt.NDArray[np.void]  # whose dtype is one of those at the end
+StructuredArray = npt.NDArray[np.void]  # its dtype is one of those at the end of this file
 
 
 class Limits(NamedTuple):
-    """Limits of the controls, (M,) each; infinite where there is none."""
+    """Limits of the controls, (M,) each; infinite for no limit."""
 
     low: Arrays
     high: Arrays
@@ -23,7 +23,7 @@ class Limits(NamedTuple):
 class DynamicsModel(NamedTuple):
     """Addresses of the functions of the dynamics, and their parameters (any,).
 
-    `step_curvature` is that of a step's second derivatives; 0 where they vanish or are not wanted.
+    `step_curvature` is the address of a step's second derivatives; 0 if they vanish or are not needed.
     """
 
     advance: float
@@ -36,7 +36,8 @@ class Constraints(NamedTuple):
     """The constraints that act on a cost.
 
     Attributes:
-      functions: (C, 5) addresses of each one's functions, and 1 if it uses the control; see `model_functions.py`.
+      functions: (C, 5) addresses of each constraint's functions, and 1 if it uses the control; see
+        `model_functions.py`.
       data, multipliers: a vector for each; see `augmented_lagrangian.py`.
       size: C.
     """
@@ -53,7 +54,7 @@ class CostModel(NamedTuple):
     Attributes:
       functions: (K, 2) addresses of each term's value and derivatives; terms that may be indefinite come first.
       data: a vector for each term. size: K. indefinite: number of terms that may be indefinite.
-      project: address of the projection of their sum; 0 if there are none.
+      project: address of the projection of the sum of these terms; 0 if there are none.
     """
 
     functions: Arrays
@@ -65,7 +66,7 @@ class CostModel(NamedTuple):
 
 
 class NoiseModel(NamedTuple):
-    """Addresses of the functions of noise; what they read (any,); and (2,) the risk, and 1 if it was too high."""
+    """Addresses of the functions of noise; their data (any,); and (2,) the risk, and 1 if it was too high."""
 
     value: float
     quadratic: float
@@ -136,7 +137,7 @@ class Prior(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """Where a pass linearises: a fraction `reach` of the way from the plan to the smoothed states.
+    """The points about which a pass linearises: a fraction `reach` of the way from the plan to the smoothed states.
 
     With `guided`, the forward pass linearises about the plan. `damping` weighs changes of the controls, relative to the
     control's own curvature.
@@ -154,8 +155,8 @@ class ModelOrder(NamedTuple):
 
     Attributes:
       damping: weight on changes of the controls.
-      share: share of the second order: 0 for iLQR's models, with projected costs and linearised dynamics; 1 for
-        Newton's, with true Hessians of the costs, and those of the dynamics times the costate.
+      share: fraction of the second-order terms: 0 for iLQR's models, with projected costs and linearised dynamics; 1
+        for Newton's, with true Hessians of the costs, and Hessians of the dynamics times the costate.
       known: the cost-to-go that weighs noise, if `share` is above 0.
     """
 
@@ -202,7 +203,7 @@ class ConstraintRows(NamedTuple):
 
     Attributes:
       first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
-      multipliers: ((T+1) size,); those up to `least` count as zero.
+      multipliers: ((T+1) size,); multipliers up to `least` count as zero.
     """
 
     size: int
@@ -267,13 +268,14 @@ class EliminatedControl(NamedTuple):
 
 
 class IterationSettings(NamedTuple):
-    """How long a solve iterates, and when it has converged.
+    """Limits of a solve's iterations, and tolerances of convergence.
 
     Attributes:
-      steps: T. tolerance, gap_tolerance: of relative changes of cost, and of the gap.
-      optimal: whether a settled cost must be optimal, too. fixed: whether the start is given exactly.
-      guided: whether the first iteration linearises about the guess. prior_iterations: in which the prior acts.
-      valley: the gap below which smoothing leaves the rest to Newton's method; 0 for never.
+      steps: T. tolerance, gap_tolerance: tolerances of relative changes of cost, and of the gap.
+      optimal: whether a settled cost must also be optimal. fixed: whether the start is given exactly.
+      guided: whether the first iteration linearises about the guess. prior_iterations: number of iterations with the
+        prior.
+      valley: the gap below which Newton's method takes over from smoothing; 0 for never.
     """
 
     steps: int
@@ -345,8 +347,9 @@ class Predictor(NamedTuple):
 
     Attributes:
       dynamics, dt: as in `ProblemModel`. places: (P,) indices of the unknown parameters.
-      lag: (2,) share of the difference to a command that is left at the end of a period, and on average over it.
-      transition: (D, D) of the unknowns' states. output: (V, D) from these to the unknowns.
+      lag: (2,) remaining fraction of the difference to a command at the end of a period, and on average over the
+        period.
+      transition: (D, D), for the unknowns' states. output: (V, D), from these to the unknowns.
     """
 
     dynamics: DynamicsModel
@@ -358,7 +361,7 @@ class Predictor(NamedTuple):
 
 
 class SensorModel(NamedTuple):
-    """Addresses of the measurement and of its Jacobian, and what these read (any,)."""
+    """Addresses of the measurement and of its Jacobian, and their data (any,)."""
 
     measure: float
     slope: float
@@ -373,7 +376,7 @@ class Measurements(NamedTuple):
 
 
 class AngularStates(NamedTuple):
-    """Which states are angles, and where rotation vectors begin: indices (any,), and how many there are."""
+    """Indices (any,) of the angles, and of the first entries of rotation vectors, with their numbers."""
 
     angles: Arrays
     angle_count: int
@@ -386,13 +389,14 @@ def _row(*names: str) -> np.dtype[np.void]:
 
 
 # The state of the iterations between calls.
-# plan_cost, merit: of the plan; the merit includes the augmented Lagrangian. started: 1 once the start was rolled out.
-# watched: 1 where undamped iterations end without progress, because the safeguard can take over.
-# Of the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row;
-# idle: of iterations in a row that were rejected or improved by rounding; of iterations at reach 0, iLQR's, how many
-# are left, how many there will be the next time, and how many others there were since; final_gap: between smoothed
-# states and plan at the end.
-# Of Newton's method: share of the second order of the next pass; the step at which the last pass failed; its predicted
+# plan_cost, merit: cost and merit of the plan; the merit includes the augmented Lagrangian. started: 1 once the start
+# was rolled out. watched: 1 if undamped iterations end without progress, because the safeguard can take over.
+# For the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row;
+# idle: number of iterations in a row that were rejected or improved by rounding; for iterations at reach 0, iLQR's, how
+# many remain, how many there will be the next time, and how many others there were since; final_gap: gap between
+# smoothed states and plan at the end.
+# For Newton's method: fraction of second-order terms in the next pass; the step at which the last pass failed; its
+# predicted
 # slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible cost; and
 # the damping without which the pass has no minimum.
 MEMORY = _row(

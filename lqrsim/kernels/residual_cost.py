@@ -1,14 +1,15 @@
-"""`1/2 sum of weight * error^2` for errors from a model. The kernels' subset.
+"""`1/2 sum of weight * error^2` for errors from a model. Written in the kernels' subset.
 
-`data` has the data of the errors, and from AT on a weight for each. `places` and `places_jacobian` are the errors here.
+`data` has the data of the errors, and from AT on a weight for each error. `places` and `places_jacobian` are the errors
+here.
 """
 
 from lqrsim.kernels.declarations import N, places, places_jacobian, stack
 from lqrsim.kernels.linear_algebra import clear
 
 AT = 0
-ROWS = 1  # how many there are
-MOVED = 1  # states that the errors depend on: the first ones
+ROWS = 1  # number of errors
+MOVED = 1  # number of states, from the first on, that the errors depend on
 
 
 def value(x, u, t, data):

@@ -1,6 +1,6 @@
 """Sweeps along a trajectory: rollouts of a policy, costs, line searches, and the backward pass of iLQR.
 
-The kernels' subset. Shapes and names are those of `passes.py`.
+Written in the kernels' subset. Shapes and names are as in `passes.py`.
 """
 
 from math import isnan, nan
@@ -61,7 +61,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
 
     Args:
       plan: a Motion that satisfies the dynamics. order: ModelOrder.
-      keep: 1 to write all steps; 0 to overwrite one, where only the predicted decrease is wanted.
+      keep: 1 to write all steps; 0 to overwrite a single step, if only the predicted decrease is needed.
       policy: relative to the plan, written. to_go: about the origin, written.
 
     Returns:
@@ -179,14 +179,14 @@ def larger(a, b):
 def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
 
-    The merit is the true cost, expected where there is noise, plus the augmented Lagrangian's terms.
+    The merit is the true cost, with noise its expectation, plus the augmented Lagrangian's terms.
 
     Args:
-      shift: (N,) of the start. work: its policy has the changes of the controls, about its plan.
-      smallest: fraction. trial: Motion, written.
+      shift: (N,) shift of the start. work: its policy contains the changes of the controls, about its plan.
+      smallest: smallest fraction. trial: Motion, written.
 
     Returns:
-      The merit, the cost, and the fraction: `bound`, `bound` and 0 if none down to `smallest` will do.
+      The merit, the cost, and the fraction; or `bound`, `bound` and 0 if no fraction down to `smallest` is accepted.
     """
     fraction, plan, policy = 1.0, work.best, work.policy
     while fraction >= smallest:
@@ -230,7 +230,7 @@ def copy_policy(steps, source, target):
 
 
 def shorten_step(steps, fraction, plan, x_hats):
-    """Turn the states (T+1, N) that a whole step leads to into those that a fraction of it leads to."""
+    """Convert the states (T+1, N) after a whole step, in place, to the states after a fraction of the step."""
     if fraction < 1:
         for t in range(steps + 1):
             for i in range(N):

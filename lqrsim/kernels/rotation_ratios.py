@@ -1,8 +1,8 @@
 """Ratios of a rotation vector's angle that are smooth at zero, and their derivatives; see `rotations.py`.
 
 They are functions of s, the squared angle. Near zero they are series, such as sin x / x = sum (-s)^k / (2k + 1)!; the
-coefficients of the last one are |Bernoulli(2k + 2)| / (2k + 2)!. Below s = 1/4 the first term that is left out is
-under 1e-16, relatively.
+coefficients of the last ratio are |Bernoulli(2k + 2)| / (2k + 2)!. For s below 1/4 the first omitted term is less than
+1e-16 of the sum.
 """
 
 from math import cos, sin, sqrt

@@ -1,4 +1,4 @@
-"""One Runge-Kutta step with the control held, and its Jacobian. The kernels' subset.
+"""One Runge-Kutta step with the control held, and its Jacobian. Written in the kernels' subset.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
@@ -23,12 +23,12 @@ def advance(x, u, p, h, out):
 def chain(fx, fu, previous, a, out):
     """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the Jacobian of one Runge-Kutta stage in (x, u).
 
-    Dynamics with known zeros have a `chain` of their own; see `write_chain` in `codegen/symbolic.py`.
+    Dynamics with known zeros have their own `chain`; see `write_chain` in `codegen/symbolic.py`.
 
     Args:
-      fx: (N, N). fu: (N, M). previous: (N, W) of the stage before. a: how far ahead of x the stage is, in s.
+      fx: (N, N). fu: (N, M). previous: (N, W) of the previous stage. a: time of the stage after x, in s.
     """
-    row = stack(W)  # not out[i], so that it stays in registers
+    row = stack(W)  # a local array instead of out[i] stays in registers
     for i in range(N):
         for j in range(N):
             row[j] = fx[i, j]

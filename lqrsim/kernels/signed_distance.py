@@ -1,4 +1,4 @@
-"""Signed distances to obstacles, and their derivatives: the only place where these formulas are. The kernels' subset.
+"""All formulas of signed distances to obstacles, and their derivatives. Written in the kernels' subset.
 
 An obstacle is ROW numbers of a flat table, which begin at index `row`.
 """
@@ -39,7 +39,7 @@ def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gr
 
     With `v` the vector from the nearest point of the centre or axis and `q` its length, the gradient is `v / q` and the
     Hessian `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is curved there. On
-    an axis or at a centre, where neither exists, both are zero.
+    an axis or at a centre, where both do not exist, they are set to zero.
     """
     kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
@@ -108,7 +108,7 @@ def rim_derivatives(data, row: int, side: float, end: float, gradient, hessian) 
 
 
 def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, hessian) -> float:
-    """As `signed_distance_derivatives`, of a box, at (dx, dy, dz) from its centre."""
+    """As `signed_distance_derivatives`, for a box, at (dx, dy, dz) from its centre."""
     beyond, sign = stack(3), stack(3)
     deepest, face = -inf, 0
     for k in range(3):
@@ -143,7 +143,7 @@ def nearest(obstacles, count, each, data, points, displaced, out):
     """Write the distances (count,) of points (count, 3) to the nearest of the obstacles.
 
     Args:
-      each: points per trial. displaced: (trials obstacles, 3) by how much obstacles have moved, trial by trial.
+      each: points per trial. displaced: (trials obstacles, 3) displacements of the obstacles, trial by trial.
     """
     for i in range(count):
         out[i] = nearest_to(obstacles, data, points[i], displaced, obstacles * (i // each))
@@ -151,7 +151,7 @@ def nearest(obstacles, count, each, data, points, displaced, out):
 
 @outline
 def nearest_to(obstacles, data, point, displaced, first):
-    """The distance of one point (3,) to the nearest obstacle; they are displaced by the rows from `first` on."""
+    """The distance of one point (3,) to the nearest obstacle. Obstacles are displaced by the rows from `first` on."""
     least = inf
     for k in range(obstacles):
         x, y = point[0] - displaced[first + k, 0], point[1] - displaced[first + k, 1]

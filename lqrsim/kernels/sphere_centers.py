@@ -1,4 +1,4 @@
-"""The centres of a robot's balls at many states. The kernels' subset."""
+"""The centres of a robot's balls at many states. Written in the kernels' subset."""
 
 from lqrsim.kernels.declarations import outline, places, places_jacobian
 

@@ -39,7 +39,7 @@ STEP = 6e-6  # of differences of gradients, relative to a number and at least to
 # the control, 1 for the lower one and -1 for the upper one, and its value.
 KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
-ROUNDING = 1e-10  # relative to a row's size: the violation that a model may have
+ROUNDING = 1e-10  # allowed violation by a model, relative to a row's size
 
 
 def stage_models(t, steps, plan, costates, model, rows, out):
@@ -264,7 +264,7 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
 
 
 def linearize_plan(steps, soft, own, plan, costates, model, values, rows, out, active):
-    """Write the models of all stages at a plan, and the values of the active set's rows, if it has any.
+    """Write the models of all stages at a plan, and the values of the active set's rows, if there are any.
 
     Args:
       soft: 1 if there is an initial cost.
@@ -331,8 +331,8 @@ def optimality_measures(steps, plan, models, gaps, active, state_size, control_s
 
     Returns:
       The largest derivative of the Lagrangian in a control, times its size; the largest violation of an inequality,
-      negative if all are satisfied; that of an equality; the largest gap, relative to the state's size; and the largest
-      product of a multiplier and its row's value.
+      negative if all are satisfied; the largest violation of an equality; the largest gap, relative to the state's
+      size; and the largest product of a multiplier and its row's value.
     """
     slope, after = stack(W), stack(N)
     steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
@@ -359,17 +359,18 @@ def optimality_measures(steps, plan, models, gaps, active, state_size, control_s
 
 
 def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy, to_go, changes):
-    """The step to the minimum of the stages' models with the active set held, and the rows that are wrong there.
+    """The step to the minimum of the stages' models with the active set fixed, and the rows that are wrong there.
 
     Args:
-      free: (N,) 0 for the states that the start fixes, else 1. share: of the projected Hessian of the cost.
-      scale: the cost relative to which multipliers are measured.
-      weight: on the distance of a held row from its target, relative to its size; times `price` for constraints.
+      free: (N,) 0 for the states that the start fixes, else 1. share: fraction of the projected Hessian of the cost.
+      scale: the cost to which multipliers are relative.
+      weight: weight on the distance of a fixed row from its target, relative to its size; times `price` for
+        constraints.
       models: StageModels. gaps: (T, N). active: ActiveRows, written.
       policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.
 
     Returns:
-      The step whose control block is not positive definite (T + 1 for the start's, -1 for none), and the number of rows
+      The step whose control block is not positive definite (T + 1 for the start, -1 for none), and the number of rows
       with the wrong state.
     """
     stage, slope = stack(W, W), stack(W)
@@ -400,7 +401,7 @@ def blend(share, one, other, out):
 
 
 def add_held_rows(t, weight, price, models, active, stage, slope):
-    """Add the penalties of the held rows at a step to its model."""
+    """Add the penalties of the fixed rows at a step to its model."""
     for row in range(active.size):
         at = active.size * t + row
         if active.held[at] == 0:
@@ -416,13 +417,13 @@ def add_held_rows(t, weight, price, models, active, stage, slope):
 
 
 def held_weight(row, weight, price, active):
-    """The penalty on a held row."""
+    """The penalty on a fixed row."""
     size = active.table[row, SIZE]
     return (weight if active.table[row, KIND] == LIMIT else price * weight) / (size * size)
 
 
 def predict_rows(steps, scale, weight, price, models, active, changes):
-    """Write the multipliers after a step, and which rows are wrong there; return how many."""
+    """Write the multipliers after a step, and which rows are wrong there; return the number of wrong rows."""
     count = 0
     for t in range(steps + 1):
         for row in range(active.size):
@@ -448,10 +449,10 @@ def predict_rows(steps, scale, weight, price, models, active, changes):
 
 
 def update_active_set(steps, worst, active):
-    """Add rows that are violated to the active set, and remove those with a negative multiplier.
+    """Add violated rows to the active set, and remove rows with a negative multiplier.
 
     Args:
-      worst: 1 for all rows that are worse than at the neighbouring steps; 0 for the last one alone.
+      worst: 1 for all rows that are worse than at the neighbouring steps; 0 for the last wrong row alone.
     """
     last = -1
     for row in range(active.size):
@@ -475,7 +476,7 @@ def rollout_of_active_set(steps, soft, plan, policy, limits, active, model, valu
     """Roll out a policy about a plan, and evaluate the constraints there; return the cost.
 
     Args:
-      soft: 1 if there is an initial cost. plan: its controls are clamped, and set to the limits that are held.
+      soft: 1 if there is an initial cost. plan: its controls are clamped, and set to the limits that are fixed.
       policy: its offsets are set to zero, and so are its gains at limits. limits: (T, M) each.
       values: a vector for each constraint, written. out: Motion, written.
     """

@@ -1,7 +1,7 @@
-"""The distance of a state to a bound, positive on the feasible side: values of a constraint. The kernels' subset.
+"""Constraint values: the distance of a state to a bound, positive on the feasible side. Written in the kernels' subset.
 
-For each row, `data` has the index of the state, 1 for a lower bound and -1 for an upper one, the bound, and the last
-step at which it holds.
+For each row, `data` has the index of the state, 1 for a lower or -1 for an upper bound, the bound, and the last step at
+which it holds.
 """
 
 from math import inf

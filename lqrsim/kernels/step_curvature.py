@@ -1,4 +1,4 @@
-"""The Hessian of a Runge-Kutta step times weights, for rates with second derivatives. The kernels' subset.
+"""The Hessian of a Runge-Kutta step times weights, for rates with second derivatives. Written in the kernels' subset.
 
 A sweep backwards through the stages turns the weights of the next state into weights of each stage's rates. The Hessian
 of the weighted rates at a stage is then pulled back to the step's state and control by the Jacobian of the stage.
@@ -61,7 +61,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 
 
 def back(fx, after, ahead, share, weights, before):
-    """Write the weights (N,) of a stage's rates, given those of the next stage."""
+    """Write the weights (N,) of a stage's rates, given the next stage's weights."""
     for j in range(N):
         total = 0.0
         for i in range(N):
@@ -70,9 +70,9 @@ def back(fx, after, ahead, share, weights, before):
 
 
 def add_curvature(z, u, p, weights, ahead, slope, total):
-    """Add the Hessian (W, W) of the weighted rates at a stage, whose state is `x + ahead k`; `slope` (N, W) is k's."""
+    """Add the Hessian (W, W) of the weighted rates at a stage with state `x + ahead k`; `slope` (N, W) is k's."""
     curve, rows, product = zeros(K, K), stack(STATES + 1, W), stack(K, W)
-    line = stack(W)  # not a row of a matrix, so that it stays in registers
+    line = stack(W)  # a local array, not a row of a matrix, stays in registers
     rate_curvature(z, u, p, weights, curve)
     for a in range(STATES):
         for j in range(W):

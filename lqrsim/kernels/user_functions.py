@@ -1,7 +1,7 @@
-"""A user's own functions, called at their addresses. The kernels' subset.
+"""A user's own functions, called at their addresses. Written in the kernels' subset.
 
-The data of each function begin with its address and, where one is given, that of its derivatives; its parameters
-follow. Outputs are NaN where the user's function does not write them. `differences.py` has derivatives by differences.
+The data of each function begin with its address and, if given, the address of its derivatives; its parameters follow.
+Outputs are NaN where the user's function does not write them. `differences.py` computes derivatives by differences.
 """
 
 from math import nan
@@ -9,9 +9,9 @@ from math import nan
 from lqrsim.kernels.declarations import M, N, W, call, stack, zeros
 from lqrsim.kernels.linear_algebra import clear, fill
 
-BALLS = 1  # of `places`
-COORDINATES = 3  # of each ball that the function returns: 2 in a plane
-COLUMNS = 1  # of the noise matrix M
+BALLS = 1  # number of balls of `places`
+COORDINATES = 3  # number of coordinates that the function returns per ball; 2 in a plane
+COLUMNS = 1  # number of columns of the noise matrix M
 STRENGTH = 1  # index in the data of the factor of M
 
 

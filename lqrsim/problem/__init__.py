@@ -1,1 +1,1 @@
-"""The user's problem: dynamics, costs, constraints, and the problem made of them."""
+"""The user's problem: dynamics, costs, constraints, and the problem that they form."""

@@ -20,17 +20,18 @@ class Clearance(KeepsClear, Constraint):
 
         ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
 
-    It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
-    the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,
-    if only of a small weight: it guides the search around the obstacles.
+    The constraint does not act at a start that is given exactly. Between two steps a plan can come nearer: by
+    `v^2 dt^2 / 8 r` at the speed v, where r is the sum of the radii of robot and obstacle. It can also step over
+    obstacles thinner than a step. Add an ObstacleCost, even one with a small weight: it guides the
+    search around the obstacles.
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: radius of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
+      radius: radius of the robot in metres, as for an ObstacleCost. Give exactly one of `radius`, `balls` and `geoms`.
       balls: the robot's balls, as for an ObstacleCost.
       geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
         obstacle.
-      margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
+      margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 
     def __init__(

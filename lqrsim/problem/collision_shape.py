@@ -1,6 +1,6 @@
-"""What of a robot must stay clear of obstacles: a ball at its position, several balls, or the geoms of an MJCF.
+"""The collision shape of a robot: a ball at its position, several balls, or the geoms of an MJCF.
 
-`ShapeInWorld` is such a shape among obstacles, with all that plans, chances of collision and simulations ask of it.
+`ShapeInWorld` is such a shape among obstacles, with the methods that plans, chances of collision and simulations need.
 """
 
 import abc
@@ -29,11 +29,11 @@ class GeomDistances(Term):
     """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
 
     The source defines `distances(x, data, out)`, which writes one number per row, and `distances_jacobian(x, data, out,
-    slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
+    slopes)`, which writes the distances, and the nonzero derivatives in the states (rows, N) to an array of zeros.
 
     Attributes:
-      parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle; -1
-        for the nearest of all.
+      parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle, or -1
+        for the nearest obstacle.
       moved: number of states, from the first one on, that the distances depend on.
     """
 
@@ -42,14 +42,14 @@ class GeomDistances(Term):
     moved: int
 
     def filling(self, kernel: Source) -> Source:
-        """A kernel of costs or constraints, with the distances as what it calls places."""
+        """A kernel of costs or constraints whose open function `places` is filled with the distances."""
         return kernel.filled(places=(self.code, "distances"), places_jacobian=(self.code, "distances_jacobian"))
 
 
 class CollisionGeoms(abc.ABC):
-    """The colliding geoms of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
+    """The colliding geoms of a robot, with distances computed by its simulator, such as `MjcfRobot.geoms`.
 
-    `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all of it clear.
+    `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all these geoms clear.
     """
 
     @property
@@ -59,7 +59,7 @@ class CollisionGeoms(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
-        """The distances up to `reach` in m, for a system. `clearances` and `slopes` raise InputError as this does.
+        """The distances up to `reach` in m, for a system. `clearances` and `slopes` raise InputError in the same cases.
 
         Raises:
           InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
@@ -80,24 +80,24 @@ class CollisionGeoms(abc.ABC):
 
     @abc.abstractmethod
     def of_scene(self, scene: Scene) -> bool:
-        """Whether these are the geoms of that scene, with its obstacles."""
+        """Whether these geoms belong to that scene, with its obstacles."""
 
     @abc.abstractmethod
     def travel(self, before: Array, after: Array) -> Array:
-        """How far any point moves at most on a straight line between states (..., n), (...) in m."""
+        """The largest distance that any point moves on a straight line between states (..., n): (...) in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeInWorld:
-    """A robot's collision shape among obstacles: one ball, or several; of geoms it is a `GeomsInWorld`.
+    """A robot's collision shape among obstacles: one ball or several. For geoms see `GeomsInWorld`.
 
-    Its *places* at states (..., n) are the middles of its balls, (..., B, 2 or 3) in m; of geoms the states, (..., 1,
-    n).
+    Its *places* at states (..., n) are the centres of its balls, (..., B, 2 or 3) in m; for geoms, they are the states,
+    (..., 1, n).
 
     Attributes:
-      dynamics: of the robot. world: the obstacles, in the coordinates of the places.
-      radii: of the balls in m, (B,); of geoms that of the largest one.
-      names: of the balls. centers: their middles; None for one ball at the robot's position.
+      dynamics: the robot's dynamics. world: the obstacles, in the coordinates of the places.
+      radii: radii of the balls in m, (B,); for geoms, the radius of the largest geom.
+      names: names of the balls. centers: their centres; None for one ball at the robot's position.
     """
 
     dynamics: Dynamics
@@ -126,7 +126,7 @@ class ShapeInWorld:
         """Signed distance to the nearest obstacle, minus the radius, at places: (...) in m; infinite without obstacles.
 
         Args:
-          displaced: (K, O, 3) in m, by how much obstacles are elsewhere; the first axis of the places is then K.
+          displaced: (K, O, 3) in m, displacements of the obstacles; the first axis of the places is then K.
         """
         if not len(self.world):
             return np.full(places.shape[:-2], np.inf)
@@ -139,7 +139,7 @@ class ShapeInWorld:
     def with_slopes(self, states: Array, along: Sequence[int]) -> tuple[Array, Array]:
         """Clearance of each obstacle at states (K, n), (K, O) in m, and its derivatives in some states, (K, O, p).
 
-        They are those of the nearest ball.
+        Both belong to the nearest ball.
         """
         knots, count, size = np.arange(len(states))[:, None], len(self.radii), states.shape[1]
         if self.centers is None:
@@ -159,19 +159,19 @@ class ShapeInWorld:
         points, table = np.zeros((len(places), 3)), self.world.table.ravel()
         points[:, : places.shape[1]] = places
         found = np.full(len(self.world), np.inf)
-        larger = self.radii - self.radii.min()  # what all have changes no order, except by rounding
+        larger = self.radii - self.radii.min()  # a radius that all share changes no order, except by rounding
         for point, radius in zip(points, larger, strict=True):
-            there = (point - displaced).tolist()  # seen from where each obstacle is
+            there = (point - displaced).tolist()  # relative to each displaced obstacle
             own = [signed_distance_of_one(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
             found = np.minimum(found, own)
         return int(np.argmin(found))
 
     def travel(self, before: Array, after: Array) -> Array:
-        """How far any point goes at most on a straight line between places, (...) in m."""
+        """The largest distance that any point moves on a straight line between places, (...) in m."""
         return np.linalg.norm(after - before, axis=-1).max(axis=-1)
 
     def inside(self, state: Array) -> tuple[str, str] | None:
-        """Where a state, which may have NaNs, is inside an obstacle, and the remedy, as texts; None if it is clear."""
+        """The place in an obstacle of a state, which may have NaNs, and the remedy, as texts; None if it is clear."""
         for name, radius, place in zip(self.names, self.radii, self.places(state), strict=True):
             if len(self.world) and not np.isnan(place).any():
                 distances = self.world.distances(place) - radius
@@ -184,7 +184,7 @@ class ShapeInWorld:
         return None
 
     def across(self, vectors: Array) -> Array:
-        """Vectors (..., 3) along the axes of the scene, along those of `world`."""
+        """Convert vectors (..., 3) from the axes of the scene to the axes of `world`."""
         space = self.dynamics.state_coordinates
         if not self.in_plane:
             return vectors
@@ -197,7 +197,7 @@ class GeomsInWorld(ShapeInWorld):
     """Geoms among obstacles.
 
     Attributes:
-      geoms: the geoms, which know their distances.
+      geoms: the geoms, which compute their distances.
     """
 
     geoms: CollisionGeoms
@@ -214,7 +214,7 @@ class GeomsInWorld(ShapeInWorld):
         return states[..., None, :]
 
     def clearance(self, places: Array, displaced: Array | None = None) -> Array:
-        """NaN where the states are."""
+        """NaN where a state has a NaN."""
         states = places[..., 0, :]
         known = np.asarray(np.isfinite(states).all(axis=-1))
         if not len(self.world):
@@ -247,7 +247,7 @@ def shape_in(
     dynamics: Dynamics, world: World, *, radius: float = 0.0, balls: CollisionSpheres | None = None,
     geoms: CollisionGeoms | None = None,
 ) -> ShapeInWorld:  # fmt: skip
-    """The shape of a robot among obstacles; a ball at its position, of a robot that has none, is among none.
+    """The shape of a robot among obstacles. A ball at the position of a robot without a position is among no obstacles.
 
     Raises:
       InputError: it does not fit the dynamics.
@@ -266,8 +266,8 @@ class KeepsClear:
     """A cost or a constraint that keeps a robot clear of obstacles.
 
     Attributes:
-      world: the obstacles. shape: the robot's, as the one keyword that was given of radius, balls and geoms.
-      radius: as given; of balls that of the largest, of geoms 0. balls, geoms: None where they were not given.
+      world: the obstacles. shape: the robot's shape, as the keyword that was given: radius, balls or geoms.
+      radius: the given radius; for balls the largest radius, for geoms 0. balls, geoms: None if not given.
     """
 
     def _set_shape(
@@ -298,7 +298,7 @@ class KeepsClear:
         return own | self.shape
 
     def in_world(self, dynamics: Dynamics, time: float = 0.0) -> ShapeInWorld:
-        """The shape among the obstacles, where they are at a time in s. Raises InputError if it does not fit."""
+        """The shape among the obstacles, at their positions at a time in s. Raises InputError if it does not fit."""
         if "radius" in self.shape and not dynamics.state_coordinates.position:
             wanted = "Dynamics(..., position=(names)), or balls="
             raise InputError(f"{type(self).__name__}: got dynamics without a position, want {wanted}")

@@ -1,4 +1,4 @@
-"""Robots that are several balls: where each is, as a function of the state, and how large."""
+"""Robots made of several balls: the centre of each as a function of the state, and its radius."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -45,16 +45,16 @@ from lqrsim.scenes.world import SPACE, World
 
 @dataclass(frozen=True)
 class SphereCenters(Term):
-    """Places of balls, made for one system: the source to compile, and its data.
+    """Positions of balls, for one system: the source to compile, and its data.
 
     The source defines `places(x, data, out)`, which writes three coordinates per ball, ball by ball, and
-    `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are not
-    zero, to zeros.
+    `places_jacobian(x, data, out, slopes)`, which writes the coordinates, and the nonzero derivatives in the states (3
+    K, N) to an array of zeros.
 
     Attributes:
       depends_on: the states that the places depend on, by their indices.
-      in_plane: whether the places are in the plane of the robot's position, with third coordinate 0, instead of in
-        space.
+      in_plane: whether the positions are in the plane of the robot's position, with third coordinate 0; else they are
+        in space.
     """
 
     depends_on: tuple[int, ...]
@@ -84,7 +84,7 @@ class SphereCenters(Term):
         """The kernel of a cost or a constraint, with these places.
 
         Args:
-          kernel: its source.
+          kernel: the source of the kernel.
         """
         return kernel.filled(places=self.code, places_jacobian=self.code)
 
@@ -99,23 +99,23 @@ class CollisionSpheres:
 
         ls.CollisionSpheres(rotors, [0.12] * 4)
 
-    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear. The `balls` of a
-    `Robot` are its collision shape in simulation; without any it is one ball at its position. `Capsule` makes chains.
+    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all balls clear. The `balls` of a `Robot`
+    are its collision shape in simulation; a robot without balls is one ball at its position. `Capsule` makes chains.
 
-    To place balls otherwise, subclass it and write `bind`.
+    To compute the centres in another way, subclass this class and write `bind`.
 
     Args:
-      places: `places(x, p)`, stated at one of the three levels of `Dynamics`; returns the middle of each of K balls.
-        They have 3 coordinates in the world, in metres; or 2, in the plane of the position, if the robot has a position
-        in a plane, and then they see the world as the position does: see `World.seen_by`. p has the dynamics'
-        parameters as attributes.
-      radii: (K,) of the balls, in metres.
+      places: `places(x, p)`, at one of the three levels of `Dynamics`; returns the centre of each of K balls, as 3
+        coordinates in the world, in metres. If the robot has a position in a plane, a centre may have 2 coordinates in
+        that plane; obstacles are then seen as for the position, see `World.seen_by`. The parameters of the dynamics are
+        attributes of p.
+      radii: (K,) radii of the balls, in metres.
       names: names of the balls in messages; by default "ball 0", "ball 1", ....
-      sites: names of sites or geoms in the robot's MJCF, one per ball, None where there is none. A `Plant` checks that
-        the middle of each is where the formula has it.
-      jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
-        to slopes (K, 3 or 2, n), which it gets as zeros. Without it they are central differences.
-      depends_on: names of the states that the places depend on, for the compiled and the plain level; all by default.
+      sites: names of sites or geoms in the robot's MJCF, one per ball, or None. A `Plant` checks that each of them has
+        its centre where the formula puts the ball.
+      jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the nonzero derivatives to slopes
+        (K, 3 or 2, n), which are zero on entry. Without a jacobian, central differences are used.
+      depends_on: names of the states that the centres depend on, for the compiled and the plain level; all by default.
         The fewer, the faster.
       level: "symbolic", "compiled" or "plain"; by default compiled if `places` is a numba function, else symbolic.
 
@@ -256,22 +256,22 @@ class CollisionSpheres:
                 size = len(_points(plain(np.zeros(len(dynamics.state_coordinates)), p), len(self))[0])
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
-        except Exception as error:  # whatever a user's function may raise becomes one line
+        except Exception as error:  # any exception of a user's function becomes one line
             said = f"{type(error).__name__} ({error})"
             raise InputError(f"{self.name}: got {said}, want it to work at x = (0, ..., 0)") from error
         self._check_plane(size, dynamics.state_coordinates)
         return size
 
     def _check_plane(self, size: int, space: Coordinates) -> None:
-        """Raises InputError for places in a plane of a robot that has none."""
+        """Raises InputError for points in a plane if the robot has no position in a plane."""
         if size == 2 and len(space.position) != 2:
             has = "a position in space" if space.position else "no position"
             raise InputError(f"{self.name}: got points of 2 coordinates for dynamics with {has}, want 3")
 
     def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
-        """The middle of each ball, (..., K, 3), at states (..., n), in the world and in metres.
+        """The centre of each ball, (..., K, 3), at states (..., n), in the world, in metres.
 
-        Places in a plane that is seen from above have height 0.
+        Centres in a plane that is seen from above have height 0.
 
         Args:
           dynamics: dynamics of the system whose states move the balls.
@@ -285,7 +285,7 @@ class CollisionSpheres:
 
 
 def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
-    """Places of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
+    """Centres of this number of balls, (..., count, 3), by compiled code, at states (..., n)."""
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))
@@ -294,8 +294,8 @@ def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
 
 
 def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
-    """Places of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states (K,
-    n).
+    """Centres of this number of balls (K, count, 3), and their derivatives in the states (K, count, 3, n), at states
+    (K, n).
     """
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))

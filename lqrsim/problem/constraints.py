@@ -31,8 +31,8 @@ from lqrsim.kernels import state_bound
 from lqrsim.problem.costs import OfFunction, ProblemPart
 from lqrsim.problem.dynamics import Dynamics
 
-EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
-STEPS = ("all", "final")  # at which a constraint can act
+EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
+STEPS = ("all", "final")  # the steps at which a constraint can act
 _Value = TypeVar("_Value")
 
 
@@ -46,12 +46,12 @@ class ConstraintTerm(Term):
     Attributes:
       rows: number of entries at a step.
       describe: returns the name of a row for messages.
-      uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
+      uses_control: whether the entries depend on u; if so, they do not act at the last step, which has no control.
       equality: whether the entries must be zero.
-      final_only: whether they act only at the last step.
-      shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
-        source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
-        these numbers (shared,) and their derivatives (shared, n) in place of x and u.
+      final_only: whether the entries act only at the last step.
+      shared: number of values that all rows share, such as the centres of balls; they are computed once per step. If it
+        is not 0, the source must define `places` and `places_jacobian`, as in `SphereCenters`. Then `value` and `slope`
+        get these values (shared,) and their derivatives (shared, n) in place of x and u.
     """
 
     rows: int
@@ -72,19 +72,19 @@ class ConstraintTerm(Term):
         for name in ("uses_control", "equality", "final_only"):
             keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
-            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
+            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
         keep(self, shared=check_count("ConstraintTerm: shared", self.shared, at_least=0))
         super().__post_init__()
 
 
 class Constraint(ProblemPart[ConstraintTerm]):
-    """One constraint."""
+    """A constraint."""
 
     def ahead(self, steps: int) -> "Constraint":
-        """The constraint after `steps` steps are over: itself, unless it differs from step to step.
+        """The constraint for the rest of the plan after `steps` steps: unchanged, unless it differs from step to step.
 
         Args:
-          steps: how many steps are over.
+          steps: number of steps that are over.
         """
         check_count("steps", steps, at_least=0)
         return self
@@ -98,16 +98,17 @@ class SymbolicConstraint(OfFunction, Constraint):
 
         ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
 
-    One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
-    the last, too, but not at a start that is given exactly, which cannot change.
+    A constraint that depends on the control acts at all steps that have a control, so not at the last knot. A
+    constraint on the state alone acts at the last knot, too. It does not act at a start that is given exactly, because
+    that cannot change.
 
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
-        must be nonnegative. All of them depend on u, or none does. They are solved for to one tolerance, so their units
-        are best such that numbers about 1 matter.
+        must be nonnegative. Either all of them depend on u, or none does. All are solved to the same tolerance, so
+        choose units in which values of about 1 matter.
       parameters: name -> value, as in `Dynamics`.
       equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
-      at: "all" steps, or only the "final" one, where it must not depend on u.
+      at: "all" steps, or only the "final" step, at which the expressions must not depend on u.
     """
 
     def __init__(
@@ -174,14 +175,14 @@ class SymbolicConstraint(OfFunction, Constraint):
 
 
 class GoalState(Constraint):
-    """The final state equals a goal: `x_T = goal`. A final cost only draws it there.
+    """The final state equals a goal: `x_T = goal`. A final cost only draws the state to it.
 
         ls.GoalState(x=1.0, velocity=0.0)
 
     Args:
       goal: (n,) the state, in the states' units; or a dictionary of name or unit: number, for some of the states, such
         as {"m/s": 0} for all velocities. Angles count whole turns, as for a QuadraticCost.
-      **named: name of a state -> number, which says the same as a dictionary.
+      **named: name of a state -> number, in place of a dictionary.
 
     Raises:
       InputError: no goal, a number that is not finite, or a state that is named twice.
@@ -195,7 +196,7 @@ class GoalState(Constraint):
             self.goal = check_array("GoalState: goal", goal, (None,))
 
     def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
-        """The goal of each state that has one, by its index. Raises InputError if it does not fit."""
+        """The goal of each state with a goal, by index. Raises InputError if the goal does not fit."""
         names, goal = dynamics.state_coordinates.names, self.goal
         if isinstance(goal, dict):
             return dynamics.state_coordinates._by_name("GoalState: states", goal, check_number)
@@ -215,19 +216,19 @@ class GoalState(Constraint):
 
 
 class StateBounds(Constraint):
-    """Bounds on states, `low <= x_t <= high`, at each step; only at a start that is given exactly they do not act.
+    """Bounds on states, `low <= x_t <= high`, at each step except a start that is given exactly.
 
         ls.StateBounds(height=(0.1, 2.0), velocity=(-np.inf, 1.5))
 
-    Nor do they act at the end on a state that a GoalState fixes, so a goal may lie on a bound.
+    At the end, the bounds do not act on a state that a GoalState fixes. A goal may therefore lie on a bound.
 
     Args:
-      bounds: a dictionary of name or unit of a state: (low, high), in its unit; an infinite one is none. A name wins
-        over a unit.
-      **named: name of a state -> (low, high), which says the same as a dictionary.
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit. An infinite number means no bound. A
+        name takes precedence over a unit.
+      **named: name of a state -> (low, high), in place of a dictionary.
 
     Raises:
-      InputError: no bounds, none that is finite for a state, low not below high, or a state that is named twice.
+      InputError: no bounds, no finite bound for a state, low not below high, or a state that is named twice.
     """
 
     def __init__(
@@ -236,14 +237,14 @@ class StateBounds(Constraint):
         self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
     def _of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
-        """(low, high) of each state that has any, by its index."""
+        """(low, high) of each bounded state, by index."""
         return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, _bound)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_to_goal(dynamics, {}, 0)
 
     def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
-        """As `bind`, where some states, by their indices, must be at a goal after this number of steps.
+        """As `bind`, if some states, by their indices, must be at a goal after this number of steps.
 
         Raises:
           InputError: a goal is outside the bounds.
@@ -265,15 +266,15 @@ class StateBounds(Constraint):
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
-    """The values that all GoalStates require, by the index of the state. Raises InputError if two contradict each
-    other.
+    """The values that all GoalStates require, by the index of the state. Raises InputError if two of them contradict
+    each other.
     """
     goals: dict[int, float] = {}
     for constraint in constraints:
         for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
             if goals.setdefault(i, number) != number:
                 name = dynamics.state_coordinates.names[i]
-                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one")
+                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one goal")
     return goals
 
 
@@ -281,7 +282,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     """The constraints for a system and the times (T+1,) in s of the knots.
 
     Raises:
-      InputError: they do not fit it, or each other.
+      InputError: the constraints do not fit the system, or each other.
     """
     goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
     _check_bounds([one for one in constraints if isinstance(one, StateBounds)], dynamics)
@@ -308,15 +309,13 @@ def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics) -> None:
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:
-    """The largest violation of a constraint, given its values; 0 if there is none, infinite if one is NaN."""
+    """The largest violation of a constraint, given its values: 0 if it is satisfied, infinite if a value is NaN."""
     missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
     return missed if not np.isnan(missed) else np.inf
 
 
 def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
-    """The largest violation that counts as none. Where `tolerance` is a margin, inequalities may not be violated at
-    all.
-    """
+    """The largest violation that counts as none. If `tolerance` is a margin, inequalities may not be violated."""
     if term.equality:
         return min(tolerance, EQUALITY_TOLERANCE)
     return 0.0 if spared else tolerance
@@ -343,9 +342,9 @@ def by_name(
 
 
 def _bound(field: str, given: object) -> tuple[float, float]:
-    """(low, high), one of them finite."""
+    """(low, high), at least one of them finite."""
     if isinstance(given, (int, float)):
-        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); an infinite one is none")
+        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); infinite for no bound")
     low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
     if not low < high or not np.isfinite([low, high]).any():
         raise InputError(f"{field}: got {low:g} to {high:g}, want low below high, and one of them finite")

@@ -50,7 +50,7 @@ FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing 
 
 @dataclass(frozen=True)
 class CostTerm(Term):
-    """A cost term, made for one system: what gets compiled, and the numbers it reads.
+    """A cost term, for one system: the source to compile, and the numbers that it reads.
 
     The source defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
     cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls.
@@ -58,11 +58,11 @@ class CostTerm(Term):
     Attributes:
       nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
         sum of all such terms is projected to the nearest positive-semidefinite matrix.
-      uses_control: whether it depends on u (only stage costs may).
-      factor: index in `data` of a number that the whole term is proportional to, if it may be reduced in the first
-        iterations; see `InitialPrior`. None where there is none.
-      exact_hessian: whether the Hessian is complete. Where a part is left out on purpose, `check_derivatives` does not
-        compare it with differences.
+      uses_control: whether the term depends on u (only stage costs may).
+      factor: index in `data` of a number that the whole term is proportional to, if the number may be reduced in the
+        first iterations; see `InitialPrior`. Else None.
+      exact_hessian: whether the Hessian is complete. If a part is left out on purpose, `check_derivatives` does not
+        compare the Hessian with differences.
     """
 
     nonconvex_in: tuple[int, ...] | None = None
@@ -95,7 +95,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> _BoundTerm:
-        """Bind it to a system.
+        """Bind the term to a system.
 
         Args:
           dynamics: dynamics of the system.
@@ -106,11 +106,11 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     @property
     def moving(self) -> bool:
-        """Whether it changes with time; see `_bind_at`."""
+        """Whether the term changes with time; see `_bind_at`."""
         return False
 
     def _stated(self) -> Mapping[str, object]:
-        """What it was made of, by name."""
+        """The arguments that it was made from, by name."""
         return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
     def __repr__(self) -> str:
@@ -122,7 +122,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
-        """Bind it to a system and the times (T+1,) in s of a problem's knots."""
+        """Bind the term to a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
 
 
@@ -154,7 +154,7 @@ class Cost(ProblemPart[CostTerm]):
 
     @property
     def name(self) -> str:
-        """Its name in messages."""
+        """The name in messages."""
         return type(self).__name__
 
     def _in(self, dynamics: Dynamics) -> "Cost":
@@ -175,7 +175,7 @@ class CostSum(Cost):
         return " + ".join(map(repr, self.terms))
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        raise InputError("cost: got a sum to bind, want its terms one by one")
+        raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
 
 
 def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
@@ -190,10 +190,10 @@ def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
 
 
 def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
-    """The cost with numbers by name in the order of a system; itself where it has none.
+    """The cost with numbers by name in the order of a system; the same object if it has no numbers by name.
 
     Raises:
-      InputError: a term does not fit the system, or it is no cost.
+      InputError: a term does not fit the system, or is no cost.
     """
     terms = terms_of(cost, field)
     found = tuple(term._in(dynamics) for term in terms)
@@ -226,13 +226,13 @@ class _SquareCost(Cost):
 
     @property
     def about(self) -> Array:
-        """Where it is zero. Numbers by name are in no order before a Problem has the cost."""
+        """The point at which the cost is zero. Numbers by name are in no order before a Problem has the cost."""
         return self._known[1]
 
     @property
     def _known(self) -> tuple[Array, Array]:
         if self._numbers is None:
-            raise InputError(f"{self.name}: got numbers by name, want the one of a Problem, as problem.final_cost")
+            raise InputError(f"{self.name}: got numbers by name, want the cost from a Problem: problem.final_cost")
         return self._numbers
 
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
@@ -273,8 +273,8 @@ class QuadraticCost(_SquareCost):
 
     Args:
       weight: (n, n) symmetric positive semidefinite, or its diagonal (n,), or a dictionary of name or unit of a state:
-        number; states without one have no weight.
-      about: (n,) the state where it is zero, or a dictionary of name or unit: number; the others are 0.
+        number; states without a number have no weight.
+      about: (n,) the state at which the cost is zero, or a dictionary of name or unit: number; the other states are 0.
     """
 
     controls = False
@@ -289,8 +289,8 @@ class ControlCost(_SquareCost):
     Args:
       weight: (m, m) symmetric positive definite, or its diagonal (m,), or a dictionary of name or unit of a control:
         number, with one for each control.
-      about: (m,) the nominal control, where it is zero, or a dictionary of name or unit: number; the solvers start from
-        it unless told otherwise. By default, and for controls without a number, 0.
+      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. The solvers
+        start from it unless told otherwise. By default 0, also for controls that the dictionary leaves out.
     """
 
     controls = True
@@ -300,11 +300,11 @@ class ControlCost(_SquareCost):
 
 
 class LimitCost(Cost):
-    """`1/2 weight depth^2` for each state that is past a bound, by that depth: a soft end to where it may be.
+    """`1/2 weight depth^2` for each state that is past a bound by some depth: a soft limit.
 
     Args:
       low, high: name of a state -> its bound.
-      weight: of the square of each depth.
+      weight: weight of the square of each depth.
     """
 
     def __init__(
@@ -334,20 +334,21 @@ class LimitCost(Cost):
 class ObstacleCost(KeepsClear, Cost):
     """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
 
-    Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
-    the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
+    Paper: Sec. VI-A, with the sharpness made explicit. The cost does not act at t = 0, where the state is given. For a
+    robot in the plane (two position coordinates), the world is seen from above or cut by the plane; see
+    `World.seen_by`.
 
-    For a robot of several balls it is also the sum over the balls. The Hessian is then that in the balls' places, taken
-    to the states by the first derivatives of the places; their second derivatives are left out.
+    For a robot of several balls, the cost is summed over the balls, too. Its Hessian is then computed in the centres of
+    the balls and mapped to the states by the Jacobian of the centres. Second derivatives of the centres are left out.
 
     Args:
       world: the obstacles.
       radius: radius of the robot at its position, in metres.
-      balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
-      geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances: the sum is over its
-        bodies and the obstacles, and pairs farther apart than 16 / sharpness cost nothing. Give one of radius, balls
-        and geoms.
-      sharpness: in 1/m.
+      balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
+      geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances. The sum is then
+        over bodies and obstacles; pairs farther apart than 16 / sharpness cost nothing. Give exactly one of `radius`,
+        `balls` and `geoms`.
+      sharpness: sharpness in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """
 
@@ -410,7 +411,7 @@ class SymbolicCost(OfFunction, Cost):
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression. For an initial or final
         cost it must not depend on u.
       parameters: name -> value, as in `Dynamics`.
-      convex: set it where the Hessian is positive semidefinite everywhere, to save the projection.
+      convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
     """
 
     def __init__(
@@ -458,16 +459,16 @@ class SymbolicCost(OfFunction, Cost):
 
 
 class FunctionCost(OfFunction, Cost):
-    """A cost given as a numba or a plain Python function, where `SymbolicCost` cannot express it.
+    """A cost given as a numba or plain Python function, for costs that `SymbolicCost` cannot express.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.
       derivatives: `derivatives(x, u, p, gradient, hessian)`, which writes to gradient (n+m,) and hessian (n+m, n+m),
-        states before controls; it gets them as zeros. Without it, both are central differences, good to some six
-        digits, at two evaluations for every pair of entries in `depends_on`.
-      depends_on: names of the states and controls that it depends on; all by default. The fewer, the faster.
+        states before controls; both are zero on entry. Without derivatives, both are central differences, accurate to
+        about six digits, at two evaluations for every pair of entries in `depends_on`.
+      depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
       parameters: name -> value, as in `Dynamics`.
-      convex: set it where the Hessian is positive semidefinite everywhere, to save the projection.
+      convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
       level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 
@@ -486,7 +487,7 @@ class FunctionCost(OfFunction, Cost):
         self.level = level_of(function, level)
         if self.level == "symbolic":
             if level is not None:
-                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
+                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled' or 'plain'; or use SymbolicCost")
             self.level = "plain"
         self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
         if self.depends_on == ():  # a constant: nothing to minimise

@@ -18,7 +18,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.fields import Line, check_fields
 
-STEP = 6e-6  # of difference quotients, relative to numbers above 1
+STEP = 6e-6  # step of difference quotients, relative to numbers above 1
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
@@ -27,7 +27,7 @@ def functions_of(problem: Problem) -> list[UserFunction]:
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
-    """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
+    """Call each numba and plain Python function once. Raises InputError if a function returns an unsuitable result."""
     for part in _parts(problem):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
@@ -40,7 +40,7 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
 
 
 def _parts(problem: Problem) -> list[Dynamics | Term]:
-    """The dynamics, and all that is bound to them."""
+    """The dynamics, and all terms that are bound to them."""
     terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
     noise = () if problem.noise_term is None else (problem.noise_term,)
     return [problem.dynamics, *terms, *problem.constraint_terms, *noise]
@@ -108,17 +108,17 @@ class PlainTerm:
         return float(self._functions["derivatives"](x, u, 1, self._data, hessian, gradient)), gradient, hessian
 
     def value(self, z: Array, row: int) -> float:
-        """One of the constraint's numbers."""
+        """One row of the constraint."""
         return float(self._functions["value"](*self._given(z), 1, row, self._data))
 
     def slope(self, z: Array, row: int) -> Array:
-        """The gradient (n+m,) of one of the constraint's numbers."""
+        """The gradient (n+m,) of one row of the constraint."""
         gradient = np.zeros(self.size)
         self._functions["slope"](*self._given(z), 1, row, self._data, gradient)
         return gradient
 
     def _given(self, z: Array) -> tuple[Array, Array]:
-        """State and control; or the numbers that all rows share and their derivatives, in place of them."""
+        """State and control; or, in their place, the values that all rows share and their derivatives."""
         x, u = z[: self.states], z[self.states :]
         if not self.shared:
             return x, u
@@ -129,7 +129,7 @@ class PlainTerm:
 
 @dataclass(frozen=True)
 class DerivativeCheck:
-    """How far derivatives are from central differences, where they are furthest.
+    """The largest deviation of derivatives from central differences.
 
     Attributes:
       what: name of the derivative, such as `df/dx of ...`.
@@ -138,8 +138,8 @@ class DerivativeCheck:
       column: the name of the input at that entry.
       stated: the stated derivative there.
       difference: the difference quotient there.
-      state: (n,), where that was.
-      control: (m,), where that was.
+      state: (n,), at that point.
+      control: (m,), at that point.
       tolerance: the largest acceptable error.
     """
 
@@ -175,19 +175,20 @@ def check_derivatives(
 ) -> list[DerivativeCheck]:
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
-    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes. Those of
-    compiled and plain functions may be wrong. Costs without derivatives are left out, because theirs are central
-    differences themselves.
+    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes. Derivatives
+    of compiled and plain functions may be wrong. Costs without derivatives are left out, because central differences
+    are used for them anyway.
 
     Args:
       subject: dynamics, checked around zero, or a problem, checked around its start and nominal control.
-      samples: how many points.
+      samples: number of points.
       spread: their standard deviation, in the units of states and controls.
       tolerance: tolerance of the error, relative to each entry.
       seed: seed of the points.
 
     Returns:
-      One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
+      One check per matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the
+      verdict.
 
     Raises:
       InputError: a function fails, or an argument is not as described.
@@ -220,7 +221,7 @@ class _Derivative(NamedTuple):
     """A matrix of derivatives at a point.
 
     Attributes:
-      what: its name in messages. rows, columns: names.
+      what: name of the matrix in messages. rows, columns: names.
       stated: derivatives from the function that is checked. differences: the result of `_differences`.
       x, u: the point.
     """
@@ -251,7 +252,7 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
     names = (*states, *controls)
     for cost, term in _terms(problem):
         if len(term.functions) == 1 and term.exact_hessian:
-            continue  # without derivatives of its own, it has central differences already
+            continue  # a function without derivatives uses central differences already
         plain = PlainTerm(term, len(states), len(controls))
         for x, u in points:
             z = np.concatenate([x, u])
@@ -299,6 +300,6 @@ def _differences(function: Any, z: Array) -> tuple[Array, Array]:
         behind[i] -= h
         above, below = function(ahead), function(behind)
         columns.append((above - below) / (2 * h))
-        # A thousand roundings of a number of that size, or of one.
+        # A thousand rounding errors of a number of that size, or of 1.
         noise.append(1e3 * np.finfo(float).eps * np.maximum(np.maximum(np.abs(above), np.abs(below)), 1.0) / h)
     return np.stack(columns, axis=1), np.stack(noise, axis=1)

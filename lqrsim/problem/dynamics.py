@@ -29,7 +29,7 @@ from lqrsim.results.coordinates import Coordinates, Limits
 if TYPE_CHECKING:
     from lqrsim.scenes.contact_modes import ContactModes
 
-# Most operations of a formula that is differentiated twice, which then takes about five seconds.
+# The largest number of operations of a formula that is differentiated twice; the largest takes about five seconds.
 LONGEST = 1500
 
 
@@ -56,26 +56,28 @@ class Dynamics:
       plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
-      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed; p has the parameters as
-        attributes, and so have x and u states and controls where they are symbols: `x.speed` is `x[1]`.
+      f: `f(x, u, p)`; returns one entry per state. x (n,) and u (m,) must not be changed. The parameters are attributes
+        of p. If x and u are symbols, states and controls are also attributes: `x.speed` is `x[1]`.
       states: name -> unit, in order; n of them.
       controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
-      disturbances: quantities unknown when planning, such as a wind or the remaining share of a motor's force: name ->
-        the value that the plan assumes, mostly 0 or 1. To f they are parameters. Plans know them as constants and are
-        not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
-        knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
+      disturbances: quantities unknown when planning, such as a wind or the remaining fraction of a motor's force: name
+        -> the value that the plan assumes, usually 0 or 1. To f they are parameters. For planning they are constants,
+        so
+        they cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows the
+        names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default that of the names, if they are
-        two of x, y and z.
-      offset: where the plane is along the third axis, in metres.
+      plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default the plane that the names of
+        the states give, if they are two of x, y and z.
+      offset: coordinate of the plane along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
-        (lowest, highest), as `{"force": (-2, 2)}`; the actuators' range, for execution.
-      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
-        that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
+        (lowest, highest), as `{"force": (-2, 2)}`. It is the range of the actuators in execution.
+      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes the nonzero entries of df/dx
+        and df/du to fx (n, n) and fu (n, m), which are zero on entry. A numba function if f is one, else a Python
+        function.
       level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
 
     Raises:
@@ -83,7 +85,7 @@ class Dynamics:
         of f is checked when it is first needed.
     """
 
-    # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
+    # Whether the dynamics are given as the state after a control period, not as a rate; see `robots/mjcf_dynamics.py`.
     discrete: ClassVar[bool] = False
     # Hash of everything that defines the dynamics besides source and parameters; empty for functions.
     fixed: str = ""
@@ -151,7 +153,7 @@ class Dynamics:
         )
         space = Coordinates(names=tuple(controls), units=tuple(controls.values()))
         self.control_coordinates = space if control_limits is None else space.limited(control_limits)
-        # At once and not when first needed: several threads may need them, and addresses are not to change.
+        # Computed now, not when first needed: several threads may need the functions, and addresses must not change.
         self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -168,7 +170,7 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        """The name of the dynamics in messages: that of `f`."""
+        """The name of the dynamics in messages: the name of `f`."""
         return name_of(self.f)
 
     def with_parameters(self, **values: float) -> "Dynamics":
@@ -189,7 +191,7 @@ class Dynamics:
 
     @cached_property
     def disturbed(self) -> "Dynamics":
-        """The same dynamics with the disturbances as parameters, too; at their planned values it moves the same way."""
+        """The same dynamics with the disturbances as parameters, too. At their planned values nothing changes."""
         if self.disturbances.keys() <= self.parameters.keys():
             return self
         other = copy.copy(self)
@@ -205,7 +207,7 @@ class Dynamics:
 
     @property
     def places(self) -> dict[str, int]:
-        """Where each parameter is among the numbers that compiled code takes."""
+        """The index of each parameter among the numbers that compiled code takes."""
         return {name: len(self.functions) + i for i, name in enumerate(self.parameters)}
 
     def _functions(self) -> tuple[UserFunction, ...]:
@@ -240,27 +242,27 @@ class Dynamics:
         return False
 
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
-        """The same dynamics with softer contacts and limits, each with its name, the softest first.
+        """The dynamics with softer contacts and limits, in several degrees with their names, the softest first.
 
         Args:
-          states: (T+1, n) of a plan; where nothing touches along it, there are none.
+          states: (T+1, n) of a plan. If nothing touches along the plan, there are no softer dynamics.
         """
         return iter(())
 
     def contact_modes(self, dt: float) -> "ContactModes | None":
-        """What acts in control periods, for dynamics that are smooth only as long as the same does.
+        """The contact modes of control periods, for dynamics that are smooth only within one mode.
 
         Args:
           dt: the control period in seconds.
 
         Returns:
-          None, except for an MJCF in which all that switches is known.
+          None, except for an MJCF whose switches are all known.
         """
         return None
 
     @cached_property
     def step_source(self) -> Source:
-        """Source of `advance` and `step_jacobian`, as `kernels/runge_kutta.py` has them."""
+        """Source of `advance` and `step_jacobian`, as defined in `kernels/runge_kutta.py`."""
         names = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
         return source_of(runge_kutta).filled(**dict.fromkeys(names, self.source))
 
@@ -272,7 +274,7 @@ class Dynamics:
 
     @cached_property
     def curvature_source(self) -> Source | None:
-        """Source of `step_curvature`, as `kernels/step_curvature.py` has it; None where that is zero everywhere."""
+        """Source of `step_curvature`, as defined in `kernels/step_curvature.py`; None if it is zero everywhere."""
         kept = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
         axes = tuple(range(len(self.state_coordinates) + len(self.control_coordinates)))
         by_values = source_of(differences, AXES=axes).filled(**dict.fromkeys(kept, self.source))
@@ -297,7 +299,7 @@ class Dynamics:
 
     @cached_property
     def step_curvature(self) -> float:
-        """The address of the second derivatives of a step; 0 where they are zero everywhere. Compiles them."""
+        """The address of the second derivatives of a step, which are compiled; 0 if they are zero everywhere."""
         if self.curvature_source is None:
             return 0.0
         n, m = len(self.state_coordinates), len(self.control_coordinates)
@@ -306,7 +308,7 @@ class Dynamics:
 
     @property
     def constants(self) -> dict[str, float]:
-        """The disturbances that are taken for granted."""
+        """The disturbances that the plan treats as constants."""
         return {name: value for name, value in self.disturbances.items() if name not in self.parameters}
 
     def _traced(self) -> tuple[list[Any], list[Any], list[Any]]:
@@ -359,7 +361,7 @@ class Dynamics:
         }
 
     def period_near(self, dt: float) -> float:
-        """The possible duration of a step nearest to `dt`: `dt` itself, except where MuJoCo does the steps.
+        """The possible duration of a step nearest to `dt`: `dt` itself, unless MuJoCo does the steps.
 
         Args:
           dt: seconds.
@@ -370,7 +372,7 @@ class Dynamics:
         return check_number("dt", dt)
 
     def check_period(self, dt: float) -> None:
-        """Check that a step can last `dt` seconds. It always can, except where MuJoCo does the steps.
+        """Check that a step can last `dt` seconds. It always can, unless MuJoCo does the steps.
 
         Args:
           dt: seconds.
@@ -381,10 +383,10 @@ class Dynamics:
         check_number("dt", dt)
 
     def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
-        """A context that lasts while a solver is at work.
+        """A context in which a solver works.
 
         Args:
-          threads: how many threads the solver may use for one trajectory.
+          threads: number of threads that the solver may use for one trajectory.
         """
         check_count("threads", threads)
         return contextlib.nullcontext()
@@ -453,7 +455,7 @@ class Dynamics:
 
     @cached_property
     def _plain(self) -> dict[str, Any]:
-        """The very source that gets compiled, run as plain Python."""
+        """The source that is compiled, run as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = ("rate", "rate_jacobian", "advance", "step_jacobian")
         calls = plain_calls(self.functions, self.parameters)
@@ -467,9 +469,9 @@ class Dynamics:
 def _parameters_of(
     parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Parameters and disturbances, checked; where constants gain nothing, disturbances become parameters."""
+    """Parameters and disturbances, checked. If constants gain nothing, disturbances become parameters."""
     own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
     twice = own.keys() & unknown.keys()
     if twice:
-        raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
+        raise InputError(f"disturbances: got {min(twice)!r}, which is also a parameter, want another name")
     return (own if level == "symbolic" else own | unknown), unknown

@@ -1,4 +1,4 @@
-"""The linear-quadratic problem of Sec. IV: what `smooth_lq` solves, and an iteration of `smooth` sets up."""
+"""The linear-quadratic problem of Sec. IV, which `smooth_lq` solves and each iteration of `smooth` sets up."""
 
 import contextlib
 from dataclasses import dataclass, fields
@@ -17,8 +17,8 @@ class Stage:
         step (discrete) or rate (continuous) of x:   A x + B u + c
         cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
 
-    A leading axis of T, if there is one, is time: one stage a step; an array without it is the same at every step.
-    Everything but A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
+    An array with a leading axis of T has one entry per step; an array without that axis is the same at every step. All
+    arrays except A, B and R may be left out and are then zero. Paper: Eqs. (4), (7).
 
     Attributes:
       A: (..., n, n).
@@ -57,7 +57,7 @@ class Stage:
             "A": (n, n), "B": (n, m), "c": (n,), "Q": (n, n), "P": (m, n), "R": (m, m), "q": (n,), "r": (m,),
             "constant": (),
         }  # fmt: skip
-        # Time is the leading axis of any of them, and those without one are the same at each step.
+        # Time is the leading axis of any of the arrays; arrays without that axis are the same at each step.
         given = {name: _shape(getattr(self, name)) for name in shapes if getattr(self, name) is not None}
         time = max((shape[:1] for name, shape in given.items() if len(shape) == len(shapes[name]) + 1), default=())
         for field in fields(self):
@@ -89,7 +89,7 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
     """Hessian (n, n), gradient (n,) and constant of an initial or final cost.
 
     Raises:
-      InputError: it is no Quadratic of n states, or its Hessian is not symmetric.
+      InputError: the cost is no Quadratic of n states, or its Hessian is not symmetric.
     """
     if not isinstance(cost, Quadratic):
         raise InputError(f"{field}: got {excerpt(cost)}, want a Quadratic")
@@ -101,7 +101,7 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
 
 
 def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
-    """() for ragged input, which has none."""
+    """The shape; () for ragged input, which has no shape."""
     try:
         return np.asarray(value).shape
     except Exception:  # or an object that raises anything

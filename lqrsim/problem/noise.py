@@ -1,4 +1,4 @@
-"""Noise that dynamics are driven by, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
+"""Process noise, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
 
 The same object serves for planning, as `Problem(noise=...)`, and in trials, as one of the disturbances of `simulate`.
 """
@@ -32,12 +32,12 @@ from lqrsim.kernels import differences, user_functions
 from lqrsim.kernels import noise as noise_kernel
 from lqrsim.problem.dynamics import Dynamics
 
-MOST = 100  # independent normal numbers
+MOST = 100  # largest number of independent normal numbers
 
 
 @dataclass(frozen=True)
 class NoiseTerm(Term):
-    """A noise, made for one system: the source to compile, and its data.
+    """A noise, for one system: the source to compile, and its data.
 
     The source defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
     `kernels/declarations.py`. The data are the parameters or the matrix, then the strength.
@@ -66,7 +66,7 @@ class NoiseTerm(Term):
 class Noise:
     """White noise on the states: each control period adds M(x, u) w to them, with w (k,) standard normal.
 
-    Gusts that grow with the speed of a drone:
+    For example, gusts that grow with the speed of a drone:
 
         def shaken(x, u, p):
             speed = sqrt(x.vx**2 + x.vy**2 + 1e-6)
@@ -78,14 +78,14 @@ class Noise:
     the square root of dt: with half the dt, divide M by sqrt(2).
 
     Args:
-      function: `function(x, u, p)` as in `Dynamics`: returns n rows of k entries, formulas of SymPy symbols, whose
-        derivatives follow; or numbers, of a numba or (level="plain") any Python function of arrays, whose derivatives
-        are central differences. Or the matrix itself, (n, k), if it is constant.
-      size: k; not with a matrix.
-      parameters: name -> value, as in `Dynamics`: to the function p has them as attributes. Values are data.
+      function: `function(x, u, p)` as in `Dynamics`; returns n rows of k entries. For SymPy symbols the entries are
+        formulas, whose derivatives follow. For a numba function, or with level="plain" any Python function, of arrays
+        they are numbers, whose derivatives are central differences. A constant M may be given as a matrix (n, k).
+      size: k; not allowed with a matrix.
+      parameters: name -> value, as in `Dynamics`; they are attributes of p. Values are data.
       depends_on: names of the states and controls that M depends on, for numba and plain functions; all by default.
-        Fewer are faster. For formulas they are found automatically.
-      level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
+        The fewer, the faster. For formulas they are found automatically.
+      level: "symbolic", "compiled" or "plain"; by default compiled for a numba function, and symbolic otherwise.
 
     Raises:
       InputError: an argument is not as described. The result of the function is checked when it is first needed.
@@ -124,7 +124,7 @@ class Noise:
 
     @property
     def name(self) -> str:
-        """Its name in messages."""
+        """The name in messages."""
         return "a matrix" if self.matrix is not None else f"{name_of(self.function)}(x, u, p)"
 
     def __repr__(self) -> str:

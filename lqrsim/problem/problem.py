@@ -39,11 +39,11 @@ class FixedState:
         ls.FixedState(x=1.0, heading=np.pi)
 
     Args:
-      state: (n,) in the states' units, or a dictionary of name or unit: number; states without one are 0.
-      **named: name of a state -> number, which says the same as a dictionary.
+      state: (n,) in the states' units, or a dictionary of name or unit: number; states without a number are 0.
+      **named: name of a state -> number, in place of a dictionary.
 
     Attributes:
-      state: the numbers, by name until a Problem has it.
+      state: the numbers; they may be by name until a Problem has the state.
 
     Raises:
       InputError: not finite numbers (n,), none at all, or a state that is named twice.
@@ -67,7 +67,7 @@ class FixedState:
     def numbers(self) -> Array:
         """The state (n,). Numbers by name are in no order before a Problem has it."""
         if isinstance(self.state, Mapping):
-            raise InputError("FixedState: got numbers by name, want that of a Problem, as problem.initial")
+            raise InputError("FixedState: got numbers by name, want the state from a Problem: problem.initial")
         return np.asarray(self.state)
 
     def _in(self, dynamics: Dynamics) -> "FixedState":
@@ -84,30 +84,30 @@ class Problem:
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
 
     Attributes:
-      dynamics: whose Runge-Kutta step over `dt`, control held, is g.
+      dynamics: the dynamics. g is their Runge-Kutta step over `dt` with the control held.
       dt: the control period in seconds.
-      steps: T, the number of them.
-      initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
+      steps: T, the number of control periods.
+      initial: c_0, the cost of starting elsewhere than desired (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
-        (lowest, highest); by default the actuators' range. Infinite ones plan as if there were none. Plan and policy
-        keep them exactly, and the policy keeps the actuators', too.
+        (lowest, highest); by default the actuators' range. Infinite limits mean that the plan has none. Plan and policy
+        respect these limits exactly; the policy also respects those of the actuators.
       constraints: conditions that the plan must satisfy at the steps; see `SymbolicConstraint`, `GoalState`,
         `StateBounds` and `Clearance`.
       begin: time in s of the first knot. The positions of moving obstacles are those at time 0.
-      noise: random inputs of the dynamics: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
-        worked out to second order about the plan. None for none.
+      noise: process noise: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation, to second order
+        about the plan. None for a problem without noise.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it is
         risk-averse, below 0 risk-seeking; 0 is the expectation.
-      duration: (shortest, longest) in s: the final time is free. A solve begins with `dt` and `steps`; the solution has
-        as many steps and a dt of its own. The stage cost is still that of each step, whatever dt is. None for the
-        duration that dt and steps say.
-      time_weight: cost of a second of a free duration. It is not in the solution's cost, whose duration is settled.
+      duration: (shortest, longest) in s, for a free final time. A solve begins with `dt` and `steps`. The solution has
+        the same number of steps, and its own dt. The stage cost still counts once per step, whatever dt is. None for
+        the fixed duration steps * dt.
+      time_weight: cost per second of a free duration. The cost of a solution does not include it.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
-        cost that depends on the control, control limits out of order or with nothing of the actuators' range, or a
+        cost that depends on the control, control limits that are out of order or outside the actuators' range, or a
         start that collides.
     """
 
@@ -171,12 +171,12 @@ class Problem:
 
     @property
     def times(self) -> Array:
-        """The times of its knots, (T+1,) in s; see `begin`."""
+        """The times of the knots, (T+1,) in s; see `begin`."""
         return self.begin + self.dt * np.arange(self.steps + 1)
 
     @property
     def moving(self) -> bool:
-        """Whether it changes with the time at which it begins: whether obstacles move."""
+        """Whether the problem depends on the time at which it begins, because obstacles move."""
         return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
@@ -189,14 +189,14 @@ class Problem:
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
         """The rest of the problem after some steps, from a state that is given exactly.
 
-        Unlike a problem that is stated, it may begin within an obstacle: the plan then leads out of it.
+        Unlike a new problem, this one may begin inside an obstacle; the plan then leads out of it.
 
         Args:
           state: (n,).
-          after: how many steps are over.
+          after: number of steps that are over.
 
         Raises:
-          InputError: the state is not one, or no step is left.
+          InputError: the state is not (n,) finite numbers, or no step is left.
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
@@ -213,7 +213,7 @@ class Problem:
         return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
-        """The same with other costs. Like this one, it may begin within an obstacle; see `from_state`.
+        """The problem with other costs. It may begin inside an obstacle if this one does; see `from_state`.
 
         Args:
           stage_cost: the stage cost, or None for the present one.
@@ -228,10 +228,10 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later beginning: moving obstacles are where they are then.
+        """The same problem with a later beginning: moving obstacles are at their positions at that time.
 
         Args:
-          seconds: how much later, in seconds.
+          seconds: the delay in seconds.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
         return other._bound_anew() if self.moving else other
@@ -244,7 +244,7 @@ class Problem:
         return self._with(_terms=self._terms | {"stage_cost": terms}, _constraint_terms=constraints)
 
     def _with(self, **changed: Any) -> "Problem":
-        """The same with other parts, without a check.
+        """The problem with other parts, without checks.
 
         Nothing is checked again: everything was checked before, and this runs at every solve of a re-planning robot.
         """
@@ -254,13 +254,13 @@ class Problem:
 
     @property
     def bytes_per_step(self) -> int:
-        """The least memory that a solver takes for a step, from one start: value functions, laws and trajectories."""
+        """The least memory in bytes of a solver for a step, from one start: value functions, laws and trajectories."""
         n, m = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates)
         return 8 * (3 * n * n + 3 * m * n + 10 * n + 7 * m)
 
     @property
     def start(self) -> Array | None:
-        """The state (n,) that the initial cost or FixedState asks for; None where it names none."""
+        """The state (n,) that the initial cost or FixedState specifies; None if neither does."""
         if isinstance(self.initial, FixedState):
             return self.initial.numbers
         abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
@@ -268,13 +268,13 @@ class Problem:
 
     @property
     def goal(self) -> Array | None:
-        """The state (n,) that the final cost and GoalStates ask for; None where they name none."""
+        """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
         abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
         return self._with_goal_states(abouts[0] if len(abouts) == 1 else None)
 
     @property
     def weighed_goal(self) -> Array | None:
-        """The goal, NaN in states that have neither a weight nor a GoalState; None where it names no state."""
+        """The goal, with NaN for states that have neither a weight nor a GoalState; None if all of it is NaN."""
         abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
         goal = np.full(len(self.dynamics.state_coordinates), np.nan)
         if len(abouts) == 1:
@@ -283,7 +283,7 @@ class Problem:
         return None if goal is None or np.isnan(goal).all() else goal
 
     def _with_goal_states(self, goal: Array | None) -> Array | None:
-        """The goal with what GoalStates ask for; None where some of it is still unknown."""
+        """The goal, completed by the GoalStates; None if some entries are still unknown."""
         stated = goals_of(self.constraints, self.dynamics)
         if goal is None and len(stated) < len(self.dynamics.state_coordinates):
             return None
@@ -294,17 +294,17 @@ class Problem:
 
     @property
     def control_coordinates(self) -> Coordinates:
-        """Names, units and limits of the controls, as they are planned with."""
+        """Names, units and limits of the controls, as used for planning."""
         return self._controls[0]
 
     @property
     def applied_coordinates(self) -> Coordinates:
-        """The same with limits that are also the actuators', as a policy keeps them."""
+        """The same, with limits narrowed to the actuators', as a policy respects them."""
         return self._controls[1]
 
     @property
     def nominal_control(self) -> Array:
-        """u*, where the control cost is zero, (m,); zeros where there is none."""
+        """u*, (m,), at which the control cost is zero; zeros if there is no control cost."""
         abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
         return abouts[0] if abouts else np.zeros(len(self.dynamics.control_coordinates))
 
@@ -396,7 +396,7 @@ class Problem:
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_duration(self) -> None:
-        """Raises InputError if the duration is not as described, or a problem of its kind cannot have one."""
+        """Raises InputError if the duration is not as described, or must not be free for this kind of problem."""
         keep(self, time_weight=check_number("time_weight", self.time_weight, at_least=0.0))
         if self.duration is None:
             if self.time_weight:
@@ -417,10 +417,10 @@ class Problem:
         elif self.moving:
             why = "obstacles that move"
         if why:
-            raise InputError(f"duration: got {low:g} to {high:g} s beside {why}, want None, or a problem without")
+            raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
     def _check_start_clear(self) -> None:
-        """Raises InputError if the robot is in an obstacle where it starts."""
+        """Raises InputError if the robot starts inside an obstacle."""
         found = None if self.start is None else self._inside(self.obstacle_costs, self.start, self.begin)
         if found is not None:
             where, advice = found
@@ -428,8 +428,8 @@ class Problem:
 
     @property
     def goal_inside(self) -> str:
-        """The place of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if it is clear, or
-        is no place.
+        """The position of a goal that is inside an obstacle of a cost or a Clearance, as text; empty if the goal is
+        clear, or is no position.
         """
         goal, end = self.weighed_goal, self.begin + self.steps * self.dt
         found = None if goal is None else self._inside(self.kept_clear, goal, end)

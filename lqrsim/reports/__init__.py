@@ -1,1 +1,1 @@
-"""A stress test as a page."""
+"""Reports of stress tests as web pages."""

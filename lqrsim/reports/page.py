@@ -34,7 +34,7 @@ from lqrsim.view import gl, style
 from lqrsim.view.style import RUNS
 
 SIZE = 5.2, 3.7
-# One for each policy; lines and markers distinguish them in grey.
+# One style for each policy; lines and markers distinguish policies in grey.
 COLOURS = (*RUNS, "#e69f00", "#882255")
 LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -84,7 +84,7 @@ def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: 
     low, value, high = band
     colour = COLOURS[number % len(COLOURS)]
     axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
-    # Curves may coincide: lower ones are wider, with larger markers.
+    # Curves may coincide, so lower curves are wider, with larger markers.
     wide = max(4 - number, 1)
     axes.plot(
         strengths, value, linestyle=LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],
@@ -102,7 +102,7 @@ def _finish(figure: Figure, axes: Axes, curves: Mapping[str, object]) -> None:
     figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * rows))
 
 
-LARGEST = 1_500_000  # bytes of a video
+LARGEST = 1_500_000  # bytes, largest video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first whose video is small enough is taken
 FPS = 15
 
@@ -148,7 +148,7 @@ def _label(one: analysis.Trial) -> str:
 
 
 def _video(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
-    """The video as text, or the reason for which there is none."""
+    """The video as text, or the reason why there is none."""
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 
     try:
@@ -168,7 +168,7 @@ def base64_text(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode("ascii")
 
 
-MOST_VIDEOS = 100  # a page with more is too large for a browser
+MOST_VIDEOS = 100  # a page with more videos is too large for a browser
 
 
 def report(
@@ -183,19 +183,19 @@ def report(
     Args:
       results: the campaign.
       out: FILE.html.
-      videos: number of the worst trials to repeat and render. Without OpenGL the page has none, and says so.
-      progress: called with the numbers of parts that are done and of all parts.
+      videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
+      progress: called with the number of finished parts and the number of all parts.
 
     Returns:
       The path of the page.
 
     Raises:
-      InputError: no trial has been run yet; a file is damaged; `results` was not given a scenario of your own; or the
-        page cannot be written.
+      InputError: no trial has been run yet; a file is damaged; `results` lacks a scenario that is your own function; or
+        the page cannot be written.
     """
     check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
     check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_function("progress", progress, "a function of the numbers of parts that are done and of all", arguments=2)
+    check_function("progress", progress, "a function of the numbers of finished parts and of all parts", arguments=2)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:
@@ -229,7 +229,7 @@ def report(
 
 
 def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, Any]:
-    """All of the page except pictures."""
+    """The whole page except pictures."""
     campaign, manifest = results.campaign, results.manifest
     whole = {cell: one for cell, one in table.items() if len(one) == campaign.trials}
     erred = sum(int((one.outcome == "error").sum()) for one in table.values())
@@ -363,7 +363,7 @@ def _picture(path: Path, *, caption: str, alt: str) -> dict[str, Any]:
 
 
 BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
-WORST_EACH = 3  # trials that are listed for each policy and sweep
+WORST_EACH = 3  # number of trials that are listed for each policy and sweep
 
 
 @dataclass(frozen=True)
@@ -393,14 +393,14 @@ def breaks_table(table: analysis.Table) -> PageTable:
 
 
 def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
-    """A share with its interval, if that has a width."""
+    """A number with its interval, if the interval has a width."""
     if one.low == one.high:
         return f"{scale * one.value:.1f}{unit}"
     return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
 
 
 def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
-    """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is that of tracking errors."""
+    """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is the unit of tracking errors."""
     found = analysis.comparisons(table)
     factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     head = (
@@ -488,7 +488,7 @@ def worst_trials(table: analysis.Table, group: tuple[str, str]) -> list[analysis
 
 
 def worst_table(table: analysis.Table, unit: str) -> PageTable:
-    """The worst trials of each policy and sweep; `unit` is that of tracking errors."""
+    """The worst trials of each policy and sweep; `unit` is the unit of tracking errors."""
     rows = [
         [
             *_cell_names(one.cell), str(one.trial), one.outcome, one.obstacle, f"{one.ended:.2f}",

@@ -1,7 +1,7 @@
 """Arrays by name and one JSON text in a file: NumPy's .npz, with a hash of its content.
 
-A file may come from anyone. Nothing in it is run, nothing is unpacked before its size is known to fit the shape that it
-states, and whatever a parser raises becomes one line.
+A file may come from anyone. Nothing in it is run. Nothing is unpacked before its size is known to fit the stated shape.
+Every exception of a parser becomes a one-line error.
 """
 
 import contextlib
@@ -27,8 +27,8 @@ from lqrsim.results.fields import check_string
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
     """SHA-256 of the concatenated parts, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
 
-    There is no separator, and an array's shape and type do not count: where they may differ, put them before the array
-    as text.
+    There is no separator, and an array's shape and type do not count. If they may differ, put them before the array as
+    text.
     """
     hasher = hashlib.sha256()
     for part in parts:
@@ -36,7 +36,7 @@ def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
             hasher.update(part.encode())
         elif isinstance(part, bytes):
             hasher.update(part)
-        else:  # a view of its bytes, for a copy may be large
+        else:  # a view of its bytes, because a copy may be large
             hasher.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
     return hasher.hexdigest()
 
@@ -44,13 +44,13 @@ def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
 Arrays = dict[str, npt.NDArray[Any]]
 META, DIGEST = "meta", "sha256"
 UNFINISHED = ".unfinished-"  # beginning of the name of a file that is being written
-ABANDONED = 24 * 3600.0  # s after its last change; nothing takes so long to write
+ABANDONED = 24 * 3600.0  # s since the last change of an unfinished file; no file takes so long to write
 
-# The most that is read, in bytes, or relative to the size of the file.
+# Largest amounts that are read, in bytes, or relative to the size of the file.
 _LARGEST_TEXT = 1 << 26
 _LARGE, _TIMES = 1 << 30, 100
-_DEPTH = 6  # nested lists and objects in `anything`
-# NumPy's header of an array of numbers, or of a text; no other is parsed.
+_DEPTH = 6  # largest depth of lists and objects in `anything`
+# NumPy's header of an array of numbers, or of a text; other headers are not parsed.
 _HEADER = re.compile(
     rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
     rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
@@ -58,7 +58,7 @@ _HEADER = re.compile(
 
 
 def parse(text: str | bytes) -> Any:
-    """Parse a JSON text. Raises ValueError if it is none, is nested too deeply, or has a name twice in an object."""
+    """Parse a JSON text. Raises ValueError if it is not JSON, is nested too deeply, or repeats a name in an object."""
     try:
         return json.loads(text, object_pairs_hook=_unique)
     except RecursionError:
@@ -78,7 +78,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
-    """Any JSON value, with a limit to nested lists and objects."""
+    """Any JSON value, with a limit on the depth of lists and objects."""
     if isinstance(value, str):
         return check_string(field, value)
     if isinstance(value, list | dict):
@@ -94,18 +94,18 @@ def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
 
 
 class Header(NamedTuple):
-    """The header of an array: NumPy's name of its numbers, and its shape."""
+    """The header of an array: NumPy's name for the type of its numbers, and the shape."""
 
     dtype: str
     shape: tuple[int, ...]
 
 
 class Other(InputError):
-    """An intact file of another format or version."""
+    """The exception for an intact file of another format or version."""
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
-    """SHA-256 of the JSON text without the hash in it, and of each array with its name, type and shape."""
+    """SHA-256 of the JSON text without its hash, and of each array with its name, type and shape."""
     parts: list[str | npt.NDArray[Any]] = [canonical({name: value for name, value in meta.items() if name != DIGEST})]
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -114,7 +114,7 @@ def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> s
 
 
 def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> None:
-    """Write arrays and text with their hash, all or nothing. Raises InputError if that fails."""
+    """Write arrays and text with their hash, all or nothing. Raises InputError if this fails."""
     text = np.array(canonical({**meta, DIGEST: digest(arrays, meta)}))
     if text.nbytes > _LARGEST_TEXT:
         raise InputError(f"output: got {text.nbytes:,} bytes of text for {path}, want at most {_LARGEST_TEXT:,}")
@@ -125,7 +125,7 @@ def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str,
             with unfinished.open("wb") as file:
                 save(file, allow_pickle=False, **whole)
             if sum(array.nbytes for array in whole.values()) < _limit(unfinished.stat().st_size):
-                break  # otherwise it is compressed so well that reading would refuse it as a zip bomb
+                break  # otherwise the file is compressed so well that reading would refuse it as a zip bomb
 
 
 class Archive:
@@ -142,21 +142,21 @@ class Archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             if name == member.filename or member.orig_filename != member.filename:
-                raise InputError(f"{excerpt(member.orig_filename)}: got a part of that name, want arrays only")
+                raise InputError(f"{excerpt(member.orig_filename)}: got a part that is no array, want arrays only")
             if name in self._members:
-                raise InputError(f"{excerpt(name)}: got it twice, want it once")
+                raise InputError(f"{excerpt(name)}: got two parts of this name, want one")
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or member.flag_bits & 0x1:
-                raise InputError(f"{excerpt(name)}: got another compression, want deflated or stored")
+                raise InputError(f"{excerpt(name)}: got an array in another compression, want it deflated or stored")
             self._members[name] = member
         if META not in self._members:
-            raise InputError(f"{META}: got none, want it")
+            raise InputError(f"{META}: got a file without it, want a file that lqrsim wrote")
         if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
             raise InputError(f"size: got {total:,} bytes, want at most {_limit(size):,} in a file of {size:,}")
         self.headers = {name: self._header(name) for name in self._members if name != META}
         self.meta = self._text()
 
     def arrays(self) -> Arrays:
-        """All arrays. Raises InputError unless the hash of the content is the one in the file."""
+        """All arrays. Raises InputError unless the hash of the content is the hash in the file."""
         found = {name: self._array(name) for name in self.headers}
         if self.meta.get(DIGEST) != digest(found, self.meta):
             raise InputError(f"{DIGEST}: got another hash than that of the content, want an unchanged file")
@@ -173,7 +173,7 @@ class Archive:
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
         if 10 + length + prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
-            raise InputError(f"{excerpt(name)}: got a size that does not fit its shape, want that of {excerpt(shape)}")
+            raise InputError(f"{excerpt(name)}: got a size that does not fit, want the size of {excerpt(shape)}")
         return Header(dtype, shape)
 
     def _text(self) -> dict[str, Any]:
@@ -188,14 +188,14 @@ class Archive:
     def _array(self, name: str) -> npt.NDArray[Any]:
         with self._archive.open(self._members[name]) as file:
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
-            if file.read(1):  # reads to the end, where zipfile compares the check sum
-                raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want as many")
+            if file.read(1):  # reads to the end, where zipfile compares the checksum
+                raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want exactly as many")
         return array
 
 
 @contextlib.contextmanager
 def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
-    """Open a file of this kind, or of any in `versions`; any exception in the block is reported as a fault of the file.
+    """Open a file of this kind, or of any in `versions`. Exceptions in the block are reported as faults of the file.
 
     Raises:
       InputError: the file does not exist, has another kind or version, or is damaged.
@@ -219,9 +219,9 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterato
 def blamed(path: Path, kind: str) -> Iterator[None]:
     """Turn any exception from reading `path` into one line about the file.
 
-    Parsers raise exceptions of all kinds for foreign bytes, so that everything is caught here, and only here.
+    Parsers raise exceptions of all kinds for foreign bytes. Everything is therefore caught here, and only here.
     """
-    if not os.path.isfile(path):  # not the method, which raises for names that are too long
+    if not os.path.isfile(path):  # not the method of Path, which raises for names that are too long
         raise InputError(f"{kind}: got {excerpt_of(path)}, want a file that exists")
     try:
         yield
@@ -244,7 +244,7 @@ def excerpt_of(path: Path) -> str:
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary file to write to, which replaces `path` when the block ends and is removed if the block fails.
 
-    Files that a killed process has left beside it are removed, once they are a day old.
+    Files that a killed process has left in the same folder are removed once they are a day old.
 
     Raises:
       InputError: the folder or the file cannot be written, the disk is full, or `path` is no regular file.
@@ -254,8 +254,8 @@ def replacing(path: Path) -> Iterator[Path]:
     if target.exists() and not target.is_file():
         what = "a folder" if target.is_dir() else "neither a file nor a folder"
         raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a regular file")
-    # A random name, so that two writers do not collide, and known before the file exists, so that Ctrl-C at any moment
-    # removes it. The suffix stays, for writers choose the format by it.
+    # A random name, so that two writers do not collide. It is known before the file exists, so that Ctrl-C at any
+    # moment removes the file. The suffix stays, because writers choose the format by it.
     unfinished = target.parent / f"{UNFINISHED}{secrets.token_hex(8)}{path.suffix}"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -281,5 +281,5 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def _limit(size: int) -> int:
-    """The most bytes that a file of this size may hold."""
+    """The largest number of bytes that a file of this size may hold."""
     return max(_LARGE, _TIMES * size)

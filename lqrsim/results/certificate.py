@@ -1,4 +1,4 @@
-"""A certificate: how often a policy fails, with everything that it takes to measure it again. NumPy only."""
+"""A certificate of how often a policy fails, with everything needed to repeat the measurement. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from lqrsim.results.solution import Solution
 
 @dataclass(frozen=True, kw_only=True)
 class FailureCertificate:
-    """The probability that a policy fails, as multilevel splitting has measured it, and what was measured.
+    """The probability that a policy fails, as measured by multilevel splitting, and a description of the measurement.
 
     Attributes:
-      solution: with the plan.
+      solution: the solution with the plan.
       scenario: reference to the scenario, as in `ReliabilityProblem`.
       sweep: name of the set of disturbances.
       strength: factor by which they are scaled.
@@ -22,14 +22,14 @@ class FailureCertificate:
       design_disturbances: name of the set for which it is designed, or None.
       failure: the event that counts as a failure.
       goal_radius: as in `ReliabilityProblem`.
-      goal_tolerance: likewise.
-      disturbances: a description of each.
+      goal_tolerance: as in `ReliabilityProblem`.
+      disturbances: a description of each disturbance.
       model: hash of the simulated MJCF.
       policy_digest: hash of everything that the controls depend on.
       probability: the estimate.
-      low: lower end of its interval.
-      high: upper end.
-      confidence: of the interval.
+      low: lower end of the interval.
+      high: upper end of the interval.
+      confidence: confidence level of the interval.
       repetitions: the estimate of each repetition, (R,).
       particles: number of trials at each level.
       seed: seed of all random numbers.
@@ -63,8 +63,8 @@ class FailureCertificate:
     def __post_init__(self) -> None:
         check_fields(self)
         if not self.low <= self.probability <= self.high:
-            got = f"{self.probability:g} in an interval from {self.low:g} to {self.high:g}"
-            raise InputError(f"FailureCertificate: probability: got {got}, want it inside")
+            wanted = f"a number from {self.low:g} to {self.high:g}, its interval"
+            raise InputError(f"FailureCertificate: probability: got {self.probability:g}, want {wanted}")
         mean = float(self.repetitions.mean()) if len(self.repetitions) > 1 else -1.0
         if abs(mean - self.probability) > 1e-9 * self.probability:
             raise InputError(
@@ -73,7 +73,7 @@ class FailureCertificate:
             )
 
     def summary(self) -> str:
-        """Lines that say what was measured, and the probability."""
+        """Lines that describe the measurement, and the probability."""
         interval = f"{100 * self.confidence:g} % interval, {len(self.repetitions)} repetitions"
         return (
             f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}; failure: {self.failure}\n"

@@ -33,7 +33,7 @@ PerEntry = npt.ArrayLike | Mapping[str, float]
 Limits = tuple[npt.ArrayLike, npt.ArrayLike] | Mapping[str, tuple[float, float]]
 
 _FROM_ABOVE = ("xy", "yx")
-_UNITS = {  # what distances to obstacles and whole turns are counted in
+_UNITS = {  # units of distances to obstacles and of whole turns
     "position": ("m", "for a position"),
     "angles": ("rad", "for an angle, whose whole turns are 2 pi"),
     "rotation_vectors": ("rad", "for a rotation vector"),
@@ -50,10 +50,11 @@ class Coordinates:
       units: units of the entries; "" for none. A position is in m, angles and rotation vectors in rad.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
-        without a position, and two of x, y and z for a planar one. By default it follows from names that end in these
-        letters or have one standing alone, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" if no name tells it.
-      offset: place of the plane along the third axis, in metres: the y of "xz". A vertical plane has an offset, 0 by
-        default. A horizontal one has none by default: the world is then seen from above. See `World.seen_by`.
+        without a position, and two of x, y and z for a planar position. By default it follows from names that end in
+        these letters or have such a letter standing alone, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" if no
+        name tells it.
+      offset: coordinate of the plane along the third axis, in metres: the y of "xz". A vertical plane has an offset, 0
+        by default. A horizontal plane has none by default: the world is then seen from above. See `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
       low: lower limit of each entry, (len(names),); -inf where there is none.
@@ -165,7 +166,7 @@ class Coordinates:
 
     @property
     def from_above(self) -> bool:
-        """Whether the position is in a horizontal plane without a height: that of the ground under the robot."""
+        """Whether the position is in a horizontal plane without a height: the ground under the robot."""
         return len(self.position) == 2 and self.offset is None
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
@@ -173,10 +174,10 @@ class Coordinates:
 
         Args:
           places: (..., d), d position coordinates in metres.
-          height: in metres, of positions in a horizontal plane without a height.
+          height: height in metres of positions in a horizontal plane without a height.
 
         Raises:
-          InputError: not numbers of such a shape, or there is no position.
+          InputError: the places are not numbers of this shape, or there is no position.
         """
         height = check_number("height", height)
         if not self.position:
@@ -193,7 +194,7 @@ class Coordinates:
           points: (..., 3), in metres.
 
         Raises:
-          InputError: not numbers of such a shape.
+          InputError: the points are not numbers of this shape.
         """
         return vectors_of("points", points, 3)[..., list(self.world_axes)]
 
@@ -210,7 +211,7 @@ class Coordinates:
           near: (..., n); leading dimensions broadcast.
 
         Raises:
-          InputError: not numbers of such shapes.
+          InputError: the arguments are not numbers of these shapes.
         """
         out, near = vectors_of("vector", vector, len(self)), vectors_of("near", near, len(self))
         try:
@@ -236,21 +237,21 @@ class Coordinates:
     def _by_name(
         self, field: str, given: Mapping[str, object], check: Callable[[str, object], _Value]
     ) -> dict[int, _Value]:
-        """What is given by name or by unit, by the index of the entry; a name wins over a unit.
+        """Values that are given by name or by unit, by the index of the entry. A name takes precedence over a unit.
 
         Args:
           field: of the message.
-          given: name of an entry, or a unit -> what is said of it, or of all entries in this unit.
+          given: name of an entry, or a unit -> the value for it, or for all entries in this unit.
           check: a function of a field and a value, which returns the value, or raises.
 
         Returns:
-          Index of each entry that is named -> what `check` returned.
+          Index of each entry that is named -> the value that `check` returned.
 
         Raises:
           InputError: there is no such name or unit.
         """
         units, found = set(self.units) - {""} - set(self.names), {}
-        for key in sorted(given, key=lambda key: key not in units):  # units first, so that names win
+        for key in sorted(given, key=lambda key: key not in units):  # units first, so that names take precedence
             check_name(field, key, [*self.names, *sorted(units)])
             value = check(f"{field}: {excerpt(key)}", given[key])
             told = self.units if key in units else self.names
@@ -258,7 +259,7 @@ class Coordinates:
         return found
 
     def _numbers(self, field: str, given: Mapping[str, float]) -> Array:
-        """Numbers by name or by unit as an array (n,), 0 where none is given.
+        """Numbers by name or by unit as an array (n,), with 0 for entries without a number.
 
         Args:
           field: of the message.
@@ -279,8 +280,8 @@ class Coordinates:
         """The same coordinates with other limits.
 
         Args:
-          limits: (lowest, highest), each a number or (n,); or a dictionary of name or unit: (lowest, highest), which
-            leaves the other entries their limits.
+          limits: (lowest, highest), each a number or (n,); or a dictionary of name or unit: (lowest, highest). Entries
+            that are not named keep their limits.
 
         Raises:
           InputError: a limit is not a number, the lower is not below the upper, or there is no such name.
@@ -292,7 +293,7 @@ class Coordinates:
         else:
             try:
                 low, high = (np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in limits)
-            except Exception:  # no pair, no numbers, another number of them
+            except Exception:  # not a pair, not numbers, or the wrong number of them
                 wanted = f"(lowest, highest), each a number or ({len(self)},), or such pairs by name"
                 raise InputError(f"control_limits: got {excerpt(limits)}, want {wanted}") from None
         for name, lowest, highest in zip(self.names, low, high, strict=True):
@@ -306,7 +307,7 @@ class Coordinates:
         """The same coordinates with the narrower of both limits.
 
         Args:
-          other: coordinates of as many entries.
+          other: coordinates with the same number of entries.
 
         Raises:
           InputError: the numbers of entries differ, or nothing is within both limits.
@@ -365,7 +366,7 @@ def _pair(field: str, given: object) -> tuple[float, float]:
 
 
 def _letter(name: str) -> str:
-    """The axis in a name: the letter x, y or z at its end, or alone in it; `?` if none."""
+    """The axis in a name: the letter x, y or z at its end, or standing alone; `?` if there is none."""
     if name[-1:].lower() in tuple(SPACE):
         return name[-1].lower()
     alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))
@@ -373,10 +374,10 @@ def _letter(name: str) -> str:
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:
-    """The one of the equal rotations `(angle + 2 pi k) axis` that is nearest to `near`; both (..., 3)."""
+    """The rotation nearest to `near` among the equal rotations `(angle + 2 pi k) axis`; both (..., 3)."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     distance = np.linalg.norm(near, axis=-1, keepdims=True)
-    # The identity has every axis: take the one that `near` points along.
+    # The identity has every axis; take the axis that `near` points along.
     small = angle < 1e-12
     axis = np.where(small, near / np.where(distance > 0, distance, 1.0), vector / np.where(small, 1.0, angle))
     turns = np.round((np.sum(axis * near, axis=-1, keepdims=True) - angle) / (2 * np.pi))

@@ -1,7 +1,7 @@
 """Policies as C99, for a microcontroller. The texts are in `templates/c/`; here they get their numbers.
 
-The laws are written about their nominal states, `planned + gain (state - nominal)`, which is the same as `gain state +
-offset`: rounding, to float or to 16 bits, then acts on deviations only.
+The laws are written about their nominal states, `planned + gain (state - nominal)`, which equals `gain state + offset`.
+Rounding to float or to 16 bits then acts on deviations only.
 """
 
 import os
@@ -25,10 +25,10 @@ from lqrsim.results.save_load import hash_of
 from lqrsim.results.solution import Solution
 
 TEMPLATES = Path(__file__).parent.parent / "templates" / "c"
-PREFIX = "my_policy"  # in the templates
+PREFIX = "my_policy"  # the name in the templates
 STATIC = ("CMakeLists.txt", "main.c", "stm32f405.c", "stm32f405.ld")
-LARGEST = 32767  # of 16 bits
-# What main.c allows, relative to the largest sum of magnitudes in a command: well above rounding, which is about 1e-15
+LARGEST = 32767  # largest integer in 16 bits
+# The tolerance of main.c, relative to the largest sum of magnitudes in a command: well above rounding, about 1e-15
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
 SHARES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
 NUMBERS, GAINS = ("float", "double"), ("full", "int16")
@@ -37,15 +37,15 @@ DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
 
 @dataclass(frozen=True, kw_only=True)
 class ExportedC:
-    """What `export_c` wrote.
+    """The result of `export_c`.
 
     Attributes:
-      files: their paths.
-      sha256: of the policy's content, as in its file; the header has it, too.
-      table_bytes: of the constant tables.
-      rounding: how far rounding the gains changes each control at most, where every state, with those of the filter, is
-        off its nominal by one of its unit; (m,), in the controls' units.
-      controls: their names and units.
+      files: paths of the files.
+      sha256: hash of the policy's content, as in its file; it is also in the header.
+      table_bytes: size of the constant tables.
+      rounding: (m,), the largest change of each control by rounding the gains, in the control's unit, if every state,
+        including the filter's, is off its nominal value by one unit.
+      controls: names and units of the controls.
     """
 
     files: tuple[Path, ...]
@@ -58,7 +58,7 @@ class ExportedC:
         check_fields(self)
 
     def summary(self) -> str:
-        """Lines on the files, and on the largest errors of the commands."""
+        """A summary of the files and of the largest errors of the commands."""
         lines = [f"SHA-256 {self.sha256}, tables of {self.table_bytes:,} bytes", f"{OFF}:"]
         return "\n".join([*lines, *_bounds(self.controls, self.rounding)])
 
@@ -77,18 +77,18 @@ def export_c(
         ls.export_c(solution, "firmware/policy")
         ls.export_c(ls.OffsetFree(problem, solution, uncertainty).policy, "firmware/policy", gains="int16")
 
-    `NAME.h` declares `NAME_init()` and `NAME_step(measured, t, command)`, `NAME.c` needs `math.h` alone and allocates
-    nothing. The commands are those that the policy computes in Python, angles, limits and the time after the horizon
-    included. `main.c` compares some with Python's.
+    `NAME.h` declares `NAME_init()` and `NAME_step(measured, t, command)`. `NAME.c` needs only `math.h` and allocates
+    nothing. The commands are those that the policy computes in Python, including angles, limits and the time after the
+    horizon. `main.c` compares some commands with Python's.
 
     Args:
-      policy: of a solution; of `track`; or with a filter, as `OffsetFree(...).policy`. A controller that solves while
-        it runs, or a function, cannot be exported.
-      folder: for the files. Files of these names are replaced.
-      number: "float" or "double", of all but the time.
+      policy: a Solution, whose policy is exported; a policy, as from `track`; or a policy with a filter, as
+        `OffsetFree(...).policy`. A controller that solves while it runs, or a function, cannot be exported.
+      folder: the folder for the files. Files of these names are replaced.
+      number: the type of all numbers except the time, "float" or "double".
       gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
       interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
-      name: of the files and the functions: small letters, digits and underscores, a letter first.
+      name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter.
 
     Raises:
       InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
@@ -100,7 +100,7 @@ def export_c(
     folder, number = check_path("folder", folder, "the path of a folder"), check_name("number", number, NUMBERS)
     gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
-        raise InputError(f"name: got {excerpt(name)}, want small letters, digits and underscores, such as policy")
+        raise InputError(f"name: got {excerpt(name)}, want lower-case letters, digits and _, such as policy")
     law = policy.policy if isinstance(policy, Solution) else policy
     if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")
@@ -138,14 +138,14 @@ def export_c(
     )  # fmt: skip
 
 
-# The template of the source, and what the header says.
+# The template of the source, and the text of the header.
 FEEDBACK = {"source": "feedback.c", "what": "A feedback law", "lost": "", "or": ", or measured is NULL"}
 FILTER = {
     "source": "filter.c", "what": "A filter and the law of its estimates",
     "or": ", or my_policy_init()\n * has not been called",
     "lost": " NULL if the\n * measurement got lost; it is predicted then. Call it once in each control period.",
 }  # fmt: skip
-# What feedback.c does between two knots.
+# The behaviour of feedback.c between two knots.
 HELD = {"blend": "", "near": "NOMINAL(k, j)", "wanted": "law(k, i, state)"}
 BLENDED = {
     "blend": """    const int next = k + 1 < MY_POLICY_STEPS ? k + 1 : k;
@@ -161,9 +161,9 @@ class _Tables:
     """The constant tables of a policy, as C text.
 
     Attributes:
-      bytes: of all.
-      rounding: by the name of a table of matrices (T, rows, columns), the sum over the columns of the largest rounding
-        error of each entry, (rows,).
+      bytes: size of all tables.
+      rounding: name of a table of matrices (T, rows, columns) -> the sum over the columns of the largest rounding error
+        of each entry, (rows,).
       share: the largest rounding error of an entry, relative to the entry's largest magnitude over the steps.
     """
 
@@ -175,7 +175,7 @@ class _Tables:
     def add(self, name: str, array: Array) -> None:
         """Add a table (T, rows) or (T, rows, columns), read by a macro: NAME(k, i, j).
 
-        Entries that are the same in all steps, such as those of a filter's unknowns, are stored once.
+        Entries that are the same in all steps, such as the entries of a filter's unknowns, are stored once.
         """
         if not np.isfinite(array).all():
             raise InputError(f"policy: {name}: got NaN or infinity in it, want finite numbers")
@@ -209,7 +209,7 @@ class _Tables:
             self.share = max(self.share, float(shares.max()))
 
     def plain(self, name: str, array: Array) -> None:
-        """Add an array of numbers that the type holds."""
+        """Add an array of numbers that fit the type."""
         self._write(name, array, "real")
 
     def text(self) -> str:
@@ -243,7 +243,7 @@ class _Tables:
 
 
 def _number(value: float, number: str) -> str:
-    """A number in C, which reads as the same bits."""
+    """A number in C that reads as the same bits."""
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     return f"{np.float32(value)!s}f" if number == "float" else repr(float(value))
@@ -254,7 +254,7 @@ def _list(parts: Iterable[str]) -> str:
 
 
 def _values(law: AffinePolicy | OutputFeedbackPolicy) -> dict[str, Array]:
-    """The tables by name: of a filter as in filter.c, of any other law as in feedback.c."""
+    """The tables by name: for a filter as in filter.c, for any other law as in feedback.c."""
     nominal, n = law.nominal, len(law.state_coordinates)
     planned = law.offset + np.einsum("tij,tj->ti", law.gain, nominal)
     values = {"planned": planned, "gain": law.gain, "nominal": nominal}
@@ -279,7 +279,7 @@ def _limits(controls: Coordinates, dtype: npt.DTypeLike) -> tuple[Array, Array]:
 
 
 def _nearest(law: AffinePolicy | OutputFeedbackPolicy, number: str) -> str:
-    """The functions that take angles and rotation vectors nearest to others."""
+    """The C functions that replace angles and rotation vectors by the representatives nearest to others."""
     spaces = {"nearest_state": law.state_coordinates}
     if isinstance(law, OutputFeedbackPolicy):
         spaces["nearest_measured"] = law.measured_coordinates
@@ -297,7 +297,7 @@ def _nearest(law: AffinePolicy | OutputFeedbackPolicy, number: str) -> str:
 
 
 def _comment(text: str) -> str:
-    """Text of anyone for a comment in C: plain ASCII that neither ends the comment nor looks like a trigraph."""
+    """Any text, made safe for a comment in C: plain ASCII that neither ends the comment nor looks like a trigraph."""
     return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)", " ", re.sub(r"[^ -~]|[?\\]", "_", text))
 
 
@@ -324,7 +324,7 @@ def _rounding_text(law: AffinePolicy | OutputFeedbackPolicy, tables: _Tables, nu
     return "\n * ".join(map(_comment, lines))
 
 
-# What `rounding` bounds.
+# The quantity that `rounding` bounds.
 OFF = """Rounding the gains changes each command by at most this, where everything that they multiply is off its nominal
 value by 1 in its unit"""
 
@@ -354,7 +354,7 @@ def _rows(
     times = np.arange(12.0) if isinstance(law, OutputFeedbackPolicy) else np.abs(periods)
     z = law.start() if isinstance(law, OutputFeedbackPolicy) else law.nominal[0]
     expected = values.get("expected", law.nominal)
-    # A filter takes the spread of its measurements for fast motion, so that it is smaller here.
+    # A filter interprets the spread of its measurements as fast motion, so the spread is smaller here.
     spread = np.minimum(0.1 * np.ptp(expected, axis=0) + 0.01, 0.3) / (100 if "expected" in values else 1)
     for place, period in enumerate(times):
         t, k = float(period) * law.dt, min(int(period), law.steps - 1)

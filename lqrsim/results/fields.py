@@ -9,7 +9,7 @@
         def __post_init__(self) -> None:
             check_fields(self)
 
-A letter is a size: the same one throughout a record and the records in it; `...` is any number of dimensions, `_` any
+A letter is a size, the same throughout a record and the records in it. `...` means any number of dimensions, `_` any
 size. The letter of a tuple, or of `Coordinates`, is its length.
 """
 
@@ -39,7 +39,7 @@ Sizes = dict[str, int]
 
 LINE = 1000  # characters of a name or another line
 Line = Annotated[str, LINE]  # one printable line
-LARGEST_COUNT = 2**128 - 1  # of a seed
+LARGEST_COUNT = 2**128 - 1  # the largest seed
 
 
 class Bounds(NamedTuple):
@@ -58,11 +58,11 @@ class Declared(NamedTuple):
     """The content of a field's annotation.
 
     Attributes:
-      kinds: the kinds that are allowed; `typing`'s names.
-      dtype: type of an array, float64 or int64; None for anything else.
-      letters: the shape of an array, or the length of something else; empty where none is given.
+      kinds: the allowed types, as `typing` names them.
+      dtype: type of an array, float64 or int64; None if it is no array.
+      letters: the shape of an array, or the length of something else; empty if not given.
       longest: characters of a text that is one printable line; None for any text.
-      optional: whether it may be None.
+      optional: whether the field may be None.
     """
 
     kinds: tuple[Any, ...]
@@ -74,7 +74,7 @@ class Declared(NamedTuple):
 
 
 def check_fields(record: Any) -> Sizes:
-    """Check the fields of a record and keep them as their annotations say: arrays as float64, tuples as tuples.
+    """Check the fields of a record and convert them as annotated: arrays to float64, sequences to tuples.
 
     Returns:
       The sizes, by letter.
@@ -94,7 +94,7 @@ def check_fields(record: Any) -> Sizes:
 
 @cache
 def declarations(kind: type) -> dict[str, Declared]:
-    """The declaration of each field of a record, except those that are no part of its value (`compare=False`)."""
+    """The declaration of each field of a record, except fields that are no part of its value (`compare=False`)."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: declared(hints[field.name]) for field in fields(kind) if field.compare}
 
@@ -125,7 +125,7 @@ def declared(annotation: Any) -> Declared:
 
 @cache
 def _in_order(kind: type) -> list[tuple[str, Declared]]:
-    """Records first, which define sizes, then arrays, then optional records and tuples of a length."""
+    """Sort key: records first, which define sizes, then arrays, then optional records and tuples of a length."""
 
     def order(item: tuple[str, Declared]) -> int:
         said = item[1]
@@ -136,7 +136,7 @@ def _in_order(kind: type) -> list[tuple[str, Declared]]:
 
 
 def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
-    """The value as it is declared. Raises InputError for another."""
+    """The value as declared. Raises InputError for other values."""
     kind, bounds = said.kinds[0], said.bounds
     if value is None and said.optional:
         return None
@@ -179,7 +179,7 @@ def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
 
 
 def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
-    """Raises InputError unless a record's sizes are those that are known; others become known by it."""
+    """Raises InputError unless a record's sizes agree with the known sizes; its other sizes become known."""
     for name, said in declarations(type(record)).items():
         value, inner = getattr(record, name), f"{field}.{name}"
         if value is None or said.letters.startswith("..."):
@@ -213,13 +213,13 @@ def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) 
 
 
 def _length_of(letter: str, sizes: Sizes) -> str:
-    """The length that a letter stands for, such as 151 for T+1; the letter itself where it is not known."""
+    """The length that a letter stands for, such as 151 for T+1; the letter itself if its size is unknown."""
     name, _, more = letter.partition("+")
     return str(sizes[name] + int(more or 0)) if name in sizes else letter
 
 
 def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:
-    """Raises InputError unless something has the number of entries that the letter stands for."""
+    """Raises InputError unless the number of entries is the size that the letter stands for."""
     if length != (want := sizes.setdefault(letter, length)):
         raise InputError(f"{field}: got {length} entries, want {want}")
 
@@ -258,7 +258,7 @@ def check_string(field: str, value: Any, longest: int | None = None) -> str:
     Lines are printed as they are, and a terminal obeys control characters.
 
     Raises:
-      InputError: it is not.
+      InputError: it is no such text.
     """
     if not isinstance(value, str):
         raise InputError(f"{field}: got {excerpt(value)}, want text")

@@ -1,4 +1,4 @@
-"""A funnel: the states about a plan from which a policy succeeds, at which rate, with which confidence. NumPy only."""
+"""A funnel: the states about a plan from which a policy succeeds at a certified rate. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -33,10 +33,10 @@ FLAT = 1e-13  # smallest eigenvalue of a shape scaled to a unit diagonal, below 
 class Funnel:
     """Ellipsoids about a plan, at some knots, from which runs succeed at a stated rate.
 
-    The ellipsoid at a knot is `{plan + e: e' shape^-1 e <= level^2}`. The rate is the share of runs that succeed, over
-    states drawn uniformly from the volume of the ellipsoid and over the disturbances. With the stated confidence it is
-    at least `rate` at all knots at once. It says nothing about a single state, nor about other knots, where the level
-    is interpolated; see `level`.
+    The ellipsoid at a knot is `{plan + e: e' shape^-1 e <= level^2}`. The rate is the fraction of runs that succeed,
+    over states drawn uniformly from the volume of the ellipsoid and over the disturbances. With the stated confidence
+    it is at least `rate` at all knots at once. This says nothing about a single state, nor about other knots, where the
+    level is interpolated; see `level`.
 
     T steps, n states, k knots; d of the states may be off the plan, all others are on it.
 
@@ -49,16 +49,16 @@ class Funnel:
       family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
         deviation; "tube", the predicted covariance, so that levels are standard deviations; or "given".
       knots: (k,), in order.
-      levels: (k,), 0 where there is none.
-      trials: (k,) fresh trials that certify the level; 0 where there is none.
-      successes: (k,), of these trials. They must show the rate with the confidence.
-      reasons: (k) why a level is 0, or why no larger one was tried; otherwise empty.
-      rate: required share of runs that succeed.
+      levels: (k,), the level at each knot; 0 if none was certified.
+      trials: (k,) fresh trials that certify the level; 0 if the level is 0.
+      successes: (k,), successes of these trials. They must show the rate with the confidence.
+      reasons: (k) why a level is 0, or why no larger level was tried; otherwise empty.
+      rate: required fraction of runs that succeed.
       confidence: required confidence that all levels are right.
-      simulated: trials that were run in all.
+      simulated: total number of trials that were run.
       policy_digest: hash of the controller.
       goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
-      disturbances: a description of each.
+      disturbances: a description of each disturbance.
       seed: seed of all random numbers.
       options: the settings of the search.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
@@ -170,7 +170,7 @@ class Funnel:
     def contains(self, x: npt.ArrayLike, t: float, *, about: npt.ArrayLike | None = None) -> npt.NDArray[np.bool_]:
         """Whether states (..., n) are in the funnel `t` seconds after the start of the plan, (...).
 
-        Where the level is 0, no state is.
+        If the level is 0, no state is in the funnel.
 
         Args:
           x: (..., n).
@@ -184,7 +184,7 @@ class Funnel:
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
 
     def left_at(self, rollout: Rollout) -> Array:
-        """The time at which each run first left the funnel, (K,), in seconds; infinite where it never did.
+        """The time at which each run first left the funnel, (K,), in seconds; infinite if it never did.
 
         Args:
           rollout: K trials of the funnel's plan.
@@ -194,17 +194,20 @@ class Funnel:
         """
         check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan, want a run of the funnel's plan")
+            raise InputError("rollout: got a run of another plan, want a run of the funnel's plan")
         inside = np.array([self.contains(rollout.states[:, i], t) for i, t in enumerate(self.plan.times)])
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 
     def states_at(self, knot: int, points: npt.ArrayLike, level: float) -> Array:
-        """The states (..., n) in the ellipsoid of a level at a knot, of points (..., d) of the unit ball.
+        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
 
         Args:
           knot: number of the knot.
           points: (..., d).
           level: level of the ellipsoid.
+
+        Returns:
+          The states (..., n).
 
         Raises:
           InputError: there is no such knot, the points have another shape, or the ellipsoid is flat.
@@ -217,7 +220,7 @@ class Funnel:
 
     @property
     def position_covariance(self) -> Array:
-        """(T+1, p, p) in m^2: its one-sigma ellipsoids are the funnel's projection onto the position.
+        """Matrices (T+1, p, p) in m^2 whose one-sigma ellipsoids are the funnel's projection onto the position.
 
         Raises:
           InputError: the robot has no position, or not all of it is among `states`.
@@ -237,7 +240,7 @@ class Funnel:
         return sha256(texts, self.plan.states, self.shape, self.knots, self.levels)[:16]
 
     def summary(self) -> str:
-        """A line for each knot: its level, its extent along the states, and the trials that certify it."""
+        """A line for each knot: its level, the extent along the states, and the trials that certify the level."""
         meant = {"cost_to_go": "level^2/2 is cost", "tube": "levels are standard deviations"}.get(self.family, "")
         of = "all states" if len(self.states) == len(self.state_coordinates) else ", ".join(self.states)
         lines = [
@@ -265,7 +268,7 @@ class Funnel:
 
     @cached_property
     def _inverse(self) -> Array:
-        """(T+1, d, d); NaN where the shape is flat."""
+        """The inverse shapes, (T+1, d, d); NaN if the shape is flat."""
         inverse = np.full(self.shape.shape, np.nan)
         for knot in range(len(self.shape)):
             if not flat(self.shape[knot]):
@@ -297,5 +300,5 @@ def inverse_of(matrix: Array) -> Array:
 def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:
     """The chance of at most this number of failures in independent trials that succeed at this rate."""
     i = np.arange(failures)
-    ratios = np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)  # of successive terms
+    ratios = np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)  # ratios of successive terms
     return float(np.exp(trials * np.log(rate) + np.concatenate([[0.0], np.cumsum(ratios)])).sum())

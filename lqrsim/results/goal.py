@@ -1,7 +1,8 @@
 """The goal of a trial, its distance from goal and plan, and how it ended, for every robot. NumPy only.
 
-Distances are in metres for robots with a position. For all others they are a scaled error: the largest difference among
-the states that count, each relative to the state's range along the plan (at least 1 unit), whole turns left out.
+Distances are in metres for robots with a position. For other robots they are a scaled error: the largest difference
+among the states that count, each relative to the state's range along the plan (at least 1 unit). Whole turns are left
+out.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from lqrsim.errors import Array, InputError, check_number, excerpt, keep, shaped
 from lqrsim.results.coordinates import Coordinates
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
-TOLERANCE = 0.1  # of the scaled error, by default
-STAYS = 1e-3  # of a radius: what begins closer to its goal stays there
+TOLERANCE = 0.1  # default tolerance of the scaled error
+STAYS = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
 OF_RANGE = "of the plan's range"
 
 
@@ -24,7 +25,7 @@ def scale_of(plan: Array) -> Array:
 
 
 def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
-    """Distance (..., T+1) of states (..., T+1, n) from those of a plan (T+1, n), in `tracking_unit`."""
+    """Distance (..., T+1) of states (..., T+1, n) from the states of a plan (T+1, n), in `tracking_unit`."""
     if space.position:
         place = list(space.position)
         return np.linalg.norm(states[..., place] - plan[..., place], axis=-1)
@@ -38,11 +39,11 @@ def tracking_unit(space: Coordinates) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """The goal of a run, or the end of its plan where the final cost names no goal.
+    """The goal of a run, or the end of its plan if the final cost names no goal.
 
     Args:
       space: space of the states.
-      goal: (n,), NaN in the states that do not count; None if there is none.
+      goal: (n,), NaN in the states that do not count; None without a goal.
       plan: (T+1, n), the planned states.
 
     Attributes:
@@ -77,7 +78,7 @@ class Target:
 
     @property
     def places(self) -> list[int]:
-        """Indices of the position that count; none where the distance is a scaled error."""
+        """Indices of the position that count; none if the distance is a scaled error."""
         return [i for i in self.space.position if np.isfinite(self.state[i])]
 
     @property
@@ -91,7 +92,8 @@ class Target:
         if self.places:
             return np.linalg.norm(states[..., self.places] - state[self.places], axis=-1)
         counts = np.isfinite(state)
-        # States that do not count keep their value, for the turns of a rotation vector follow from all three entries.
+        # States that do not count keep their value, because the turns of a rotation vector follow from all three
+        # entries.
         apart = self.space.difference(states, np.where(counts, state, states)) / scale_of(self.plan)
         return np.max(np.abs(apart[..., counts]), axis=-1)
 
@@ -99,13 +101,13 @@ class Target:
         """The distance within which the target counts as reached.
 
         Args:
-          robot_radius: of the robot in metres; the default goal radius where distances are in metres, see
+          robot_radius: radius of the robot in metres; the default goal radius if distances are in metres, see
             `on_the_way`.
-          goal_radius: in metres.
+          goal_radius: radius in metres.
           goal_tolerance: bound of the scaled error, by default TOLERANCE; see `on_the_way`.
 
         Raises:
-          InputError: one of them is out of range, or is not in the unit of this target.
+          InputError: a radius or tolerance is out of range, or is not in the unit of this target.
         """
         if self.places:
             if goal_tolerance is not None:
@@ -131,9 +133,9 @@ class Target:
         return self.on_the_way(TOLERANCE) if radius is None and not self.places else radius
 
     def on_the_way(self, radius: float) -> float:
-        """A radius; where the plan starts within it, a tenth of the way, so that the start has not reached the target.
+        """The radius; if the plan starts within it, a tenth of the way, so that the start has not reached the target.
 
-        A plan that starts at its target, within a thousandth of the radius, has no way, and keeps the radius.
+        A plan that starts at its target, within a thousandth of the radius, keeps the radius.
         """
         way = float(self.distance(self.plan[0]))
         return TOLERANCE * way if STAYS * radius < way <= radius else radius
@@ -147,9 +149,9 @@ class Target:
         return radius is not None and not float(self.distance(self.plan[-1])) <= radius
 
     def of_plan(self, radius: float | None) -> list[str]:
-        """Lines on the end of the plan: its distance from the goal, and another line if it misses.
+        """Lines on the end of the plan: its distance from the goal, and another line if the plan misses the goal.
 
-        Without a radius it misses if it ends farther from the goal than a tenth of the way from its start.
+        Without a radius, a plan misses if it ends farther from the goal than a tenth of the way from its start.
         """
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
@@ -163,7 +165,7 @@ class Target:
         return lines
 
     def _worst(self) -> str:
-        """Which state of the plan's end is farthest from a target without a position."""
+        """Text that names the state at the plan's end that is farthest from a target without a position."""
         if self.places:
             return ""
         end = self.plan[-1]
@@ -175,12 +177,13 @@ class Target:
 def endings(
     *, collided_at: Array, diverged_at: Array, failed_at: Array, distance: Array, radius: float, horizon: float
 ) -> tuple[npt.NDArray[np.str_], Array]:
-    """How trials ended, and when. The first event ends a trial; later ones do not count.
+    """The outcomes of trials and their times. The first event ends a trial; later events do not count.
 
     Args:
-      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. If events happen at the same
-        time, the one named first counts.
-      distance: (K,) from the target at the end. radius: within which it counts as reached. horizon: in seconds.
+      collided_at, diverged_at, failed_at: (K,) seconds, infinite for events that did not happen. If events happen at
+        the same time, the event named first counts.
+      distance: (K,) distance from the target at the end. radius: distance within which the target counts as reached.
+      horizon: in seconds.
 
     Returns:
       one of OUTCOMES for each trial, (K,), and the time in seconds at which it ended, (K,).

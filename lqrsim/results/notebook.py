@@ -1,6 +1,6 @@
 """HTML of results for notebooks: a heading, a table and a drawing. NumPy only.
 
-All text is escaped, for names come from files that anyone may have written.
+All text is escaped, because names come from files that anyone may have written.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
     from lqrsim.results.solution import Solution
 
-WIDTH, HEIGHT, MARGIN = 360, 240, 12  # of a drawing, in pixels
-POINTS = 300  # of a line at most
-MOST = 10  # trials in the table, and lines in the drawing
+WIDTH, HEIGHT, MARGIN = 360, 240, 12  # size of a drawing in pixels
+POINTS = 300  # largest number of points of a line
+MOST = 10  # largest number of trials in the table, and of lines in the drawing
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
 
 
@@ -65,7 +65,7 @@ def _number(value: float) -> str:
 def of_table(
     heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], picture: str = "", *, head: bool = True
 ) -> str:
-    """A heading, remarks, and a table with a picture beside it.
+    """A heading, remarks, and a table next to a picture.
 
     Args:
       rows: rows of the table.
@@ -84,9 +84,9 @@ def of_table(
 
 
 def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
-    """The plan (T+1, n) and runs (K, T+1, n) as SVG: paths along the first two axes of the position, of MOST runs.
+    """The plan (T+1, n) and runs (K, T+1, n) as SVG: paths of MOST runs along the first two axes of the position.
 
-    Without a position, the states of the plan and of the first run over time, each to its own scale.
+    Without a position, it shows the states of the plan and of the first run over time, each to its own scale.
     """
     dashes = "4 3" if len(runs) else ""
     if space.position:
@@ -111,7 +111,7 @@ def _cell(text: str, *, named: bool) -> str:
 
 
 def _range(values: Array) -> tuple[Array, Array]:
-    """The smallest and the largest finite value of each column, kept apart by a little."""
+    """The smallest and the largest finite value of each column, kept slightly apart."""
     finite = np.where(np.isfinite(values), values, np.nan)
     known = np.isfinite(finite).any(axis=0)
     finite = np.where(known, finite, 0.0)

@@ -18,7 +18,7 @@ from lqrsim.results.fields import Bounds, check_fields
 
 @dataclass(frozen=True, kw_only=True)
 class OutputFeedbackPolicy:
-    """Output feedback about a plan, from measurements to controls; its whole state is one vector z.
+    """Output feedback about a plan, from measurements to controls. Its entire state is one vector z.
 
     In each control period t, with x the first n numbers of z and y the measurement,
 
@@ -26,14 +26,14 @@ class OutputFeedbackPolicy:
         u = clip(gain_t z + offset_t)
         z = transition_t z + input_t u + drift_t
 
-    Before, angles of x are taken nearest to the nominal ones, and angles of y nearest to the expected ones. z begins as
-    nominal_0.
+    Before that, angles of x are replaced by the representatives nearest to the nominal angles, and angles of y by those
+    nearest to the expected angles. z begins as nominal_0.
 
     Attributes:
       gain: (T, m, Z); u = clip(gain z + offset).
       offset: (T, m).
       correction: the filter's gain, (T, Z, Y).
-      sensor: (T, Y, n), of the state: the measurement is sensor x + sensor_offset.
+      sensor: (T, Y, n); the measurement of a state x is sensor x + sensor_offset.
       sensor_offset: (T, Y).
       transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
       input: (T, Z, m).
@@ -87,13 +87,13 @@ class OutputFeedbackPolicy:
         return self.nominal[0].copy()
 
     def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: float) -> tuple[Array, Array]:
-        """Controls (..., m) of this control period, and z (..., Z) for the next; to be called once in each period.
+        """The controls (..., m) of this control period, and z (..., Z) for the next. Call it once in each period.
 
         After the horizon the last recursion holds.
 
         Args:
           z: (..., Z), from `start` or the previous call; it is not changed.
-          measurement: (..., Y), angles in any representative; None if it was lost, for a prediction alone.
+          measurement: (..., Y), angles in any representative; None if it was lost: z is then only predicted.
           t: seconds since the start.
 
         Raises:

@@ -17,7 +17,7 @@ from lqrsim.results.value_functions import Quadratic
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A plan with its feedback law, and everything that a next solve can begin with.
+    """A plan with its feedback law, and everything with which a later solve can begin.
 
     A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 
@@ -26,11 +26,11 @@ class Plan:
       detail: where and why it failed; for solutions also remarks.
       policy: the feedback law.
       trajectory: the plan: the rollout of the policy by the model from its first state.
-      cost_to_go: the value function of the law, a `Quadratic`; None where it is unknown, and for re-plans with
+      cost_to_go: the value function of the law, a `Quadratic`; None if it is unknown, and for re-plans with
         constraints, which do not need it.
-      multipliers: one for each constraint of the problem; none where no constraint is active.
-      goal: (n,) the goal state of the problem, NaN in states that do not matter; None where it has none.
-      goal_radius: distance from the goal, in `target.unit`, within which the plan reaches it; None where it is unknown.
+      multipliers: one for each constraint of the problem; none if no constraint is active.
+      goal: (n,) the goal state of the problem, NaN in states that do not matter; None if there is no goal.
+      goal_radius: distance from the goal, in `target.unit`, within which the plan reaches it; None if it is unknown.
     """
 
     status: Status
@@ -47,11 +47,11 @@ class Plan:
         check_fields(self)
         if self.cost_to_go is not None:
             check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
-        _ = self.target  # which refuses anything but a goal
+        _ = self.target  # raises an exception if the goal is invalid
         self._check_finite("trajectory", "policy", "cost_to_go")
 
     def _check_finite(self, *names: str) -> None:
-        """Raises InputError if a record or an array of a plan that converged has NaN or infinity in it."""
+        """Raises InputError if a record or an array of a plan that converged contains NaN or infinity."""
         for name in names if self.status.success else ():
             value = getattr(self, name)
             arrays = [value] if isinstance(value, np.ndarray) else vars(value).values() if value is not None else ()
@@ -61,19 +61,19 @@ class Plan:
 
     @property
     def success(self) -> bool:
-        """Whether the solve converged: CONVERGED, or COST_CONVERGED where only the cost was tested."""
+        """Whether the solve converged: CONVERGED, or COST_CONVERGED if only the cost was tested."""
         return self.status.success
 
     @property
     def target(self) -> Target:
-        """The goal of a run, or the end of the plan where there is none."""
+        """The goal of a run, or the end of the plan if there is no goal."""
         return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> Self:
-        """The rest of the plan after `steps` steps, to begin the next solve with: `start=solution.shifted(k)`.
+        """The rest of the plan after `steps` steps, as a start for the next solve: `start=solution.shifted(k)`.
 
         A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
-        end. A "shrinking" one has fewer steps. Status, log, cost and digest stay those of the whole plan.
+        end. A "shrinking" horizon has fewer steps. Status, log, cost and digest still describe the whole plan.
 
         Args:
           steps: steps that are over, fewer than the plan has.
@@ -107,19 +107,19 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class Replan(Plan):
-    """The result of a prepared solver: a plan from a given state, no worse than the rollout of the law it began with.
+    """The result of a prepared solver: a plan from a given state, no worse than the rollout of the initial law.
 
-    No worse means: its violation is no larger, and if both keep the constraints, its cost is no higher. It can be used
-    with any status, unless `cost` is not finite.
+    No worse means that its violation is no larger, and if both keep the constraints, that its cost is no higher. The
+    plan can be used with any status, unless `cost` is not finite.
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
       cost: cost of the plan, start and end included.
       before: cost of the rollout of the law that the solve began with.
-      violation: violation of the worst constraint at the steps; 0 where all are kept.
+      violation: violation of the worst constraint at the steps; 0 if all are kept.
       iterations: number of iterations.
       seconds: time that the solve took.
-      iterating: part of `seconds` in iterations and in the first rollout.
+      iterating: the part of `seconds` spent in iterations and in the first rollout.
     """
 
     improved: bool

@@ -1,7 +1,8 @@
-"""The feedback law, as a robot runs it. NumPy only.
+"""The feedback law in the form that a robot runs. NumPy only.
 
-`kernels/policy_evaluation.py` has the same law compiled, for simulations of many trials: there a trial gets the same
-bits whatever runs beside it, which NumPy's matrix products do not guarantee. `tests/test_policy.py` compares the two.
+`kernels/policy_evaluation.py` implements the same law in compiled code, for simulations of many trials. There a trial
+gets the same bits whatever other trials run with it, which NumPy's matrix products do not guarantee.
+`tests/test_policy.py` compares the two.
 """
 
 from dataclasses import dataclass, replace
@@ -50,7 +51,7 @@ class AffinePolicy:
 
     @property
     def digest(self) -> str:
-        """Hash of the laws and their times, 16 hexadecimal digits; `Rollout.policy_digest` of a run of this policy."""
+        """Hash of the laws and their times, 16 hexadecimal digits; `policy_digest` of this policy's rollouts."""
         return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "AffinePolicy":

@@ -18,16 +18,16 @@ from lqrsim.results.solution_parts import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class BallRecord:
-    """Places of a robot's balls in its runs, and in the plan, for pictures.
+    """Positions of a robot's balls in its runs and in the plan, for pictures.
 
     K trials of T control periods, B balls; the last ball stands for a robot without a position.
 
     Attributes:
-      driven: (K, T+1, B, 3) centres in the world, in metres; NaN where the states are.
-      planned: (T+1, B, 3) the same of the plan.
-      radii: (B,) in metres.
-      anchors: (B, 4) number of the MJCF's body that a ball is fixed to, and its place in the body's axes in metres; NaN
-        for a ball that names no site.
+      driven: (K, T+1, B, 3) centres in the world, in metres; NaN where the states are NaN.
+      planned: (T+1, B, 3) centres along the plan.
+      radii: (B,) radii in metres.
+      anchors: (B, 4) number of the MJCF's body that a ball is fixed to, and its position in the body's axes in metres;
+        NaN for a ball that names no site.
     """
 
     driven: Annotated[Array, "K T+1 B 3"]
@@ -41,20 +41,20 @@ class BallRecord:
 
     @property
     def tracked(self) -> tuple[int, Array]:
-        """The body that the last ball is fixed to, and its place on it, (3,).
+        """The body that the last ball is fixed to, and its position on that body, (3,).
 
         Raises:
           InputError: the last ball names no site.
         """
         body, *place = self.anchors[-1].tolist()
         if not np.isfinite(body):
-            raise InputError("balls: got no site for the last of them, want one among the sites= of CollisionSpheres")
+            raise InputError("balls: got no site for the last ball, want one in sites= of CollisionSpheres")
         return int(body), np.array(place)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Closed-loop runs of one controller in MuJoCo, with everything that a picture of them needs.
+    """Closed-loop runs of one controller in MuJoCo, with all data for drawing them.
 
     K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, bit for bit on
     equal processors.
@@ -69,39 +69,39 @@ class Rollout:
       state_coordinates: names and units of the states, and which of them wrap.
       control_coordinates: names and units of the controls, and their limits.
       goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
-      goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
-        scaled error where the goal has no position.
+      goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: in metres, or a scaled
+        error if the goal has no position.
       radius: radius of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) states as measured, which the controller gets.
       commanded: (K, T, m) the controller's commands.
-      applied: (K, T, m) what the actuators applied, within the robot's limits.
+      applied: (K, T, m) the controls that the actuators applied, within the robot's limits.
       forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
       torques: (K, T, 3) disturbing torque in N m, world axes.
       displaced: (K, obstacles, 3) displacement of each obstacle from its place in the plan, in metres.
       clearance: (K, T+1) signed distance to the nearest obstacle minus the radius, in metres; infinite without
         obstacles.
-      contacts: (K,) control periods, from the collision on, in which MuJoCo reported a contact of the robot with an
-        obstacle; 0 where the robot passes through obstacles.
-      collided_at: (K,) seconds to the first collision, at a knot or between two; infinite where there was none.
-      obstacles: (K) name of the obstacle of that collision; empty where there was none.
+      contacts: (K,) number of control periods, from the collision on, in which MuJoCo reported a contact of the robot
+        with an obstacle; 0 if the robot passes through obstacles.
+      collided_at: (K,) seconds to the first collision, at a knot or between two; infinite without a collision.
+      obstacles: (K) name of the obstacle of that collision; empty without a collision.
       diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement was not finite, or
-        the controller's filter had diverged; infinite where nothing did. The states are NaN from that knot on.
-      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. The states are NaN
+        the controller's filter had diverged; infinite if nothing diverged. The states are NaN from that knot on.
+      failed_at: (K,) seconds to the knot at which the controller failed; infinite if it did not. The states are NaN
         from that knot on.
       reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
-      disturbances: a description of each.
+      disturbances: a description of each disturbance.
       seed: seed of the random numbers.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
-      balls: places of the robot's balls, if it has any and frames were recorded; or None.
-      controller_run: the controller's run (`ControllerRun`), with what it recorded: the estimates of an `OffsetFree`,
-        the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
+      balls: positions of the robot's balls, if it has balls and frames were recorded; else None.
+      controller_run: the controller's run (`ControllerRun`) with its records: the estimates of an `OffsetFree`, the log
+        of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
     robot: Line
@@ -141,7 +141,7 @@ class Rollout:
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the controller's run, which may not be copyable."""
+        """The attributes without the controller's run, which may not be copyable."""
         return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
@@ -154,7 +154,7 @@ class Rollout:
             raise InputError(f"Rollout: contacts: got {self.contacts.max()}, want at most {self.plan.steps}, the steps")
         if not (np.diff(self.frame_times) > 0).all():
             raise InputError("Rollout: frame_times: got times that are not in order, want increasing times")
-        _ = self.target  # which checks the goal
+        _ = self.target  # raises an exception if the goal is invalid
         self._check_tube()
         self._check_endings()
 
@@ -178,7 +178,7 @@ class Rollout:
                     raise InputError(f"Rollout: tube: got {excerpt(self.tube[at].tolist())} at knot {at}, want {want}")
 
     def _check_endings(self) -> None:
-        """Raises InputError unless trials ended within the run, and what ended them is named."""
+        """Raises InputError unless trials ended within the run, by named events."""
         horizon = self.plan.horizon
         for name in ("collided_at", "diverged_at", "failed_at"):
             times = getattr(self, name)
@@ -188,7 +188,7 @@ class Rollout:
         collided, failed = np.isfinite(self.collided_at), np.isfinite(self.failed_at)
         for name, must, may in (
             ("obstacles", collided, collided),
-            ("reasons", failed, failed | np.isfinite(self.diverged_at)),  # of a filter that diverged, too
+            ("reasons", failed, failed | np.isfinite(self.diverged_at)),  # includes filters that diverged
         ):
             texts = np.array([bool(text) for text in getattr(self, name)])
             if (wrong := (must & ~texts) | (texts & ~may)).any():
@@ -213,11 +213,11 @@ class Rollout:
 
     @property
     def plane(self) -> str:
-        """The axes of the world that `places` are along; for a robot without a position, those of its last ball."""
+        """The world's axes of `places`; for a robot without a position, the axes of its last ball."""
         return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
 
     def places(self, trial: int) -> Array:
-        """Places of the robot in a trial: its position, or that of its last ball.
+        """Places of the robot in a trial: its position, or the position of its last ball.
 
         Args:
           trial: row of the rollout.
@@ -246,7 +246,7 @@ class Rollout:
 
         Args:
           places: (..., 2 or 3), in metres.
-          height: in metres, of places in a horizontal plane that has no height of its own.
+          height: height in metres of places in a horizontal plane without a height.
         """
         space = self.state_coordinates
         if space.position or self.balls is None:
@@ -274,7 +274,7 @@ class Rollout:
 
     @property
     def tracking_unit(self) -> str:
-        """Unit of `tracking_error`: m, or that of the scaled error (`goal.py`) for robots without a position."""
+        """Unit of `tracking_error`: m, or the unit of the scaled error (`goal.py`) for robots without a position."""
         return tracking_unit(self.state_coordinates)
 
     @property
@@ -301,15 +301,15 @@ class Rollout:
 
     @property
     def ended(self) -> Array:
-        """When each trial ended, (K,), in seconds; the horizon if no event ended it."""
+        """The time at which each trial ended, (K,), in seconds; the horizon if no event ended it."""
         return self._endings[1]
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Mask of the knots that count, (K, T+1): those before the trial ended, the last if no event ended it, and
-        always the first.
+        """Mask of the knots that count, (K, T+1): all before the trial ended, the last if no event ended it, and always
+        the first.
 
-        They do not depend on whether obstacles stop the robot.
+        The mask does not depend on whether obstacles stop the robot.
         """
         ran = ~np.isin(self._endings[0], ("collided", "diverged", "error"))
         counted = (self.times < self.ended[:, None]) | ran[:, None]
@@ -337,7 +337,7 @@ class Rollout:
         return np.where(self.collided, np.minimum(least, 0.0), least)
 
     def tally(self) -> str:
-        """How many trials reached the goal, as a line."""
+        """The number of trials that reached the goal, in one line."""
         return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
 
     def summary(self) -> str:

@@ -1,8 +1,7 @@
-"""Results on disk: arrays under the paths of their fields, and everything else as JSON with the structure of the
-record.
+"""Results on disk: arrays by the paths of their fields, and everything else as JSON with the structure of the record.
 
-`docs/file_format.md` describes the files, and loads a policy with NumPy alone. The annotations of the records say what
-a file may hold; see `fields.py`. `save` and `load` check it.
+`docs/file_format.md` describes the files, and shows how to load a policy with NumPy alone. The annotations of the
+records state the permitted contents of a file; see `fields.py`. `save` and `load` check this.
 """
 
 import enum
@@ -40,13 +39,13 @@ FORMATS: dict[type, tuple[str, int]] = {
     FailureCertificate: ("certificate", 1),
 }
 VERSIONS = dict(FORMATS.values())
-LATER = {(Certificate, "contacts")}  # fields that files of the same version from before do not have
+LATER = {(Certificate, "contacts")}  # fields that older files of the same version lack
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
-    """Write a solution, a rollout, a policy, a funnel or a certificate, whole or not at all. Returns its path.
+    """Write a solution, a rollout, a policy, a funnel or a certificate, all or nothing. Returns its path.
 
-    A link is written through: the file that it points to changes. Nothing but a regular file is replaced.
+    If the path is a link, the file that it points to changes. Only regular files are replaced.
 
     Args:
       result: a Solution, a Rollout, a policy, a Funnel or a FailureCertificate.
@@ -61,12 +60,12 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
 
 
 def hash_of(result: Saved) -> str:
-    """The `sha256` of the file that `save` writes of this. Raises InputError as `save`."""
+    """The `sha256` of the file that `save` would write. Raises InputError as `save` does."""
     return digest(*_content(result))
 
 
 def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
-    """The arrays and the JSON tree of a file. Raises InputError for what could not be read again."""
+    """The arrays and the JSON tree of a file. Raises InputError if the result could not be read again."""
     kinds = ", ".join(f"{'an' if kind.__name__[0] in 'AO' else 'a'} {kind.__name__}" for kind in FORMATS)
     check_kind("result", result, tuple(FORMATS), f"one of: {kinds}")
     kind = next(kind for kind in FORMATS if isinstance(result, kind))
@@ -78,7 +77,7 @@ def _content(result: Saved) -> tuple[Arrays, dict[str, Any]]:
         _record(kind, tree, "", dict(arrays))
     except (TypeError, ValueError) as error:
         reason = f"which cannot be written ({error})"
-        raise InputError(f"result: got a {name}, {reason}, want one as lqrsim makes it") from None
+        raise InputError(f"result: got a {name}, {reason}, want an unchanged result of lqrsim") from None
     return arrays, {"format": f"lqrsim {name}", "version": version, **tree}
 
 
@@ -115,7 +114,7 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         arrays, tree = archive.arrays(), {name: one for name, one in archive.meta.items() if name not in outside}
         record = _record(kind, tree, "", arrays)
         if arrays:
-            raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
+            raise InputError(f"{min(arrays)}: got an array that meta does not mention, want it mentioned there")
         return record
 
 
@@ -130,7 +129,7 @@ def record_from(kind: type[_Record], tree: Any, path: str) -> _Record:
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:
-    """The JSON tree of a value; its arrays go into `arrays`, each under the path of its field."""
+    """The JSON tree of a value. Its arrays are put into `arrays`, by the paths of their fields."""
     if is_dataclass(value):
         tree = {}
         for name in declarations(type(value)):
@@ -185,7 +184,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
         elif said.dtype is not None and field in arrays:
             found[name] = arrays.pop(field)
         elif (kind, name) not in LATER:
-            raise InputError(f"{field}: got none, want it")
+            raise InputError(f"{field}: got nothing, want this field")
     if kind is AffinePolicy and not (np.isfinite(found["gain"]).all() and np.isfinite(found["offset"]).all()):
         raise InputError(f"{_join(path, 'gain')}: got NaN or infinity in gain or offset, want finite numbers")
     try:

@@ -21,24 +21,24 @@ class Solution(Plan):
     """A locally optimal feedback policy, and how it was found.
 
     A `Plan` with the log of the solve. `detail` also says where the safeguard stepped in. The policy and the cost-to-go
-    are those of the last backward pass that was completed.
+    come from the last completed backward pass.
 
     Attributes:
-      inverse_policy: the law that follows the optimum backwards from a state of arrival; None from `ilqr`, and after a
+      inverse_policy: the law that follows the optimum backwards from a state of arrival. None from `ilqr`, and with a
         fixed start, from which not every state can be reached.
       cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
-        dual; None where a pass failed, and from `ilqr`.
+        dual form; None if a pass failed, and from `ilqr`.
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
-        where the problem has no obstacles.
+        if the problem has no obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
-      gap: gap of the plan; see `Iteration.gap`. NaN if there is none.
+      gap: gap of the plan; see `Iteration.gap`. NaN if it is not defined.
       solver: name of the function that was called.
-      options: its settings; with noise, a description of the noise, and the risk.
+      options: the settings of the solver; with noise, also a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
-      remedy: what to try, in this case; empty for a success.
-      scenario: the scenario that the command line solved; empty where a program called the solver.
+      remedy: a remedy to try in this case; empty for a success.
+      scenario: the scenario that the command line solved; empty if a program called the solver.
       candidates: the starts that were tried, if there were several.
     """
 
@@ -58,7 +58,7 @@ class Solution(Plan):
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
-        """A solution without checks, for a solver, whose parts fit; some of them are made when they are first read.
+        """A solution without checks, for solvers, whose parts fit. Some parts are made when they are first read.
 
         Args:
           later: name -> function that makes it, for parts without a default.
@@ -75,7 +75,7 @@ class Solution(Plan):
         return vars(self).setdefault(name, later[name]())  # two threads that read it get the same object
 
     def __getstate__(self) -> dict[str, Any]:
-        """With all parts made."""
+        """The attributes, with all parts made."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __post_init__(self) -> None:
@@ -146,7 +146,7 @@ class Solution(Plan):
             lines.append(f"  remedy:    {self.remedy}")
         gap = f"{self.gap:.1e}" if np.isfinite(self.gap) else "none (no cost-to-come)"
         lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
-        if self.violation > 1e-6:  # the tolerance by default
+        if self.violation > 1e-6:  # the default tolerance
             lines[-1] += f"   violation: {self.violation:.1e}"
         if self.certificate.contacts is not None:
             lines.append(f"  contacts:  {self.certificate.contacts}")
@@ -171,7 +171,7 @@ class Solution(Plan):
         return lines if self.success else lines[:1]  # the remedy of a failure follows
 
     def _beyond_limits(self) -> list[str]:
-        """A line for each control that is planned beyond its limits."""
+        """A line for each control with a plan beyond its limits."""
         space, controls = self.policy.control_coordinates, self.trajectory.controls
         return [
             f"{label} is planned from {used.min():.3g} to {used.max():.3g}, beyond {low:.3g} to {high:.3g}"
@@ -180,7 +180,7 @@ class Solution(Plan):
         ]
 
     def _search(self) -> list[str]:
-        """The start of the plan, and how the others ended, if there were several."""
+        """The start of the plan, and the results of other starts, if there were several."""
         if not self.candidates:
             return []
         ended = [candidate for candidate in self.candidates if candidate.status is not None]
@@ -201,5 +201,5 @@ class Solution(Plan):
 
 
 def _first(lines: list[str], most: int) -> list[str]:
-    """The first lines, and how many more there are."""
+    """The first lines, and the number of further lines."""
     return lines if len(lines) <= most + 1 else [*lines[:most], f"and {len(lines) - most} more"]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_count
 from lqrsim.results.fields import Bounds, Line, check_fields
 
-# The end of a horizon moves along with the robot, or stays where it is.
+# The end of a "moving" horizon moves along with the robot; the end of a "shrinking" horizon stays.
 HORIZONS = ("moving", "shrinking")
 
 
@@ -31,7 +31,8 @@ class Trajectory:
       dt: seconds between two states.
 
     Raises:
-      InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed: a failed solve has it.
+      InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed, because failed solves
+        contain it.
     """
 
     states: Annotated[Array, "T+1 n"]
@@ -65,7 +66,7 @@ class Trajectory:
 
 
 class Status(enum.StrEnum):
-    """How a solve ended; `meaning` explains it, `remedy` says what to try."""
+    """The way in which a solve ended. `meaning` explains it; `remedy` says what to try."""
 
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
@@ -82,7 +83,7 @@ class Status(enum.StrEnum):
 
     @property
     def success(self) -> bool:
-        """True for CONVERGED, and for COST_CONVERGED, where only the cost was tested."""
+        """True for CONVERGED, and for COST_CONVERGED, for which only the cost was tested."""
         return self in (Status.CONVERGED, Status.COST_CONVERGED)
 
     @property
@@ -91,7 +92,7 @@ class Status(enum.StrEnum):
 
     @property
     def remedy(self) -> str:
-        """What to try; empty for a success."""
+        """The remedy to try; empty for a success."""
         return _STATUS_TEXT[self][1]
 
 
@@ -149,28 +150,28 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: cost of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the
-        constraints are to be met.
+      cost: cost of the policy's rollout under the true dynamics; with noise, its expectation. NaN while the iterations
+        only try to satisfy the constraints.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. In damped iterations with
         constraints this and the optimality refer to the augmented Lagrangian.
       gap: largest difference between the states of minimal total cost and the rollout, each state relative to its
         range along the rollout (at least 1 unit); after a partial step of the safeguard, the states of that step. 0
         for steps of iLQR, Newton's method and restoration. In the interior point method it is the largest defect of
         the dynamics between two steps of its plan, which is zero only at the end.
-      optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
-        where it was not evaluated (it is once the other tests pass, and after the last iteration). In the interior
+      optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost. It
+        is evaluated once the other tests pass, and after the last iteration; else it is NaN. In the interior
         point method it is the residual of the optimality conditions, relative to the cost: the larger of the gradient
         of the Lagrangian in a control times the control's range, and the product of a multiplier and its slack.
       dynamics_residual: largest defect of the dynamics between two states of minimal total cost, relative as the gap
-        is, and evaluated where the optimality is. The plan itself is a rollout and has no defect. In the interior point
+        is, and evaluated when the optimality is. The plan itself is a rollout and has no defect. In the interior point
         method it equals the gap.
-      violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
-        are no equalities, which have rounding errors at least; NaN where it was not evaluated.
+      violation: violation of the worst constraint at the steps, in its unit. 0 if all inequalities hold and there are
+        no equalities, which have at least rounding errors. NaN if it was not evaluated.
       seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; "contact modes", see `Certificate.contacts`; with
         constraints or limits "interior point", and "restoration", a descent on cost and penalised violation; in the
-        safeguard "damped", or "ilqr" where its step is that of iLQR; in Newton's method and the safeguard "rejected"
-        (the cost would have risen, or a pass failed; the cost is that of the plan that was kept).
+        safeguard "damped", or "ilqr" if its step is an iLQR step; in Newton's method and the safeguard "rejected"
+        (the cost would have risen, or a pass failed; the cost belongs to the plan that was kept).
     """
 
     cost: float
@@ -209,18 +210,18 @@ class Iteration:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactCertificate:
-    """What is beside a plan that keeps to its contact modes, by rollouts of its policy with other offsets.
+    """The costs around a plan that keeps to its contact modes, from rollouts of its policy with other offsets.
 
-    A *switch* is where a contact, a limit or an edge of friction begins to act or lets go: the cost jumps there or has
-    a kink. All costs are relative to the plan's.
+    At a *switch* a contact, a limit or an edge of friction begins to act or lets go; the cost jumps or has a kink
+    there. All costs are relative to the cost of the plan.
 
     Attributes:
-      pressed: number of switches that the plan is pressed against: without them its cost would fall.
-      across: by how much the cheapest plan across one of these is below the plan, on rays up to 128 times the radius;
-        negative if all are dearer, and minus infinity where there is none, or none can be crossed on its own.
-      sampled: by how much the cheapest of the sampled plans is below the plan; negative if all are dearer.
-      radius: how far these plans change a control at most, as a part of its range.
-      samples: how many of them there are.
+      pressed: number of switches that the plan is pressed against; without them, its cost would decrease.
+      across: cost that the cheapest plan across a switch saves, on rays up to 128 times the radius. Negative if all
+        cost more; minus infinity if there are no switches, or none can be crossed on its own.
+      sampled: cost that the cheapest of the sampled plans saves; negative if all cost more.
+      radius: largest change of a control in these plans, as a fraction of its range.
+      samples: number of sampled plans.
     """
 
     pressed: int
@@ -248,14 +249,14 @@ class Certificate:
 
     Attributes:
       cost: cost of the plan; see `Solution.cost`.
-      start: largest difference between its first state and a `FixedState`; 0 where the start is not fixed.
+      start: largest difference between the first state and a `FixedState`; 0 if the start is not fixed.
       dynamics_residual: largest difference between a state and one step of the dynamics from the state before, each
         state relative to its largest size along the plan, at least 1 unit.
       policy_residual: largest difference between a control and the policy's at that state, relative to the terms of
         `L x + l`.
-      limits: how far a control is beyond its limits, in its unit.
-      violation: violation of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there
-        are no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
+      limits: largest distance of a control beyond its limits, in its unit.
+      violation: violation of the worst constraint at the steps, in its unit; 0 if all inequalities hold and there are
+        no equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6,
         unless constraints are elastic.
       optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
         relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient. With `contacts` it
@@ -294,13 +295,13 @@ class Multipliers:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of several starts that a search tried; or a plan for softer contacts, of which the next one begins.
+    """One of several starts that a search tried; or a plan for softer contacts, from which the next plan begins.
 
     Attributes:
-      start: its name.
+      start: name of the start.
       cost: cost of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
       iterations: number of iterations.
-      status: how it ended; None where it was dropped after a few iterations.
+      status: status at its end; None if it was dropped after a few iterations.
       trajectory: its last plan.
     """
 

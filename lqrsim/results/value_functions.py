@@ -13,7 +13,7 @@ from lqrsim.results.fields import check_fields
 
 
 def _check(value: object) -> None:
-    """Check the fields of a quadratic function. Raises InputError, also if there are no states."""
+    """Check the fields of a quadratic function. Raises InputError if they do not fit, or if there are no states."""
     if not check_fields(value)["n"]:
         raise InputError(f"{type(value).__name__}: got no state, want at least one")
 
@@ -24,7 +24,7 @@ def _invertible(what: str) -> Iterator[None]:
     try:
         yield
     except np.linalg.LinAlgError as error:
-        raise InputError(f"{what}: got a singular matrix ({error}), want invertible ones") from None
+        raise InputError(f"{what}: got a singular matrix ({error}), want an invertible one") from None
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Quadratic:
           states: (T+1, n).
 
         Raises:
-          InputError: other shapes.
+          InputError: the states have another shape.
         """
         x = vectors_of("states", states, self.gradient.shape[-1])
         try:
@@ -70,7 +70,7 @@ class Quadratic:
         return curved + np.einsum("...i,...i->...", x, self.gradient) + self.constant
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) that minimise it. Paper: Eq. (21). Raises InputError for a singular Hessian."""
+        """The minimising states (T+1, n). Paper: Eq. (21). Raises InputError for a singular Hessian."""
         with _invertible("hessian"):
             return -np.linalg.solve(self.hessian, self.gradient[..., None])[..., 0]
 
@@ -84,8 +84,8 @@ class Moments:
     """Quadratic functions of the state by moments, one for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) +
     const`.
 
-    The dual form's cost-to-come. In a direction in which no state can be reached the covariance is zero and the cost
-    infinite. The terms are those of Kalman smoothing, to which LQR smoothing is dual.
+    It is the dual form's cost-to-come. In a direction in which no state can be reached, the covariance is zero and the
+    cost infinite. The terms come from Kalman smoothing, to which LQR smoothing is dual.
 
     Attributes:
       covariance: (T+1, n, n), symmetric, positive semidefinite; zero at 0 after a fixed start. Sbar^-1.
@@ -109,7 +109,7 @@ class Moments:
         return Quadratic(hessian, gradient, self.constant - 0.5 * np.einsum("...i,...i->...", gradient, self.mean))
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) that minimise it: the means."""
+        """The minimising states (T+1, n): the means."""
         return self.mean
 
     def minimum(self) -> Array:
@@ -135,7 +135,7 @@ class TotalCost:
         check_shape("TotalCost: cost_to_come", come, self.cost_to_go.gradient.shape)
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises InputError if there are none."""
+        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises InputError if there is no minimum."""
         if isinstance(self.cost_to_come, Quadratic):
             return (self.cost_to_go + self.cost_to_come).minimizer()
         moved = np.einsum("...ij,...j->...i", self.cost_to_come.covariance, self.costate())
@@ -154,8 +154,8 @@ class TotalCost:
     def covariance(self) -> Array:
         """The inverses (T+1, n, n) of the Hessians, zero in a direction in which no state can be reached.
 
-        Read as the covariance of a normal distribution: at k standard deviations the total cost is `k^2/2` above its
-        least.
+        As the covariance of a normal distribution: at k standard deviations the total cost is `k^2/2` above its least
+        value.
         """
         come, curvature = self.cost_to_come, self.cost_to_go.hessian
         with _invertible("hessian"):

@@ -1,4 +1,4 @@
-"""The robots. Adding one is adding a file here and its MJCF in models/: every subclass of `Robot` in it is found."""
+"""The robots. To add one, add a file here and its MJCF in models/. Every subclass of `Robot` in the file is found."""
 
 import importlib
 import inspect
@@ -14,7 +14,7 @@ def _registry() -> dict[str, type[Robot]]:
     modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
     classes = [item for module in modules for item in vars(module).values() if inspect.isclass(item)]
     robots = [item for item in classes if issubclass(item, Robot) and not inspect.isabstract(item)]
-    return {robot.name: robot for robot in robots if hasattr(robot, "name")}  # the rest are made of a file
+    return {robot.name: robot for robot in robots if hasattr(robot, "name")}  # the others are made from a file
 
 
 def names() -> list[str]:

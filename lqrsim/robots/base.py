@@ -15,22 +15,23 @@ if TYPE_CHECKING:
 
 
 class Robot(abc.ABC):
-    """Subclass it to add a robot; see `quadrotor.py` for an example and `docs/adding_a_robot.md` for the steps.
+    """A robot. Subclass it to add your own; `quadrotor.py` is an example, `docs/adding_a_robot.md` lists the steps.
 
     Attributes:
-      name: its name on the command line.
+      name: name of the robot on the command line.
       body: the robot's body in the MJCF; its origin is the position in the states. Obstacles are everything else that
         is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
-      wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
-      drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
+      wheels: the geoms in the MJCF that are the treads of its wheels, each on its own body; none by default.
+      drag: linear drag against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
-      radius: radius of its collision circle (seen from above) or ball (the rest), in metres.
-      balls: the colliding balls, in place of `radius`, for a robot that is more than one ball or that has no position.
-        None by default. The radius then is the robot's size in pictures, and the distance within which it has reached
-        its goal.
-      geoms: the colliding geoms, in place of both, for a robot from an MJCF, where the simulator computes distances.
+      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball.
+      balls: the colliding balls, in place of `radius`, for a robot of more than one ball or without a position. None by
+        default. With balls, the radius is the size of the robot in pictures, and the distance from the goal within
+        which the robot has reached it.
+      geoms: the colliding geoms, in place of both, for a robot from an MJCF, for which the simulator computes
+        distances.
         None by default.
     """
 
@@ -61,12 +62,12 @@ class Robot(abc.ABC):
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
 
-        Angles come out in the representative nearest to `near` (..., n), if given. Without the `activations`.
+        The states of the `activations` are not included.
 
         Args:
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
-          near: (..., n), to which angles are taken nearest; None for any representative.
+          near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
         """
 
     @abc.abstractmethod
@@ -94,10 +95,10 @@ class Robot(abc.ABC):
         return np.asarray(control, dtype=np.float64)
 
     def _check(self, *, above_zero: Sequence[str] = (), at_least_zero: Sequence[str] = ()) -> None:
-        """For `__post_init__` of robots whose constants are fields: makes them floats, and refuses impossible ones.
+        """For `__post_init__` of robots whose constants are fields: convert them to floats; refuse impossible values.
 
         Raises:
-          InputError: a constant is no finite number, or not above zero, or below zero.
+          InputError: a constant is not finite, or is zero or negative where it must not be.
         """
         for field in (*above_zero, *at_least_zero):
             least = {"above": 0.0} if field in above_zero else {"at_least": 0.0}
@@ -105,8 +106,8 @@ class Robot(abc.ABC):
 
 
 def configuration_of(qpos: npt.ArrayLike, qvel: npt.ArrayLike, nq: int, nv: int) -> tuple[Array, Array]:
-    """Positions (..., nq) and velocities (..., nv) of MuJoCo, as arrays. Raises InputError unless they fit."""
+    """MuJoCo's positions (..., nq) and velocities (..., nv) as arrays. Raises InputError unless they fit."""
     qpos, qvel = vectors_of("qpos", qpos, nq), vectors_of("qvel", qvel, nv)
     if qpos.shape[:-1] != qvel.shape[:-1]:
-        raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with {nv} numbers")
+        raise InputError(f"qvel: got shape {qvel.shape}, want qpos's shape, {qpos.shape}, with {nv} numbers")
     return qpos, qvel

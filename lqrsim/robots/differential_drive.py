@@ -19,10 +19,10 @@ class DifferentialDrive(Robot):
     MJCF: models/create.xml.
 
     Attributes:
-      axle_length: in m, between the wheels.
-      radius: in m, of the body.
-      max_speed: in m/s, of a wheel's rim, in either direction.
-      wheel_radius: in m; the height of the axle.
+      axle_length: distance between the wheels in m.
+      radius: radius of the body in m.
+      max_speed: largest speed of a wheel's rim in m/s, in either direction.
+      wheel_radius: radius of a wheel in m; also the height of the axle.
 
     Raises:
       InputError: a constant is not above 0.

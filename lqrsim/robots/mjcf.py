@@ -36,15 +36,15 @@ from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obst
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
-_SHARPNESS, _SHYNESS = 20.0, 0.1  # of obstacles, 1/m and for one body that touches one: 2 % of it at 8 cm
-_ROOM = 0.1, 0.05  # rad or m, and of a joint's range: how far plans keep off its limits, the smaller one
-_REST = 1e-6  # m/s^2, by which something at rest may accelerate
-_PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
-_LISTED = 12  # names in a line of what is printed
+_SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
+_ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
+_REST = 1e-6  # m/s^2, largest acceleration at rest
+_PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
+_LISTED = 12  # largest number of names in a printed line
 
 
 class MjcfRobot(Robot):
-    """All that moves in an MJCF, as one robot.
+    """Everything that moves in an MJCF, as one robot.
 
     A cart-pole, from hanging to standing:
 
@@ -58,12 +58,12 @@ class MjcfRobot(Robot):
 
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
-    and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
-    `<name>_` where the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
+    and `<name>_wx` to `_wz` in body axes; free joints also `<name>_x` to `_z` and `<name>_vx` to `_vz`, without the
+    `<name>_` if the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
     angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
-    name in the MJCF get one, such as `unnamed_joint_0`.
+    name in the MJCF get a name, such as `unnamed_joint_0`.
 
-    Where the file has no camera, or no light, it gets one named overview.
+    If the file has no camera, or no light, a camera or light named overview is added.
 
     Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
     and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
@@ -72,21 +72,21 @@ class MjcfRobot(Robot):
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
-      body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
-        that moves and has mass, itself or by bodies that are fixed to it.
-      position: the 2 or 3 states that are the body's position in the world, in metres; by default those found by
-        MuJoCo's kinematics. () for none.
+      body: name of the body on which disturbances act, and whose position is the robot's. By default the first moving
+        body that has mass, its own mass or the mass of bodies fixed to it.
+      position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
+        kinematics. () for none.
       radius: radius of a ball about the body's origin that contains everything that may collide; by default the
         smallest guaranteed one.
-      outline: whether there are `balls`, fixed to the bodies, about all that collides; by default where there is no
-        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. Pictures follow them,
-        and they are cheap bounds of the colliding geoms.
+      outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
+        it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
+        balls are cheap bounds of the colliding geoms, and pictures follow them.
       floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
-      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. Geoms
-        that are not obstacles collide by MuJoCo's contacts, in the plan, too.
+      obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
+        none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
 
     Attributes:
-      scene: the scene that it moves in.
+      scene: the scene that the robot moves in.
       dynamics: MuJoCo's steps.
       geoms: its colliding geoms. balls: an outline of it, or None.
 
@@ -128,7 +128,7 @@ class MjcfRobot(Robot):
         self._numbers = np.array([one.number for one in actuators], dtype=np.intp)
         self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
-        turned = {"free": 3, "ball": 0}  # where among a joint's coordinates a rotation vector begins
+        turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
         place, plane = self._position(position, names, mjcf_joints.position_of(model, number), who)
         states = Coordinates(
             names=names, units=units, position=place, plane=plane,
@@ -186,7 +186,7 @@ class MjcfRobot(Robot):
         return tuple(found), plane if len(found) == 2 else ""
 
     def _balls_at(self, state: Array) -> Array:
-        """Places of the balls, (K, 3), by MuJoCo's bindings."""
+        """Centres of the balls, (K, 3), by MuJoCo's bindings."""
         assert isinstance(self.balls, MjcfBalls)
         outline = self.balls.outline
         return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)
@@ -196,9 +196,9 @@ class MjcfRobot(Robot):
         return self._dynamics
 
     def with_parameters(self, **values: float) -> "MjcfRobot":
-        """The robot with other numbers in its MJCF, also for a plant: `robot.with_parameters(mass=0.6)`.
+        """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
 
-        `dynamics.numbers` has their names and values; `dynamics.with_parameters` is the same for a plan alone.
+        `dynamics.numbers` has the names and values. `dynamics.with_parameters` changes the numbers for a plan alone.
 
         Args:
           **values: number of the MJCF, as in `dynamics.numbers` -> value.
@@ -207,7 +207,7 @@ class MjcfRobot(Robot):
           An MjcfRobot.
 
         Raises:
-          InputError: as there.
+          InputError: as `dynamics.with_parameters` does.
         """
         changed = self.dynamics.with_parameters(**values)
         model = checked_model(changed.xml, self.name)
@@ -218,7 +218,7 @@ class MjcfRobot(Robot):
         """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
 
         Args:
-          state: (n,), whose velocities do not count; nor do activations, which take the values that hold it, too.
+          state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
 
         Returns:
           (m,), within their limits; where nothing holds it, those with the least sum of squared forces left. Nothing
@@ -230,10 +230,10 @@ class MjcfRobot(Robot):
         return self._held(check_array("state", state, (len(self.dynamics.state_coordinates),))).controls
 
     def settled(self, state: npt.ArrayLike) -> Array:
-        """The state at rest nearby at which a robot stands: joints without actuators, such as a free base, move there.
+        """A nearby state in which the robot stands at rest. Joints without actuators, such as a free base, move to it.
 
-        Legs keep their angles, and the base goes to where the contacts, which are springs, carry it. They must touch.
-        Activations of actuators take the values that hold it.
+        Legs keep their angles. The base moves to where the contacts, which are springs, carry it. The robot must touch
+        its support at the given state. Activations of actuators take the values that hold it.
 
         Args:
           state: (n,), whose velocities do not count.
@@ -249,8 +249,8 @@ class MjcfRobot(Robot):
         place, left = settled(model, self.configuration(state)[0])
         if left > _REST * float(model.body_mass.sum()):
             raise InputError(
-                f"state: got one near which nothing is at rest: {left:.3g} N or N m are left, want one that touches"
-                " what is to carry it"
+                f"state: got no state of rest nearby: {left:.3g} N or N m are left, want a state in which the"
+                " robot touches its support"
             )
         found = state.copy()
         found[: 2 * model.nv] = self.state(place, np.zeros(model.nv), near=state)
@@ -286,13 +286,13 @@ class MjcfRobot(Robot):
         limits: float = 100.0,
         clearance: float | None = None,
     ) -> Problem:
-        """Make a problem: from one state to another, within the actuators' limits, clear of obstacles at a cost.
+        """Make a problem: from one state to another, within the actuators' limits, with costs on obstacles.
 
-        Joints keep off their limits at a cost, too: MuJoCo's step is discontinuous where a limit is just reached, and
-        plans along one do not converge.
+        Joint limits have a cost, too. MuJoCo's step is discontinuous where a limit is just reached, and plans that move
+        along a limit do not converge.
 
-        The cost of the controls is about those that hold the robot still at the start; if it can be held at the goal,
-        too, about the mean of both. Solvers start from these controls.
+        The control cost is zero at the controls that hold the robot still at the start. If it can also be held at the
+        goal, the cost is zero at the mean of both. Solvers start from these controls.
 
         Args:
           start: (n,), a state.
@@ -301,13 +301,14 @@ class MjcfRobot(Robot):
           dt: the control period in seconds; by default about 0.02.
           weights: weights of the final error: one number for all states, (n,), or by name or unit, {"m": 100}; states
             that are not named then have none.
-          effort: weights of the controls, likewise; by default 1 over the square of a control's largest size, so that
-            one that is off by that much costs 1/2: by its limits, else those of its force, else 1.
+          effort: weights of the controls, in the same form. By default 1 over the square of a control's largest value,
+            so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
+            force limits, else it is 1.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
-          limits: weight of what a joint is closer to its limits, at each step, than 0.1 rad or m, 5 % of its range, or
-            start and goal are.
-          clearance: constrains the distance to all obstacles to at least this, in metres, as `lqrsim solve --clearance`
-            does; by default obstacles only add cost.
+          limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
+            it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
+          clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
+            default obstacles only add cost.
 
         Returns:
           The Problem.
@@ -344,7 +345,7 @@ class MjcfRobot(Robot):
         )  # fmt: skip
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
-        """Least and largest positions of joints, by name: some way off their limits, if both states are."""
+        """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
         names, low, high = self.dynamics.state_coordinates.names, {}, {}
         for one in self._joints:
             if one.limits is not None:
@@ -376,7 +377,7 @@ class MjcfRobot(Robot):
         return "\n".join(lines)
 
     def _amiss(self) -> dict[str, list[str]]:
-        """What a plan from the MJCF's rest has to do with from its first step: joints past limits, and contacts."""
+        """Problems of a plan that starts from the MJCF's rest: joints past their limits, and contacts."""
         model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
         past = [
             f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
@@ -390,10 +391,10 @@ class MjcfRobot(Robot):
 
     @property
     def joint_limits(self) -> StateBounds:
-        """The joints' ranges as constraints for a problem; in MuJoCo they are springs that push back.
+        """The joints' ranges as constraints for a problem. In MuJoCo, joint limits are springs that push back.
 
         Raises:
-          InputError: no joint has any.
+          InputError: no joint has limits.
         """
         names = self.dynamics.state_coordinates.names
         return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
@@ -489,11 +490,11 @@ class MjcfRobot(Robot):
 
 
 def _weights(field: str, given: PerEntry, size: int) -> PerEntry:
-    """Weights by name as they are, or one for each of `size` entries."""
+    """Weights by name unchanged; other weights as one number for each of `size` entries."""
     return given if isinstance(given, Mapping) else check_weights(field, given, size)
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names in a line, of many the first."""
+    """Names in a line; only the first ones if there are many."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(names[:_LISTED]) + more if names else "none"

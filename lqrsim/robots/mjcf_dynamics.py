@@ -1,4 +1,4 @@
-"""Dynamics that are MuJoCo's: where a control period leads, by its own steps."""
+"""MuJoCo as dynamics: the state after a control period, computed by MuJoCo's own steps."""
 
 import contextlib
 import copy
@@ -28,18 +28,18 @@ from lqrsim.scenes.scene import unlogged
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
-SOFTER = 0.1, 0.03, 0.01, 0.003  # m or rad, of contacts and limits that are softened less and less
+SOFTER = 0.1, 0.03, 0.01, 0.003  # m or rad, softness of contacts and limits in successive solves
 
-_forming = threading.Lock()  # of teams
+_forming = threading.Lock()  # held while a team of threads is formed
 
 
 class MjcfDynamics(Dynamics):
     """`x' = g(x, u)`, by MuJoCo's steps of a whole control period; `MjcfRobot` makes it.
 
     The state is the position of each joint, in MuJoCo's order of degrees of freedom and with rotations of ball and free
-    joints as rotation vectors; then the velocities; then the states of actuators that have some. The control is
+    joints as rotation vectors; then the velocities; then the states of actuators that have states. The control is
     MuJoCo's `ctrl`. Derivatives are central differences over the control period. There is no rate: solvers in
-    continuous time do not take them, nor those that need an inverse.
+    continuous time, and solvers that need an inverse, do not accept these dynamics.
 
     Attributes:
       xml: the MJCF. physics: MuJoCo's model, and memory for each thread.
@@ -65,7 +65,7 @@ class MjcfDynamics(Dynamics):
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without MuJoCo's memory, which another process makes anew."""
+        """The attributes without MuJoCo's memory, which another process allocates anew."""
         return {name: value for name, value in vars(self).items() if name not in ("physics", "disturbed", "compiled")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -73,7 +73,7 @@ class MjcfDynamics(Dynamics):
         self._set_mjcf(self.xml)
 
     def __copy__(self) -> "MjcfDynamics":
-        """With the same memory of MuJoCo's."""
+        """A copy that shares MuJoCo's memory."""
         other = object.__new__(type(self))
         vars(other).update({name: value for name, value in vars(self).items() if name != "disturbed"})
         return other
@@ -96,7 +96,7 @@ class MjcfDynamics(Dynamics):
             return self
         other = copy.copy(self)
         other.parameters = dict(self.disturbances)
-        other._set_mjcf(self.xml, self.physics.model)  # with models of its own, which carry the loads
+        other._set_mjcf(self.xml, self.physics.model)  # with its own models, which carry the loads
         return other
 
     @property
@@ -114,22 +114,23 @@ class MjcfDynamics(Dynamics):
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The numbers of the MJCF that `with_parameters` takes, and what they are.
+        """The numbers of the MJCF that `with_parameters` takes, with their values.
 
         `mass` in kg, of all moving bodies, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
-        `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, where there are several
-        numbers the largest; `density` and `viscosity` of the medium. In MuJoCo's units.
+        `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, the largest number if there
+        are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
         return {name: one.value for name, one in numbers_of(self.xml, self.physics.model).items()}
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
 
-        A body's inertia scales with its mass; several numbers of a gear keep their ratios. What is pushed is pushed
-        otherwise, too: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+        A body's inertia scales with its mass; several numbers of a gear keep their ratios. Forces on the body are also
+        parameters: `dynamics.disturbed.with_parameters(force_x=1.0)`.
 
         Raises:
-          InputError: there is no such number, the value is out of range, or the masses are those of all and of one.
+          InputError: there is no such number, the value is out of range, or the mass of all bodies and of a single body
+            are both given.
         """
         numbers = self.numbers
         for name in values:
@@ -186,7 +187,7 @@ class MjcfDynamics(Dynamics):
         raise InputError(f"{self.name}: got MuJoCo's steps, which have no rate, want `linearize`")
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds, control held; NaN where it leaves all numbers."""
+        """The state (n,) after `dt` seconds, with the control held; NaN if it overflows."""
         x, u = self._check(state, control)
         self.check_period(dt)
         out = np.empty(len(x))
@@ -207,11 +208,11 @@ class MjcfDynamics(Dynamics):
 
     @contextlib.contextmanager
     def solving(self, threads: int) -> Iterator[None]:
-        """In this context so many threads linearise together, and MuJoCo does not print what statuses report.
+        """In this context, that many threads linearise together, and MuJoCo does not print what statuses report.
 
-        More threads than processors would wait for each other, and are not begun; nor are any where bodies carry loads,
-        which helpers do not know. After a signal that raises
-        KeyboardInterrupt all steps are NaN, so that it need not wait for the end of an iteration.
+        No more threads than processors are started, because they would wait for each other. None are started if bodies
+        carry loads, which helper threads do not have. After a signal that raises KeyboardInterrupt all steps are NaN,
+        so that the signal need not wait for the end of an iteration.
         """
         threads = min(check_count("threads", threads), 1 if self.parameters else processors())
         team, helpers = self.physics.team, list[threading.Thread]()

@@ -19,12 +19,12 @@ from lqrsim.scenes.mjcf_outline import Outline
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import Obstacle, World
 
-MOST_ROWS = 128  # distances that costs and constraints have at a step; with more, one a body: to the nearest obstacle
-_FAR = 1e6  # m; beyond all obstacles
+MOST_ROWS = 128  # largest number of distances per step; beyond it, one per body: to the nearest obstacle
+_FAR = 1e6  # m, a distance beyond all obstacles
 
 
 class MjcfGeoms(CollisionGeoms):
-    """All that moves and collides in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
+    """All moving geoms that collide in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
 
     Args:
       scene: the robot's scene, in which all geoms have names.
@@ -100,9 +100,9 @@ class MjcfGeoms(CollisionGeoms):
         return np.abs(after[..., :nv] - before[..., :nv]) @ self._levers
 
     def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
-        """The dynamics, and which obstacles of the scene's those of the world are. Raises InputError."""
+        """The dynamics, and the index in the scene of each obstacle of the world. Raises InputError."""
         if not isinstance(dynamics, MjcfDynamics):
-            raise InputError(f"geoms: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+            raise InputError(f"geoms: got an MJCF's geoms for {dynamics.name}, want its own dynamics, robot.dynamics")
         if world is self.scene.world:
             return dynamics, np.arange(len(world))
         known = {one.name: (number, one) for number, one in enumerate(self.scene.world.obstacles)}
@@ -127,7 +127,7 @@ class MjcfGeoms(CollisionGeoms):
         return np.concatenate([[count, len(chosen), check_number("reach", reach)], table.ravel()])
 
     def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> Array:
-        """The same with its address, of all distances to each obstacle."""
+        """The kernel's data with the address of p, for all distances to each obstacle."""
         place = np.full(len(self.scene.world), -1, dtype=np.int64)
         place[numbers] = np.arange(len(numbers))
         rows = np.asarray(place[self._number], dtype=np.int64)
@@ -167,7 +167,7 @@ class MjcfBalls(CollisionSpheres):
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:
-    """Whether two obstacles have one shape and place."""
+    """Whether two obstacles have the same shape and position."""
     if other is None or one.kind != other.kind:
         return False
     pairs = ((one.position, other.position), (one.rotation, other.rotation), (one.size, other.size))

@@ -1,4 +1,4 @@
-"""Sites of an MJCF as what costs and constraints are about: a gripper at a place, and turned as it should be."""
+"""Costs and constraints on sites of an MJCF, such as a gripper at a desired position and orientation."""
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,10 @@ _AXES = "xyz"
 
 
 class _Pose:
-    """The wanted place of a site, checked.
+    """The desired position and orientation of a site, checked.
 
     Args:
-      what: messages call it. site: name of it. position: (3,) or None. orientation: (4,) or None.
+      what: its name in messages. site: name of the site. position: (3,) or None. orientation: (4,) or None.
     """
 
     def __init__(self, what: str, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
@@ -31,7 +31,7 @@ class _Pose:
         if orientation is not None:
             quaternion = check_array(f"{what}: orientation", orientation, (4,))
             if not np.linalg.norm(quaternion) > 1e-9:
-                raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a quaternion (w, x, y, z)")
+                raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a nonzero (w, x, y, z)")
             self.axes = axes_of(quaternion / np.linalg.norm(quaternion))
 
     @property
@@ -41,7 +41,7 @@ class _Pose:
         return placed + ([f"{self.site} turned about {axis}" for axis in _AXES] if self.axes is not None else [])
 
     def bind(self, dynamics: Dynamics) -> tuple[Source, Array, MjcfMemory, int]:
-        """The errors' source, what they read, MuJoCo's memory, and of how many states they are. Raises InputError."""
+        """The source of the errors, their data, MuJoCo's memory, and the number of states. Raises InputError."""
         if not isinstance(dynamics, MjcfDynamics):
             raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
         model = dynamics.physics.model
@@ -61,15 +61,15 @@ class SiteCost(Cost):
 
         ls.SiteCost("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0), weight=1e4, turn_weight=1e3)
 
-    As a stage cost it acts at each step, as a final cost at the end.
+    As a stage cost it acts at each step; as a final cost, at the end.
 
     Args:
-      site: its name in the MJCF.
-      position: (3,) where it is wanted, in the world, in metres; None for anywhere.
-      orientation: (4,) the quaternion (w, x, y, z) of how it is wanted in the world; None for any. The angle is that of
-        the turn from there, less than half a turn.
-      weight: weight of the place, a number or one an axis of the world, (3,).
-      turn_weight: weight of the turn, a number or one an axis of what is wanted, (3,).
+      site: name of the site in the MJCF.
+      position: (3,) the desired position in the world, in metres; None for any.
+      orientation: (4,) the desired orientation in the world, as a quaternion (w, x, y, z); None for any. The angle is
+        that of the rotation from the desired orientation, less than half a turn.
+      weight: weight of the position error: one number, or one per world axis, (3,).
+      turn_weight: weight of the orientation error: one number, or one per axis of the desired orientation, (3,).
     """
 
     def __init__(
@@ -102,12 +102,12 @@ class SiteCost(Cost):
 
 
 class SiteConstraint(Constraint):
-    """A site of a robot from an MJCF is exactly at a place, or turned as wanted, or both.
+    """A site of a robot from an MJCF has exactly a desired position, or a desired orientation, or both.
 
         ls.SiteConstraint("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0))
 
     Args:
-      site: its name in the MJCF.
+      site: name of the site in the MJCF.
       position: (3,) as in a SiteCost.
       orientation: (4,) as in a SiteCost.
       at: "final", or "all" steps except a start that is given exactly.

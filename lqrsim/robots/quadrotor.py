@@ -20,16 +20,16 @@ class Quadrotor(Robot):
     Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. MJCF: models/quadrotor.xml.
 
     Attributes:
-      mass: in kg.
-      inertia: in kg m^2, about each axis.
-      yaw_inertia: about the body's z axis instead, in kg m^2; None for the same.
-      arm: in m, from the centre of mass to a rotor.
-      torque_ratio: in N m of a rotor's drag per N of its force; the paper's k_m.
-      drag: in N s/m, against the velocity; the paper's k_v.
-      gravity: in m/s^2.
-      max_force: in N, of a rotor.
-      min_force: likewise, the least.
-      radius: in m, of the collision sphere.
+      mass: mass in kg.
+      inertia: moment of inertia about each axis in kg m^2.
+      yaw_inertia: moment of inertia about the body's z axis in kg m^2, if it differs; else None.
+      arm: distance from the centre of mass to a rotor in m.
+      torque_ratio: drag torque of a rotor in N m per N of its force; the paper's k_m.
+      drag: linear drag against the velocity in N s/m; the paper's k_v.
+      gravity: gravitational acceleration in m/s^2.
+      max_force: largest force of a rotor in N.
+      min_force: least force of a rotor in N.
+      radius: radius of the collision sphere in m.
 
     Raises:
       InputError: a constant is out of range.
@@ -67,7 +67,7 @@ class Quadrotor(Robot):
 
     @property
     def hover_force(self) -> float:
-        """Force of each rotor in N that carries the weight."""
+        """The force of each rotor in hover, in N: a quarter of the weight."""
         return self.mass * self.gravity / 4
 
     @property
@@ -120,6 +120,6 @@ def _rate(x: Any, u: Any, p: Any) -> list[Any]:
     acceleration[2] -= p.gravity
     # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.
     torque = [p.arm * (u[1] - u[3]), p.arm * (u[2] - u[0]), p.torque_ratio * (u[0] - u[1] + u[2] - u[3])]
-    turned = rotations.rotate([-angle for angle in rotation], push)  # into the body's axes
+    turned = rotations.rotate([-angle for angle in rotation], push)  # in the body's axes
     torque = [own + pushed for own, pushed in zip(torque, turned, strict=True)]
     return [*velocity, *acceleration, *rotations.vector_rate(rotation, w), *(t / p.inertia for t in torque)]

@@ -38,9 +38,10 @@ def mjcf(
       path: path of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF.
-      goal: the goal, in the same form. Without a start and a goal the robot is to stay at rest, and a warning says so.
-      weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100}; the
-        others then have none.
+      goal: the goal, in the same form. Without a start and a goal, the robot is to stay at rest, and a warning says
+        this.
+      weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100};
+        states that are not named have no weight.
       effort: weights of the controls, about those that hold the robot: a number, or by name or unit; see
         `MjcfRobot.problem`.
       dt: control period in s, by default about 0.02.
@@ -48,7 +49,7 @@ def mjcf(
       body: as in `MjcfRobot`.
       floors: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
-      clearance: in metres, as in `MjcfRobot.problem`.
+      clearance: least distance to obstacles in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Raises:

@@ -27,19 +27,20 @@ class Scenario:
     """A robot in a scene with a problem.
 
     Attributes:
-      name: its name on the command line.
+      name: name of the scenario on the command line.
       summary: a line of description.
       robot: the robot.
       scene: its scene.
       problem: the problem to solve; change it with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: largest allowed distance of an undisturbed run from its plan, in metres.
-      disturbances: those of the demo: clearly visible, but within the reach of the policy.
-      start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several are tried.
+      disturbances: the disturbances of the demo: clearly visible, but within the reach of the policy.
+      start: initial guess of the solver, as in `smooth`, whenever the scenario is solved; by default several starts are
+        tried.
       paper_start: the paper's start, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: distance from the goal in metres within which it counts as reached; by default the robot's radius, or
-        a tenth of the way if the start is within it.
-      goal_tolerance: the same for goals without a position; both as in `simulate`.
-      simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
+        a tenth of the distance to the goal if the start is within the radius.
+      goal_tolerance: the tolerance for goals without a position; both are as in `simulate`.
+      simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Scenario:
         """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
 
         Args:
-          goal_radius: in metres, or None.
+          goal_radius: radius in metres, or None.
           goal_tolerance: a scaled error, or None.
         """
         if goal_radius is None and goal_tolerance is None:
@@ -72,9 +73,9 @@ class Scenario:
         """The distance from the goal within which it counts as reached, in `Target.unit`.
 
         Args:
-          goal_radius: in metres, or None.
+          goal_radius: radius in metres, or None.
           goal_tolerance: a scaled error, or None.
-          target: of a plan; without one, the plan starts where the problem does.
+          target: target of a plan; by default, of a plan that starts at the problem's start.
 
         Raises:
           InputError: as `simulate` does.

@@ -1,6 +1,6 @@
 """Scenarios and sets of disturbances from a user's input.
 
-A scenario is the name of a registered one, a function of the user's own or an MJCF, with settings:
+A scenario is the name of a registered scenario, a user's function, or an MJCF, with settings:
 
   quadrotor                     a name that `lqrsim list` prints
   quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
@@ -8,8 +8,8 @@ A scenario is the name of a registered one, a function of the user's own or an M
   my_package.robots:hallway     a function in a module of yours
   my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
 
-A set of disturbances is `scenario`, those of the scenario's own demo, or the name of a preset. NAME:Kind is one kind of
-disturbance of a set.
+A set of disturbances is `scenario`, for the disturbances of the scenario's demo, or the name of a preset. NAME:Kind is
+one kind of disturbance in a set.
 """
 
 import ast
@@ -38,8 +38,7 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
 
     Args:
       reference: the user's input.
-      registered_only: refuse a user's own function. For references that are read from a file, which must not choose the
-        code that runs.
+      registered_only: refuse users' functions. For references from a file, which must not choose the code that runs.
 
     Raises:
       InputError: there is no such scenario or setting, or the function does not return a Scenario.

@@ -1,4 +1,4 @@
-"""Solutions of scenarios: computed, begun with a stored start, or given instead of solving."""
+"""Solutions of scenarios: computed, computed from a stored start, or given instead of solving."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solutio
     Args:
       scenario: the scenario with the problem and the start.
       solver: one of SOLVERS. "ilqr" uses only the controls of a start that is an InitialPrior.
-      **options: of the solver; a `start` among them replaces the scenario's.
+      **options: options of the solver; a `start` among them replaces the scenario's.
 
     Raises:
       InputError: as the solver does.
@@ -46,14 +46,14 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     """Load a start for a solve of the scenario from a file.
 
     Args:
-      scenario: to solve.
+      scenario: the scenario to solve.
       path: path of a solution, of a policy, of a certificate, or of a rollout or funnel, for its plan.
 
     Returns:
       The solution, the policy or the plan.
 
     Raises:
-      InputError: the file has something else, or it is for another system or number of steps.
+      InputError: the file contains something else, or is for another system or number of steps.
     """
     found = load(path)
     if isinstance(found, FailureCertificate):
@@ -75,15 +75,15 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
 def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> Solution:
     """Check a solution that is given instead of solving the scenario.
 
-    It may be without convergence, or of another problem: `remarks` says so.
+    The solution may not have converged, or may be of another problem; `remarks` then says so.
 
     Args:
       scenario: the scenario in which it is to run.
       solution: a Solution, or the path of one.
 
     Raises:
-      InputError: it cannot be read, has another system, number of steps, control period or goal, or its plan is not
-        finite.
+      InputError: the solution cannot be read; it is for another system, number of steps, control period or goal; or its
+        plan is not finite.
     """
     stored = isinstance(solution, str | os.PathLike)
     what = str(solution) if stored else "one"
@@ -114,7 +114,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
     lines: list[str] = []
     if not solution.success:
         lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
-    # With a free duration the solution is of a problem with the duration that was found.
+    # With a free duration, the solution belongs to a problem with the duration that was found.
     if scenario.problem.duration is None and solution.problem_digest != scenario.problem.digest:
         solved = f" (solved as {solution.scenario})" if solution.scenario else ""
         lines.append(f"is of another problem than that of {scenario.name}{solved}; its plan is run as it is")

@@ -1,9 +1,9 @@
-"""What acts at each physics step of a control period of an MJCF, its contact mode, and how far another mode is.
+"""The contact mode of an MJCF, that is, what acts at each physics step of a control period; and the distance to others.
 
-A contact or a limit begins to act where its distance passes zero, and one that acts lets go, or an edge of its friction
-cone does, where its force passes zero. Each of these *switches* is a number that changes its sign there. As long as
-none does, a control period is a smooth function of its state and control. Where a distance changes its sign, a period
-is in general discontinuous; where a force does, it has a kink.
+A contact or a limit begins to act when its distance crosses zero. An active one, or an edge of its friction cone, lets
+go when its force crosses zero. Each of these *switches* is a number that changes sign at the event. As long as no
+switch changes sign, a control period is a smooth function of its state and control. If a distance changes sign, the
+period is in general discontinuous. If a force changes sign, it has a kink.
 """
 
 import copy
@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-_NEAR = 0.02  # m or rad, within which distances are watched
-_SMALLER = 1.0, 1e-2, 1e-4  # differences, relative to the first, that are tried until one stays in the mode
+_NEAR = 0.02  # m or rad; smaller distances are watched
+_SMALLER = 1.0, 1e-2, 1e-4  # steps of differences, relative to the first; tried until one stays in the mode
 _KIND = mujoco.mjtConstraint
 _LIMITS = np.array([int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)])
 _CONTACTS = np.array([int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)])
@@ -28,7 +28,7 @@ Names = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Switches:
-    """Switches of a control period, (k,): their names, ascending, and their values; negative where something acts."""
+    """Switches of a control period, (k,): their names, ascending, and their values, negative for active ones."""
 
     names: Names
     values: Array
@@ -45,7 +45,7 @@ class Switches:
 
     @property
     def forces(self) -> npt.NDArray[np.bool_]:
-        """Which of them are forces, whose change of sign is a kink and not a jump."""
+        """Flags of the switches that are forces; their change of sign is a kink, not a jump."""
         return (self.names & _FORCE) != 0
 
     def before_jump(self, crossed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
@@ -54,7 +54,7 @@ class Switches:
         return self.names < (jumps[0] // _FORCE + 1) * _FORCE if len(jumps) else np.ones(len(self.names), np.bool_)
 
     def same_mode(self, other: "Switches") -> bool:
-        """Whether the same acts. What is out of sight of one of them does not act in it."""
+        """Whether the same elements act in both. An element that is out of sight does not act."""
         if not np.array_equal(self.names[self.forces], other.names[other.forces]):
             return False
         return bool(((self.values < 0) == (other.at(self.names) < 0)).all()) and bool(
@@ -67,7 +67,7 @@ class Period:
     """A control period, linearised in its contact mode.
 
     Attributes:
-      state: (n,) at its end. jacobian: (n, n+m). switches: k of them. slopes: (k, n+m), NaN where not known.
+      state: (n,) at its end. jacobian: (n, n+m). switches: k switches. slopes: (k, n+m), NaN if unknown.
       certain: whether all differences stayed in the mode.
     """
 
@@ -82,7 +82,8 @@ class ContactModes:
     """Control periods of an MJCF by MuJoCo's bindings, with the switches of each stage of each physics step.
 
     Args:
-      model: of the physics. actuators: ids of those that are controlled. substeps: physics steps of a control period.
+      model: model of the physics. actuators: ids of the controlled actuators. substeps: physics steps of a control
+        period.
     """
 
     def __init__(self, model: mujoco.MjModel, actuators: tuple[int, ...], substeps: int) -> None:
@@ -95,7 +96,7 @@ class ContactModes:
 
     @staticmethod
     def known_for(model: mujoco.MjModel) -> bool:
-        """Whether all that switches is known: with joints that slide or turn, and pyramids of friction."""
+        """Whether all switches are known: joints only slide or turn, and friction cones are pyramids."""
         turning = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
         dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
         elliptic = model.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
@@ -118,7 +119,7 @@ class ContactModes:
         return np.concatenate([data.qpos, data.qvel]), Switches(names[order], values[order])
 
     def _runge_kutta(self, stage: int, found: list[tuple[Names, Array]]) -> None:
-        """A physics step of `mj_RungeKutta`, whose four stages each have contacts of their own."""
+        """A physics step of `mj_RungeKutta`, whose four stages each have their own contacts."""
         model, data, h = self._model, self._data, self._model.opt.timestep
         qpos, qvel, time = data.qpos.copy(), data.qvel.copy(), data.time
         mujoco.mj_forward(model, data)
@@ -168,7 +169,7 @@ class ContactModes:
     def linearize(self, state: Array, control: Array) -> Period:
         """The control period and its derivatives, by differences that stay in its contact mode.
 
-        Central ones where both sides do, one-sided ones where one does; smaller ones where neither does.
+        Differences are central if both sides stay in the mode, one-sided if one side does, and smaller if neither does.
         """
         n, point = len(state), np.concatenate([state, control])
         end, switches = self.step(state, control)
@@ -191,7 +192,7 @@ class ContactModes:
         return Period(end, jacobian, switches, slopes, certain)
 
     def _moved(self, point: Array, k: int, by: float) -> tuple[Array, Switches]:
-        """The period from a state and control, joined, of which one number is another."""
+        """The period from a state and control, joined, with one entry changed."""
         other = point.copy()
         other[k] += by
         n = 2 * self._nv
@@ -204,7 +205,7 @@ def _among(types: npt.NDArray[np.int32], kinds: npt.NDArray[np.int64]) -> npt.ND
 
 
 def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.bool_]) -> Names:
-    """Names of the limits in these rows: of a joint or a tendon, which one, and which of its two limits."""
+    """Names of the limits in these rows: a joint or a tendon, its number, and which of its two limits."""
     which, joints = data.efc_id[rows].astype(np.int64), data.efc_type[rows] == _LIMITS[0]
     lower = data.efc_J.reshape(data.nefc, -1)[rows].sum(axis=1) > 0  # of a joint
     ropes = which[~joints]
@@ -213,7 +214,7 @@ def _limits(model: mujoco.MjModel, data: mujoco.MjData, rows: npt.NDArray[np.boo
 
 
 def _contacts(geoms: npt.NDArray[np.int32]) -> Names:
-    """Names of contacts: the two geoms, and which of theirs; with room for the edges of a friction pyramid."""
+    """Names of contacts: the two geoms, and a number; they leave room for the edges of a friction pyramid."""
     pairs = (geoms[:, 0].astype(np.int64) * _GEOM + geoms[:, 1]) * _NUMBER
     earlier = np.tril(pairs[:, None] == pairs, -1).sum(axis=1, dtype=np.int64)
     return _CONTACT + pairs + earlier * _EDGE

@@ -18,7 +18,7 @@ _LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of severa
 
 @dataclass(frozen=True)
 class Holding:
-    """Controls, and what they leave.
+    """Controls, and the forces that they leave.
 
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
@@ -37,7 +37,7 @@ class Holding:
 
 
 class _Levels:
-    """What each actuator's force is affine in: its control or, where it has one, its activation.
+    """The variable in which each actuator's force is affine: its control or, if it has one, its activation.
 
     A filter's and a muscle's activation comes to rest at the control, or at the end of its own range that is nearest to
     it. An integrator's rests anywhere with a control of zero. Where its control cannot be zero, it rests at the end of
@@ -84,8 +84,8 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
 
     Actuator forces are assumed to be affine in the controls or activations, like those of motors and servos: inverse
-    dynamics give the required forces, and least squares within the limits finds the controls. `act` counts for
-    actuators of other kinds alone.
+    dynamics give the required forces, and least squares within the limits finds the controls. `act` matters only for
+    actuators of other kinds.
     """
     from scipy.optimize import lsq_linear
 
@@ -111,11 +111,11 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     kept, carried = _carried(model, qpos, np.asarray(columns.any(axis=1)))
     columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
     scale = np.abs(columns).max(axis=0)
-    scale[scale == 0] = 1.0  # such as what a state of the actuator stands between
+    scale[scale == 0] = 1.0  # for example if a state of the actuator comes in between
     rows = np.concatenate([columns / scale, _LIGHT * np.eye(model.nu)])
     aims = np.concatenate([wanted - rest, np.zeros(model.nu)])
     bounds = (low - middle) * scale, (high - middle) * scale
-    tight = bounds[1] - bounds[0] < 1e-12  # which lsq_linear refuses
+    tight = bounds[1] - bounds[0] < 1e-12  # lsq_linear refuses such bounds
     bounds = np.where(tight, -1e-12, bounds[0]), np.where(tight, 1e-12, bounds[1])
     found = middle + lsq_linear(rows, aims, bounds).x / scale
     found = np.clip(found, low, high)
@@ -129,10 +129,10 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
-    """Positions (nq,) nearby at which what no actuator drives is at rest, and the largest force (N, N m) left on it.
+    """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
-    Newton's method, with the smallest steps: contacts are springs, and nothing moves in a free direction, such as along
-    a floor.
+    It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
+    as along a floor.
     """
     data, levels = mujoco.MjData(model), _Levels(model)
     data.qpos[:] = qpos
@@ -195,7 +195,7 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
 
 
 def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
-    """The largest size of each control, (m,): by its own limits, else by those of its force; 1 without limits."""
+    """The largest size of each control, (m,): from its own limits, else from its force's; 1 without limits."""
     found = np.ones(model.nu)
     for number in range(model.nu):
         gain, gear = abs(float(model.actuator_gainprm[number, 0])), abs(float(model.actuator_gear[number, 0]))

@@ -25,8 +25,8 @@ class Joint:
     """A joint.
 
     Attributes:
-      name: its own. kind: free, ball, slide or hinge.
-      qpos, dof: its numbers in qpos and in qvel. limits: of a slide or hinge, in m or rad; None without.
+      name: name of the joint. kind: free, ball, slide or hinge.
+      qpos, dof: its indices in qpos and in qvel. limits: limits of a slide or hinge, in m or rad, or None.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Joint:
 
     @property
     def dof(self) -> int:
-        """The first of its numbers in qvel: the only one of a slide or hinge."""
+        """The first of its indices in qvel; a slide or hinge has only this index."""
         return self.dofs.start
 
 
@@ -54,11 +54,11 @@ class Actuator:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A joint that an equality constraint moves with another one: by how much it is linear.
+    """A joint that an equality constraint moves with another joint, linearly.
 
     Attributes:
-      dof: index of the joint's velocity. other: that of the joint it follows; -1 where it stands still. offset: its
-        position where the other's is 0, in m or rad. ratio: of both.
+      dof: index of the joint's velocity. other: index of the velocity of the joint that it follows; -1 if it stands
+        still. offset: its position if the other's is 0, in m or rad. ratio: ratio of both.
     """
 
     dof: int
@@ -86,7 +86,7 @@ def named(xml: str) -> str:
                 element.set("name", f"{UNNAMED}{kind}_{count}")
                 count += 1
 
-    # An MJCF has a section worldbody of its own and one of each file that it includes.
+    # An MJCF has its own section worldbody, and one from each file that it includes.
     there = [one for world in root.iter("worldbody") for one in world.iter()]
     for kind, tags in (("body", ("body",)), ("joint", ("joint", "freejoint")), ("geom", ("geom",))):
         name((one for one in there if one.tag in tags), kind)
@@ -95,10 +95,10 @@ def named(xml: str) -> str:
 
 
 def lit(xml: str, model: mujoco.MjModel) -> str:
-    """An MJCF with a camera and a light named overview, where it has none of the kind; the same text where it has both.
+    """An MJCF with a camera and a light named overview added if it has none; the same text if it has both.
 
     Args:
-      xml: the MJCF. model: compiled from it, for the size of the whole.
+      xml: the MJCF. model: the model compiled from it, for its overall size.
     """
     if (model.ncam and model.nlight) or "</mujoco>" not in xml:
         return xml
@@ -106,13 +106,13 @@ def lit(xml: str, model: mujoco.MjModel) -> str:
     added = ElementTree.Element("worldbody")
     if not model.ncam:
         place = " ".join(f"{number:.6g}" for number in middle + size * np.array([1.0, -1.6, 0.8]))
-        axes = "0.848 0.53 0 -0.207 0.331 0.921"  # which looks from there at the middle
+        axes = "0.848 0.53 0 -0.207 0.331 0.921"  # the camera looks from there at the centre
         ElementTree.SubElement(added, "camera", {"name": "overview", "pos": place, "xyaxes": axes})
     if not model.nlight:
         place = " ".join(f"{number:.6g}" for number in middle + size * np.array([-1.0, -1.0, 3.0]))
         light = {"name": "overview", "pos": place, "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
         ElementTree.SubElement(added, "light", light)
-    end = xml.rindex("</mujoco>")  # the text is ElementTree's, and can be long
+    end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
     return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
 
 
@@ -142,7 +142,7 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
 
 
 def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
-    """The names of the states of actuators, (na,): `<actuator>_activation`, numbered where an actuator has several."""
+    """The names of the states of actuators, (na,): `<actuator>_activation`, numbered if an actuator has several."""
     names = [""] * model.na
     for number in range(model.nu):
         first, count = int(model.actuator_actadr[number]), int(model.actuator_actnum[number])
@@ -152,8 +152,7 @@ def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def _unit(model: mujoco.MjModel, number: int) -> str:
-    """The unit of a control, for plain motors and servos of joints; empty for others, whose unit depends on their
-    use."""
+    """The unit of a control, for plain motors and servos of joints; empty for others, which have no fixed unit."""
     joint = int(model.actuator_trnid[number, 0])
     gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
     if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:
@@ -203,7 +202,7 @@ def couplings_of(model: mujoco.MjModel) -> tuple[Coupling, ...]:
 
 
 def is_linear(model: mujoco.MjModel, number: int) -> bool:
-    """Whether an equality constraint couples a joint linearly to another one, or holds it."""
+    """Whether an equality constraint couples a joint linearly to another joint, or fixes it."""
     joints = model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT
     return bool(joints and (int(model.eq_obj2id[number]) < 0 or not model.eq_data[number, 2:5].any()))
 
@@ -259,15 +258,15 @@ class Equalities:
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
-    """The id of the body of that name; without a name, of the first that moves and has mass. Raises InputError."""
+    """The id of the body of that name; without a name, of the first moving body with mass. Raises InputError."""
     if name is not None:
         names = [model.body(number).name for number in range(1, model.nbody)]
         return int(model.body(check_name(f"{what}: body", name, names)).id)
     moving = [number for number in range(1, model.nbody) if model.body_jntnum[number] > 0]
     if not moving:
         raise InputError(f"{what}: got no joints, want a robot that moves: at least one <joint> or <freejoint/>")
-    # Several bodies may carry a slide each before there is any mass: the robot is the first that has some, itself or by
-    # bodies that are fixed to it.
+    # Several bodies may each carry a slide before there is any mass. The robot is the first body with mass, its own or
+    # the mass of bodies fixed to it.
     masses = np.bincount(model.body_weldid, weights=model.body_mass, minlength=model.nbody)
     return next((number for number in moving if masses[number] > 0), moving[0])
 
@@ -280,10 +279,10 @@ def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array,
 
 
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
-    """For each degree of freedom that alone moves a body's origin along an axis of the world: that axis (0 to 2).
+    """Map each degree of freedom that alone moves a body's origin along an axis of the world to that axis (0 to 2).
 
-    Found by moving it: the origin must be where the free joint or the slides put it, for any positions of the other
-    joints.
+    The axes are found by moving the joints: the origin must be where the free joint or the slides put it, for any
+    positions of the other joints.
     """
     data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
     candidates = {
@@ -310,7 +309,7 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
 
 
 def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
-    """The body of a site, and its place (3,) and axes (3, 3) in the body's axes."""
+    """The body of a site, and the site's position (3,) and axes (3, 3) in the body's axes."""
     return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
 
 
@@ -322,10 +321,10 @@ def axes_of(quaternion: Array) -> Array:
 
 
 def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
-    """The geom of the tree of a body that is farthest from its origin at rest; the body itself if it has none.
+    """The geom in a body's tree that is farthest from the body's origin at rest; the body itself if there is no geom.
 
     Returns:
-      The number of its body, its place (3,) there, and the radius of the ball that it is in, in metres.
+      The number of the geom's body, its position (3,) there, and the radius of its bounding ball in metres.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -338,7 +337,7 @@ def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:
-    """The largest distance from a body's origin of its colliding geoms and of those it carries, in metres.
+    """The largest distance of the colliding geoms of a body, or of bodies that it carries, from its origin, in metres.
 
     If no geom collides, the visual geoms count instead.
     """

@@ -12,10 +12,10 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_number
 
-WHOLE = "mass"  # of all moving bodies together
+WHOLE = "mass"  # name of the mass of all moving bodies together
 _OF_JOINTS = ("damping", "stiffness", "armature", "frictionloss")
 _MEDIUM = ("density", "viscosity")
-_BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # of the rest: none is negative
+_BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # bounds; all other numbers must not be negative
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,17 @@ class Number:
 
 
 def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
-    """All of them, by the names that parameters have: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
+    """All such numbers, by the names of parameters: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
 
-    Only for elements that have a name and this number in the text: bodies that move, geoms that collide.
+    Numbers are listed only for elements that have a name and this number in the text: bodies that move, geoms that
+    collide.
 
     Args:
-      xml: an MJCF whose elements all have names. model: compiled from it.
+      xml: an MJCF whose elements all have names. model: the model compiled from it.
     """
     elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
     masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
-    if _bodies(model) == elements["body"].keys():  # otherwise the text has no place for the mass of some
+    if _bodies(model) == elements["body"].keys():  # otherwise the text has no place for some masses
         found += [Number("mass", "", sum(masses.values()))] if masses else []
         found += [Number("mass", name, mass) for name, mass in masses.items()]
     for number in range(model.njnt):
@@ -57,15 +58,15 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
 
 
 def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], what: str) -> str:
-    """The MJCF with others of its numbers, by name, as in `numbers_of`.
+    """The MJCF with changed numbers, by name, as in `numbers_of`.
 
-    A body's inertia scales with its mass; `mass` scales those of all bodies. The numbers of a gear keep their ratios.
+    A body's inertia scales with its mass; `mass` scales all bodies. The numbers of a gear keep their ratios.
 
     Args:
-      what: the MJCF's name in messages.
+      what: name of the MJCF in messages.
 
     Raises:
-      InputError: a value is out of range, or both the whole mass and that of a body are given.
+      InputError: a value is out of range, or both the whole mass and the mass of a body are given.
     """
     numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
     elements, scales = _elements(root), dict[str, float]()
@@ -76,7 +77,7 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         if name == WHOLE:
             scales |= dict.fromkeys(_heavy(model), ratio)
             if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
-                raise InputError(f"{what}: {WHOLE}: got it together with {other}, want the mass of all or of bodies")
+                raise InputError(f"{what}: {WHOLE}: got {WHOLE} and {other}, want one of the two")
         elif one.what == "mass":
             scales[one.part] = ratio
         elif one.what in _OF_JOINTS:
@@ -86,7 +87,7 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         elif one.what == "gear":
             _set(elements["actuator"][one.part], "gear", [*(ratio * model.actuator(one.part).gear)])
         else:
-            _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last one wins
+            _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
     if scales:
         _state_masses(root, elements["body"], model, scales)
     return ElementTree.tostring(root, encoding="unicode")
@@ -98,8 +99,7 @@ def _state_masses(
     model: mujoco.MjModel,
     scales: Mapping[str, float],
 ) -> None:
-    """Write the mass and inertia of each body, times its scale: as compiled, in place of the elements that they came
-    from."""
+    """Write the compiled mass and inertia of each body, times its scale, in place of the elements they came from."""
     for name, body in bodies.items():
         for inertial in body.findall("inertial"):
             body.remove(inertial)
@@ -116,7 +116,7 @@ def _state_masses(
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
-    """The named elements, by kind and name. Replicas have other names in the model, and are not found by these."""
+    """The named elements, by kind and name. Replicas have other names in the model, and are not found."""
     found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
     for world in root.iter("worldbody"):
         for element in world.iter():
@@ -132,7 +132,7 @@ def _bodies(model: mujoco.MjModel) -> set[str]:
 
 
 def _heavy(model: mujoco.MjModel) -> list[str]:
-    """The bodies that move, or are moved with others, and have mass."""
+    """The bodies with mass that move, by themselves or with others."""
     moves = (model.body_treeid >= 0) & (model.body_mass > 0)
     return [model.body(number).name for number in np.flatnonzero(moves)]
 

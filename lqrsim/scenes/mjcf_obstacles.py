@@ -6,9 +6,9 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's
+Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 
-_NEAR = 1e-3  # m; anything nearer to the floor stands on it
+_NEAR = 1e-3  # m; a geom nearer to the floor stands on it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 
 
@@ -41,9 +41,9 @@ def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors
 
 
 def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs of a geom that moves and an obstacle that MuJoCo lets collide.
+    """The pairs of a moving geom and an obstacle that MuJoCo lets collide.
 
-    By contype and conaffinity, unless their bodies are excluded; or as a pair of the MJCF.
+    They collide by contype and conaffinity, unless their bodies are excluded, or as a pair in the MJCF.
     """
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
     fixed = np.array(obstacles, dtype=np.int64)
@@ -63,7 +63,7 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs whose distances matter: those that can touch, and all pairs of an obstacle that nothing can touch.
+    """The pairs whose distances matter: pairs that can touch, and all pairs with an obstacle that nothing can touch.
 
     The user has chosen such an obstacle by name or by a rule.
     """
@@ -77,16 +77,17 @@ def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 
 def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
-    """Ids of the geoms that move and can collide; of all that move where none can."""
+    """Ids of the moving geoms that can collide; of all moving geoms if none can."""
     moves = model.body_weldid[model.geom_bodyid] != 0
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     return np.flatnonzero(moves & collides) if (moves & collides).any() else np.flatnonzero(moves)
 
 
 def levers(model: mujoco.MjModel) -> Array:
-    """How far any point of the robot moves at most for each degree of freedom, (nv,): in m/rad, or 1 for slides.
+    """The largest distance that any point of the robot moves per degree of freedom, (nv,): in m/rad, or 1 for slides.
 
-    For any joint angles; slides between a joint and the body that it turns count with their range, or 1 m without one.
+    It holds for any joint angles. Slides between a joint and the body that it turns count with their range, or 1 m
+    without a range.
     """
     reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
     found = np.ones(model.nv)
@@ -113,7 +114,7 @@ def levers(model: mujoco.MjModel) -> Array:
 
 
 def _base(model: mujoco.MjModel) -> set[int]:
-    """The bodies that carry what moves, up to the world, and everything fixed to the last of them."""
+    """The bodies that carry the moving bodies, up to the world, and everything fixed to the last of these."""
     fixed, base, carriers = model.body_weldid == 0, set[int](), set[int]()
     for body in np.flatnonzero(~fixed).tolist():
         above = int(model.body_parentid[body])
@@ -131,7 +132,7 @@ def _base(model: mujoco.MjModel) -> set[int]:
 
 
 def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
-    """Level planes that face up, and height fields."""
+    """Ids of level planes that face up, and of height fields."""
     planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (data.geom_xmat[:, 8] > _LEVEL)
     return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
 
@@ -143,7 +144,7 @@ def _at_rest(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def _touches(model: mujoco.MjModel, data: mujoco.MjData, ground: int) -> bool:
-    """Whether something that moves touches a geom, or is in it."""
+    """Whether a moving geom touches a geom, or is inside it."""
     pairs = touching_pairs(model, [ground])[:, 0].tolist()
     return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
 

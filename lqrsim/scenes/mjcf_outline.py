@@ -18,9 +18,9 @@ class Outline:
     """B balls.
 
     Attributes:
-      bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) where, in the axes of these, in metres.
-      radii: (B,) in metres. names: of the balls. sites: of the geoms whose middle they are in; None for the others.
-      missed: largest part of a capsule outside its balls, in metres.
+      bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) positions in the axes of these bodies,
+        in metres. radii: (B,) in metres. names: names of the balls. sites: names of the geoms in whose centre they are;
+        None for other balls. missed: largest part of a capsule outside its balls, in metres.
     """
 
     bodies: Array
@@ -32,9 +32,9 @@ class Outline:
 
 
 def outline_of(model: mujoco.MjModel) -> Outline:
-    """Spheres as they are, capsules as chains, other geoms as a ball about their middle that contains them.
+    """Spheres as balls, capsules as chains of balls, other geoms as a ball about their centre that contains them.
 
-    Geoms that are only drawn count if nothing collides. The last ball is in the middle of a geom.
+    Geoms that are only drawn count if nothing collides. The last ball is in the centre of a geom.
     """
     rows, names, sites, missed = list[tuple[int, Array, float]](), list[str](), list[str | None](), 0.0
     for geom in solid_geoms(model).tolist():

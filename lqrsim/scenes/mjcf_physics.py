@@ -1,4 +1,4 @@
-"""MuJoCo's own steps as numbers that compiled code can work with: addresses, sizes, and memory for several threads."""
+"""MuJoCo's own steps as numbers for compiled code: addresses, sizes, and memory for several threads."""
 
 import copy
 import ctypes
@@ -15,7 +15,7 @@ from lqrsim.machine import processors
 from lqrsim.scenes.scene import model_from_xml
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
-_CLOSE, _LOOKS = 1e-10, 100  # m, and iterations at most, of distances
+_CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
 _PARTS = {
     mujoco.mjtIntegrator.mjINT_EULER: "mj_Euler",
     mujoco.mjtIntegrator.mjINT_IMPLICIT: "mj_implicit",
@@ -28,23 +28,24 @@ class MjcfPhysics:
 
     The model is the MJCF's own, except that
 
-    - obstacles do not collide: they are for costs and constraints to keep clear of;
-    - controls are not cut off at their range, which would hide from a solver which way to go from there;
+    - obstacles do not collide: costs and constraints keep clear of them;
+    - controls are not clipped to their range, which would hide from a solver the direction back into the range;
     - the constraint solver ends nearer to its solution;
-    - what blows up is not reset.
+    - an unstable simulation is not reset.
 
     Args:
-      xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
+      xml: the MJCF as text. name: name of the MJCF in messages. body: id of the body that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
-      softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 as in the MJCF.
+      softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
+        impedance.
 
     Attributes:
-      model: MuJoCo's. numbers: what the kernel takes, with no wrench and no loads. team: the words that its threads
-        share. carriers: ids of the bodies that can carry a load, those that move and have mass.
+      model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
+        threads share. carriers: ids of the bodies that can carry a load: bodies that move and have mass.
 
     Raises:
-      InputError: joints and actuators do not describe its whole state.
+      InputError: joints and actuators do not describe the whole state.
     """
 
     def __init__(
@@ -67,12 +68,13 @@ class MjcfPhysics:
         self._exact = _for_distances(self.model)
         heavy = (self.model.body_treeid >= 0) & (self.model.body_mass > 0)
         self.carriers = tuple(np.flatnonzero(heavy).tolist())
-        # With loads each slot has a model of its own, which may be large; filters need one.
+        # With loads, each slot has its own model, which may be large; filters need one slot.
         slots = 2 if loaded else 2 * processors()
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
         self._data = [mujoco.MjData(self.model) for _ in range(2 * slots)]
         for data in self._data:
-            # MuJoCo writes to a file and the console about the first of each: there are no first ones.
+            # MuJoCo reports the first warning of each kind to a file and the console; here no warning counts as the
+            # first.
             for warning in range(len(data.warning.number)):
                 data.warning.number[warning] = 1
         self._flags = np.zeros(slots, dtype=np.int64)
@@ -137,20 +139,20 @@ def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
     model.geom_contype[listed] = model.geom_conaffinity[listed] = 0
     for geom in np.intersect1d(listed, [model.pair_geom1, model.pair_geom2])[:1]:
         who = model.geom(int(geom)).name
-        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype and conaffinity")
+        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
     option, flags = model.opt, mujoco.mjtDisableBit
     option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     option.tolerance = min(option.tolerance, _CONVERGED)
     if mujoco.__version__ == "4.0.0":
-        option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse ones its Newton solver is wrong
+        option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse Jacobians its Newton solver is wrong
 
 
 def _soften(model: mujoco.MjModel, width: float) -> None:
     """Let the impedance of contacts and limits rise from zero, over at least this depth in m or rad.
 
-    By default `solimp` is "0.9 0.95 0.001": a contact that is just reached has 90 % of its impedance, and what arrives
-    there at speed is stopped or not. From zero, a step is continuous.
+    By default `solimp` is "0.9 0.95 0.001": a contact that is just reached has 90 % of its impedance, so a body that
+    arrives at speed is either stopped or not. If the impedance rises from zero, a step is continuous.
     """
     for solimp in (model.geom_solimp, model.pair_solimp, model.jnt_solimp, model.tendon_solimp_lim):
         solimp[:, 0], solimp[:, 2] = 0.0, np.maximum(width, solimp[:, 2])
@@ -158,7 +160,7 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
 
 
 def touches(model: mujoco.MjModel, states: Array) -> bool:
-    """Whether a contact or a limit acts at one of these states (k, n), as `kernels/mjcf_dynamics.py` has them."""
+    """Whether a contact or a limit acts at one of these states (k, n), in the form of `kernels/mjcf_dynamics.py`."""
     data, kinds = mujoco.MjData(model), mujoco.mjtConstraint.__members__
     one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
     unturned = np.zeros(model.nq)
@@ -175,19 +177,19 @@ def touches(model: mujoco.MjModel, states: Array) -> bool:
 
 
 def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The same model with more exact distances, whose directions are gradients.
+    """The model with more exact distances, whose directions are gradients.
 
     With MuJoCo's own tolerance of 1e-6 m, the direction between two geoms that nearly touch can be a few degrees off.
     """
     exact = copy.copy(model)
     exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _CLOSE, max(_LOOKS, exact.opt.ccd_iterations)
-    exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the other way is wrong at a distance
+    exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the other algorithm is wrong at a distance
     return exact
 
 
 @cache
 def _yield() -> int:
-    """The address of a function that yields to other threads; 0 where there is none."""
+    """The address of a function that yields to other threads; 0 if there is none."""
     if platform.system() == "Windows":
         return 0
     return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0

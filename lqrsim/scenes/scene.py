@@ -1,18 +1,18 @@
 """Scenes: from an MJCF to a MuJoCo model and the obstacles that a robot must keep clear of.
 
-The one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and can
-collide is an obstacle.** Fixed to the world: no joint and no mocap between the geom and the world. Can collide:
-contype or conaffinity is not zero, and contacts are not switched off by a flag. So
+There is one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and
+can collide is an obstacle.** A geom is fixed to the world if there is no joint and no mocap between them. It can
+collide if contype or conaffinity is not zero, and contacts are not switched off by a flag. Therefore
 
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
-- planes are walls, floors and ceilings, infinite, at any drawn size, and solid behind. One that is parallel
-  to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
-- plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out. A robot
-  from an MJCF has MuJoCo's distances, to all types;
-- a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
+- planes are walls, floors and ceilings, infinite, at any drawn size, and solid behind. A plane that is parallel to the
+  plane in which a robot moves, such as the floor that it drives on, does not bound the robot (`World.seen_by`);
+- plane, sphere, capsule, cylinder and box have a distance. Other types are refused by name, not left out. A robot from
+  an MJCF uses MuJoCo's distances, to all types;
+- a cylinder or capsule counts as infinite if both ends lie on or behind planes, because nothing can reach them.
 
-`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out geoms that are not in
-the way of that robot.
+`obstacles=` of `load_scene` chooses other obstacles, by names or by a function. `MjcfRobot` leaves out geoms that are
+not in the way of that robot.
 """
 
 import contextlib
@@ -52,15 +52,15 @@ except Exception as error:
         f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
     ) from None
 
-# In the wheel models/ lies inside the package, in the repository beside it.
+# In the wheel, models/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
 _FLAGS = mujoco.mjtDisableBit
-DEEPEST = 490  # MuJoCo's reader refuses a little more
-_FLAT = 1e-9  # m, for geoms without a thickness
-MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
+DEEPEST = 490  # largest depth of elements; MuJoCo's reader refuses slightly more
+_FLAT = 1e-9  # m, thickness of geoms without one
+MOST_CELLS = 4096**2  # largest number of cells of a height field; MuJoCo crashes with far more
 
-MOST_COPIES = 1_000_000  # elements that <replicate> makes: some minutes of MuJoCo's, and GBs
-_COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of what they make
+MOST_COPIES = 1_000_000  # largest number of elements from <replicate>: they take MuJoCo minutes, and GBs
+_COPIERS = "replicate", "composite", "flexcomp"  # elements with a count of the elements that they make
 _MASSES = frozenset(
     (
         "mass", "density", "viscosity", "diaginertia", "fullinertia", "settotalmass", "boundmass", "boundinertia",
@@ -81,8 +81,8 @@ class Scene:
 
     Attributes:
       name: name of the packaged scene, or the stem of the file.
-      xml: the whole MJCF as text, includes resolved. It alone makes the model again.
-      model: compiled from `xml`.
+      xml: the whole MJCF as text, with includes resolved. The model can be made from it alone.
+      model: the model compiled from `xml`.
       world: the obstacles, as the module's docstring defines them.
       geoms: ids of their geoms in the model, in the same order.
     """
@@ -117,9 +117,9 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
 
     Args:
       name_or_path: a name in models/, or the path of an MJCF file.
-      obstacles: which geoms fixed to the world are obstacles: all that can collide; none, with False; names of geoms,
-        or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says whether it
-        is one.
+      obstacles: the geoms fixed to the world that are obstacles: all that can collide; none, with False; names of
+        geoms, or of bodies for all of their geoms; or a function that says whether a geom, as from
+        `model.geom(number)`, is an obstacle.
 
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
@@ -130,7 +130,7 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
 
 
 def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
-    """The name and the whole text of an MJCF, includes resolved; as `load_scene`."""
+    """The name and the whole text of an MJCF, with includes resolved. Raises InputError as `load_scene`."""
     path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
     if path.suffix.lower() != ".xml":
         packaged = names()
@@ -151,10 +151,10 @@ def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
     """The model of an MJCF given as text, without includes.
 
     Args:
-      what: its name in messages.
+      what: name of the MJCF in messages.
 
     Raises:
-      InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
+      InputError: MuJoCo refuses the MJCF, or would crash, or the MJCF contains a NaN.
     """
     _check_elements(xml, what)
     try:
@@ -173,7 +173,7 @@ def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
 
 
 def checked_model(xml: str, name: str) -> mujoco.MjModel:
-    """The model of a scene's MJCF. Raises InputError as `model_from_xml`, and where MuJoCo solves it wrongly."""
+    """The model of a scene's MJCF. Raises InputError as `model_from_xml`, and if MuJoCo would solve it wrongly."""
     model = model_from_xml(xml, f"scene {name}")
     if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
         # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
@@ -185,7 +185,7 @@ def checked_model(xml: str, name: str) -> mujoco.MjModel:
 
 
 def scene_of(xml: str, name: str, model: mujoco.MjModel, geoms: Sequence[int], kinds: Collection[str] = KINDS) -> Scene:
-    """The scene in which these geoms are the obstacles. Raises InputError if one is not of these kinds."""
+    """The scene in which these geoms are the obstacles. Raises InputError if a geom is not of these kinds."""
     return Scene(name, xml, model, World(_obstacles(model, name, geoms, kinds)), tuple(geoms))
 
 
@@ -193,10 +193,10 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
     """Ids of the geoms that the `obstacles=` of `load_scene` chooses.
 
     Args:
-      default: those with True. what: its name in messages.
+      default: the geoms for True. what: name of the scene in messages.
 
     Raises:
-      InputError: no geom or body that is fixed to the world has such a name, or it is no choice.
+      InputError: no geom or body that is fixed to the world has such a name, or the argument is no choice.
     """
     if isinstance(obstacles, bool):
         return list(default) if obstacles else []
@@ -204,9 +204,9 @@ def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int
     if callable(obstacles):
         try:
             return [geom for geom in fixed if obstacles(model.geom(geom))]
-        except Exception as error:  # whatever a user's function may raise becomes one line
+        except Exception as error:  # any exception of a user's function becomes one line
             raise InputError(
-                f"{what}: obstacles: got {type(error).__name__} ({error}), want a rule for geoms"
+                f"{what}: obstacles: got {type(error).__name__} ({error}), want a function of a geom that does not fail"
             ) from error
     wanted = "True, False, names of geoms or bodies, or a function of a geom"
     if isinstance(obstacles, str):
@@ -230,7 +230,7 @@ def unlogged() -> Iterator[None]:
     """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
     otherwise.
 
-    Several threads may be in it: the last to leave restores the state before the first.
+    Several threads may be in this context. The last to leave restores the state before the first.
     """
     global _count, _before
     with _quiet:
@@ -249,7 +249,7 @@ def unlogged() -> Iterator[None]:
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """A name for an element without one in the MJCF: this, with underscores after it if it is taken."""
+    """A name for an element without a name in the MJCF: the given name, with underscores appended if it is taken."""
     while name in taken:
         name += "_"
     return name
@@ -265,20 +265,20 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def geom_names(model: mujoco.MjModel) -> list[str]:
-    """The names of all geoms, empty for those without one."""
+    """The names of all geoms, empty for geoms without a name."""
     text = model.names
     return [text[first : text.index(b"\0", first)].decode() for first in model.name_geomadr.tolist()]
 
 
 def _check_elements(xml: str, what: str) -> None:
-    """Raises InputError where MuJoCo would crash or not complain: excessive counts, or NaN for unknown numbers.
+    """Raises InputError where MuJoCo would crash or stay silent: for excessive counts, or NaN for unknown numbers.
 
-    It takes a NaN for the mass or density of a geom as if there were none.
+    MuJoCo treats a NaN for the mass or density of a geom as a missing number.
     """
     text = xml.lower()
     rare = any(word in text for word in (*_COPIERS, "hfield", "nan"))
     if not rare and xml.count("</") < DEEPEST and xml.count("<") <= MOST_COPIES:
-        return  # files of thousands of geoms are not read once more
+        return  # files of thousands of geoms are not read again
     reader, depth, copies = ElementTree.XMLPullParser(["start", "end"]), 0, [1]
     try:
         reader.feed(xml)
@@ -307,16 +307,16 @@ def _check_elements(xml: str, what: str) -> None:
                     raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
     except (ElementTree.ParseError, ValueError) as error:
         if isinstance(error, InputError):
-            raise  # the rest is for MuJoCo to say
+            raise  # MuJoCo reports all other errors
 
 
 def _product(text: str) -> int:
-    """The count of an element of an MJCF, of several numbers their product; 1 if MuJoCo itself refuses it."""
+    """The count in an element of an MJCF, or the product of several counts; 1 if MuJoCo itself refuses it."""
     return math.prod(max(int(number), 1) for number in re.findall(r"(?<!\S)\+?(\d+)(?!\S)", text))
 
 
 def _check_numbers(model: mujoco.MjModel, what: str) -> None:
-    """Raises InputError if the model has a NaN, which MuJoCo only warns about, or a time step in which none passes."""
+    """Raises InputError if the model contains a NaN, about which MuJoCo only warns, or its timestep is not positive."""
     if not 0 < model.opt.timestep < np.inf:
         raise InputError(f"{what}: got the timestep {model.opt.timestep:g}, want a finite number of seconds above 0")
     for field in ("gravity", "wind", "magnetic"):
@@ -377,9 +377,9 @@ def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
 
 
 def _flatten(path: Path) -> str:
-    """The MJCF at `path` as one text: includes in place, files of meshes and textures by their full path.
+    """The MJCF at `path` as one text: with includes in place, and files of meshes and textures by their full path.
 
-    MuJoCo can write a model as text too, but with six digits, which is another model.
+    MuJoCo can also write a model as text, but with six digits, which gives another model.
     """
     seen: set[Path] = set()
 

@@ -1,4 +1,4 @@
-"""Obstacles as primitives, and the world of them; `kernels/signed_distance.py` has the distance to each."""
+"""Obstacles as geometric primitives, and the world, a set of them. `kernels/signed_distance.py` has the distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,7 +16,7 @@ SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
-# MuJoCo's types without a distance here; distances of a robot from an MJCF are MuJoCo's own.
+# MuJoCo's types for which no distance is implemented here. Robots from an MJCF use MuJoCo's distances.
 OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 
@@ -26,14 +26,15 @@ class Obstacle:
 
     Attributes:
       name: name of the geom in the MJCF.
-      kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` has one.
+      kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` computes
+        distances.
       position: (3,) in metres.
-      rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
+      rotation: (3, 3) with the local axes as columns. The free side of a plane is its local +z; capsules and cylinders
         lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
-        the half length is; box half lengths, and for other kinds those of the bounding box; plane (0, 0, 0).
-      velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
-        it into account; in the scene that MuJoCo simulates it stands still.
+        the half length is; box half lengths, and for other kinds the half lengths of the bounding box; plane (0, 0, 0).
+      velocity: (3,) in m/s, of an obstacle that moves in a straight line; `position` is its position at time 0. Plans
+        take the velocity into account; in the scene that MuJoCo simulates, the obstacle stands still.
     """
 
     name: str
@@ -61,7 +62,7 @@ class Obstacle:
     def _of_mujoco(
         cls, name: str, kind: str, position: Array, rotation: Array, size: Array, velocity: Array
     ) -> "Obstacle":
-        """One that MuJoCo has compiled, and that needs no checks: of these there can be tens of thousands."""
+        """Make an obstacle that MuJoCo has compiled, without checks: there can be tens of thousands."""
         made = object.__new__(cls)
         vars(made).update(name=name, kind=kind, position=position, rotation=rotation, size=size, velocity=velocity)
         return made
@@ -116,7 +117,7 @@ class World:
         return any(obstacle.velocity.any() for obstacle in self.obstacles)
 
     def displacements(self, times: npt.ArrayLike) -> Array:
-        """Displacements of the obstacles since the time 0 of the run.
+        """Displacements of the obstacles since time 0 of the run.
 
         Args:
           times: (K,) in s.
@@ -134,7 +135,7 @@ class World:
           times: (K,) in s.
 
         Returns:
-          (K, len(self), ROW); (1, len(self), ROW) where no obstacle moves.
+          (K, len(self), ROW); (1, len(self), ROW) if no obstacle moves.
         """
         if not self.moving:
             return self.table[None]
@@ -144,12 +145,12 @@ class World:
         return tables
 
     def moved(self, seconds: float) -> "World":
-        """The world some time later: each obstacle has moved at its velocity.
+        """The world at a later time: each obstacle has moved at its velocity.
 
         An obstacle that is seen at the time t of a run goes into its problem as `ls.World([seen]).moved(-t)`.
 
         Args:
-          seconds: how much later; a negative number is earlier.
+          seconds: the delay in seconds; negative for an earlier time.
         """
         seconds = check_number("seconds", seconds)
         moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]
@@ -158,22 +159,22 @@ class World:
     def seen_by(self, plane: str, offset: float | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
 
-        A robot in space ("xyz") sees this world itself. A plane has its two axes as x and y, in their order; its third
-        axis is across.
+        A robot in space ("xyz") sees this world itself. For a plane, its two axes become x and y, in their order; the
+        third axis is normal to it.
 
-        With an offset, this world is cut there: distances are in space, from the points of the plane. The robot is a
-        ball, obstacles beside the plane do not touch it, and a floor is a wall. Without one, in a horizontal plane, the
-        world is seen from above: the robot is as high as everything, upright obstacles reach from the floor to the sky,
-        and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the horizontal
-        one that is the floor.
+        With an offset, this world is cut by the plane: distances are in space, from the points of the plane. The robot
+        is a ball, obstacles next to the plane do not touch it, and a floor is a wall. Without an offset, in a
+        horizontal plane, the world is seen from above: heights do not count, upright obstacles are infinitely high, and
+        a sphere counts with its equator. In both cases, planes parallel to the robot's plane, such as the floor under a
+        horizontal plane, bound nothing.
 
         Args:
           plane: as in `Coordinates`.
           offset: as in `Coordinates`, in metres.
 
         Raises:
-          InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
-            so that it has no outline among the primitives.
+          InputError: there is no such plane; a vertical plane has no offset; or, seen from above, an obstacle is
+            tilted, so that its outline is no primitive.
         """
         check_name("plane", plane, (SPACE, *PLANES))
         offset = None if offset is None else check_number("offset", offset)
@@ -181,7 +182,7 @@ class World:
             return self
         if offset is None and plane not in ("xy", "yx"):
             raise InputError(
-                f"offset: got none for the plane {plane!r}, want where it is along its third axis, in metres"
+                f"offset: got none for the plane {plane!r}, want its coordinate along the third axis, in metres"
             )
         seen = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
         if plane == "xy" and offset is None:
@@ -209,7 +210,7 @@ class World:
     def distances(self, point: npt.ArrayLike) -> Array:
         """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
 
-        Points (2,) are for a world that is seen by a robot in the plane, and in its coordinates.
+        Points (2,) are for a world that is seen by a robot in the plane, in its coordinates.
 
         Args:
           point: (3,), or (2,) in a plane, in metres.
@@ -248,7 +249,7 @@ class World:
 
 
 def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
-    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for anything else."""
+    """Points (..., 2 or 3), or a single point, as an array. Raises InputError for anything else."""
     array = real(field, points)
     if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
         raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")
@@ -256,13 +257,13 @@ def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
 
 
 def _parallel(obstacle: Obstacle, across: int) -> bool:
-    """Whether it is a plane whose normal is along that axis of the world."""
+    """Whether an obstacle is a plane with its normal along that axis of the world."""
     return obstacle.kind == "plane" and bool(abs(abs(obstacle.rotation[across, 2]) - 1) < 1e-9)
 
 
 def _from_above(obstacle: Obstacle) -> Obstacle:
-    """The obstacle with infinite height; planes are as they are. Raises InputError if it is tilted."""
-    upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # which local axis is vertical, if one is
+    """The obstacle with infinite height; planes are unchanged. Raises InputError if it is tilted."""
+    upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # flags of a vertical local axis
     size = obstacle.size.copy()
     match obstacle.kind:
         case "sphere":

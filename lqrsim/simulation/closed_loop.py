@@ -47,38 +47,38 @@ def simulate(
     progress: Callable[[int, int], object] | None = None,
     watch: Callable[[float, Array, npt.NDArray[np.bool_]], object] | None = None,
 ) -> Rollout:
-    """Run a policy, or anything else that controls, closed-loop in the plant's physics, from a plan's first state.
+    """Run a policy or another controller closed-loop in the plant's physics, from a plan's first state.
 
     In each control period: read the true state, measure it, compute the control, disturb it, saturate it, apply
     disturbing forces, step the physics, and let the state jump.
 
     A trial ends with its first collision, as `collisions.py` defines it, when its simulation becomes unstable, when the
-    filter of its controller diverges, or when the controller fails: it raises an exception, which ends all trials that
-    it computes together, or returns invalid controls. Records after a collision do not count; in the other cases they
-    are NaN.
+    filter of its controller diverges, or when the controller fails. A controller fails if it raises an exception, which
+    ends all trials that it computes together, or if it returns invalid controls. Records after a collision do not
+    count. In the other cases they are NaN.
 
     Args:
       plant: robot and scene to run.
       plan: a solution or another plan, which gives the first state, the duration, and the reference for comparisons. By
-        default the controller's own plan, which an `OffsetFree` and a `Replanner` have.
+        default the controller's own plan; an `OffsetFree` and a `Replanner` have their own.
       controller: computes the controls; by default the plan's policy. Another policy, with or without a filter; a
         `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
-      disturbances: in the order in which they act. Each has its own stream of random numbers. A `Noise` of a problem is
-        one, too.
+      disturbances: in the order in which they act. Each has its own stream of random numbers. The `Noise` of a problem
+        is allowed, too.
       seed: seed of all random numbers.
       trials: number of trials.
-      first_trial: number of the first one; trial `i` of a seed is bit-identical, independent of the trials beside it.
-      goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or
-        a tenth of the way if the plan starts within it.
-      goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
+      first_trial: number of the first trial. Trial `i` of a seed is bit-identical, whatever other trials run with it.
+      goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or a tenth
+        of the distance to the goal if the plan starts within the radius.
+      goal_tolerance: the tolerance for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` has the details.
-      frames: whether to record the data for drawing, also between the control periods; without it there is no video.
-      contacts: whether obstacles stop the robot, from the control period of its first collision on. Without, it moves
-        through them; this takes a quarter less time, is bit-identical until the collision, and has the same outcome. In
-        another simulator than MuJoCo it always moves through them.
+      frames: whether to record the data for drawing, including times between the control periods; needed for a video.
+      contacts: whether obstacles stop the robot, from the control period of its first collision on. If False, the robot
+        moves through them. This takes a quarter less time, is bit-identical until the collision, and has the same
+        outcome. In simulators other than MuJoCo the robot always moves through obstacles.
       threads: number of MuJoCo's threads; by default one per processor.
-      generators: (trial, number of the disturbance) -> its random generator, instead of those of the seed.
-      progress: called after each control period with the number of finished periods and that of all.
+      generators: (trial, number of the disturbance) -> its random generator, instead of the generators of the seed.
+      progress: called after each control period with the number of finished periods and the number of all periods.
       watch: called with each frame: its time, MuJoCo's qpos (K, nq), and which trials are unstable (K,).
 
     Returns:
@@ -193,7 +193,7 @@ class ClosedLoop:
         self.records.knot(step, self.states, measured, self.collisions.clearance)
         self.records.lose(step, self.physics.unstable | _not_finite(measured))
         over = self.records.over(step)
-        if over.any():  # trials that have ended continue in the plan's states, so that they do not disturb the others
+        if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
             measured[over] = self.settings.trajectory.states[step]
         return measured
 
@@ -249,7 +249,7 @@ class ClosedLoop:
             self._show(physics.drawn(period))
 
     def _show(self, frames: Sequence[Array]) -> None:
-        """Record frames, and pass them to `watch`."""
+        """Record the frames, and pass them to `watch`."""
         records, physics, watch = self.records, self.physics, self.settings.watch
         for frame in frames:
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
@@ -258,7 +258,7 @@ class ClosedLoop:
                 watch(time, frame, physics.unstable)
 
     def detect_contacts_at_end(self) -> None:
-        """Detect contacts at the last knot, after which there is no period."""
+        """Detect contacts at the last knot, which no period follows."""
         if not self.physics.senses_contacts:
             return
         plan, touching = self.settings.trajectory, self.physics.touching_now()
@@ -339,6 +339,6 @@ def _not_a_number(command: Array, names: Sequence[str]) -> str:
 def _not_finite(rows: Array) -> npt.NDArray[np.bool_]:
     """Whether each row has a number that is not finite, (K,)."""
     finite = np.isfinite(rows)
-    if finite.all():  # far quicker than looking at each row
+    if finite.all():  # much faster than testing each row
         return np.zeros(len(rows), dtype=bool)
     return ~np.all(finite, axis=1)

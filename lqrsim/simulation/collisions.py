@@ -1,9 +1,10 @@
 """The definition of a collision: the first moment at which the robot of a trial touches an obstacle.
 
-It touches one if the signed distance of its position, or of one of its balls or geoms, minus the radius is negative; or
-if MuJoCo detects a contact. Detection uses states without obstacle contacts, so that it is bit-identical whether an
-obstacle then stops the robot or not. It checks the knots, the parts of a control period that `Physics` has, and
-straight lines between them.
+The robot touches an obstacle if MuJoCo detects a contact, or if a signed distance minus the radius is negative. The
+distance is measured from the robot's position, or from one of its balls or geoms. Detection uses states without
+obstacle
+contacts, so its result is bit-identical whether or not an obstacle then stops the robot. It checks the knots, the parts
+of a control period that `Physics` has, and straight lines between them.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from lqrsim.errors import Array
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
-FINEST = 0.02  # smallest step along a line, relative to the radius; a step is the clearance if that is larger
+FINEST = 0.02  # smallest step along a line, relative to the radius; a larger clearance is itself the step
 MOST = 1000  # steps along a line
 
 
@@ -53,7 +54,7 @@ class Collisions:
             if len(self.plant.world):
                 self._search_line(step, part, parts, self.shape.places(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
-        # A time in the period may be rounded to beyond its end.
+        # Rounding may put a time in the period past the period's end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
         return found
 
@@ -68,7 +69,7 @@ class Collisions:
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Check the lines from the robot's last places to these, (K, B, 2 or 3) or (K, 1, n)."""
+        """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
         length = self.shape.travel(last, there)

@@ -25,18 +25,18 @@ UNSTABLE = [
 
 
 class MujocoPhysics(Physics):
-    """MuJoCo's. Robots pass through obstacles until `rerun_with_contacts` makes these solid for them.
+    """MuJoCo's physics. Robots pass through obstacles until `rerun_with_contacts` makes the obstacles solid for them.
 
     Until then a simulation is bit-identical with and without later contacts. If the robot can touch something at a
     clearance above 0, contacts are sensed without a force.
 
     Args:
       substeps: physics steps per control period.
-      contacts: whether obstacles may become solid; without them it takes a quarter less time.
+      contacts: whether obstacles may become solid; without them a run takes a quarter less time.
       threads: number of threads; by default one per processor.
 
     Attributes:
-      simulations: MuJoCo's. solid: (K,) whether the obstacles of each are solid.
+      simulations: MuJoCo's simulations. solid: (K,) whether the obstacles of each are solid.
     """
 
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
@@ -80,7 +80,8 @@ class MujocoPhysics(Physics):
         """Make obstacles passable, and update all fields that depend on the `altered` ones."""
         model = self.simulations.model
         if altered:
-            # While obstacles are still solid: MuJoCo also determines here which bodies can collide at all.
+            # This happens while obstacles are still solid, because MuJoCo also determines here which bodies can collide
+            # at all.
             self.simulations.set_const()
         geoms = np.array([model.geom(name).id for name in self.plant.obstacles], dtype=np.intp)
         if self.senses_contacts:
@@ -122,7 +123,7 @@ class MujocoPhysics(Physics):
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
         """Let the states of some or all trials jump by (K, n) at the end of a period.
 
-        Positions of MuJoCo that are not in the state, such as the wheels' angles or a small tilt, do not change.
+        MuJoCo's positions that are not in the state, such as the wheels' angles or a small tilt, do not change.
         """
         which = np.arange(len(jumps)) if rows is None else rows
         states, robot = period.states[-1][which], self.plant.robot
@@ -166,7 +167,7 @@ class MujocoPhysics(Physics):
                 self.simulations.step(rows, nstep=self._part)
             except batch.SimulationError as error:
                 self.unstable[error.ids] = True
-            # MuJoCo resets an unstable simulation and goes on; only its warnings show it.
+            # MuJoCo resets an unstable simulation and continues; only its warnings show it.
             warned = self.simulations.warning[..., 1]
             if warned.any():
                 self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)

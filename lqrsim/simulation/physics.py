@@ -34,7 +34,7 @@ class Period:
 
 
 class Physics(abc.ABC):
-    """K simulations of a plant. `place`, then changes of the models, then `prepare`, then `advance` again and again.
+    """K simulations of a plant. Call `place`, then change the models, then `prepare`, then `advance` repeatedly.
 
     Attributes:
       parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
@@ -53,7 +53,7 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def place(self, states: Array) -> None:
-        """Put the robots into analytic states (K, n)."""
+        """Put the robots into these analytic states (K, n)."""
 
     @abc.abstractmethod
     def multiply(self, parameter: str, factors: Array) -> None:
@@ -92,7 +92,7 @@ class Physics(abc.ABC):
         raise NotImplementedError
 
     def touching_now(self) -> npt.NDArray[np.bool_]:
-        """Whether each robot touches each obstacle now, (K, obstacles). The simulations must not go on after it."""
+        """Whether each robot touches each obstacle now, (K, obstacles). The simulations must not advance afterwards."""
         raise NotImplementedError
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
@@ -116,7 +116,7 @@ class SimulatorPhysics(Physics):
 
     def multiply(self, parameter: str, factors: Array) -> None:
         if parameter not in self._simulator.parameters:
-            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, which cannot change it")
+            raise InputError(f"{parameter}: got a plant simulated by {self._simulator.name}, want one that can")
         self._factors[parameter] = self._factors.get(parameter, 1.0) * factors
 
     def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
@@ -126,14 +126,14 @@ class SimulatorPhysics(Physics):
         )
 
     def displace(self, displaced: Array) -> None:
-        """Nothing: collisions are found where the obstacles are."""
+        """Do nothing: collisions are computed from the positions of the obstacles."""
 
     def prepare(self, *, altered: bool) -> None:
         self._simulations = self._simulator.start(self._states, self._factors, self.plant.timestep)
         self._look()
 
     def _look(self) -> None:
-        """Read the states, all NaN where one is not finite."""
+        """Read the states. A state with an entry that is not finite becomes NaN."""
         self._states = states_of(self._simulator, self._simulations, self._states.shape)
         lost = ~np.isfinite(self._states).all(axis=1)
         self._states[lost], self.unstable[lost] = np.nan, True

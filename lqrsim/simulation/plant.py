@@ -1,6 +1,6 @@
 """A robot in a scene: the MuJoCo model of both, and the places of the robot's states and actuators in it.
 
-With a `Simulator` the robot moves as that says; the MuJoCo model then has the obstacles and the pictures.
+With a `Simulator`, the simulator moves the robot. The MuJoCo model then provides the obstacles and the pictures.
 """
 
 import copy
@@ -37,7 +37,7 @@ class Plant:
     Attributes:
       robot: the robot, with its dynamics and limits.
       scene: the scene, with its MJCF and obstacles.
-      simulator: whose physics moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo's.
+      simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
       shape: the robot's geoms, its balls, or the ball at its position among the obstacles.
       world: the obstacles for it; none for a robot that has neither geoms nor balls nor a position.
       obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
@@ -51,7 +51,8 @@ class Plant:
 
     Raises:
       InputError: the scene lacks the robot's body, a joint, an actuator or a wheel; the robot's maps to MuJoCo's arrays
-        do not fit these; or its position is not that of its body in MuJoCo. The simulator cannot simulate the robot.
+        do not fit these; its position differs from its body's position in MuJoCo; or the simulator cannot simulate the
+        robot.
     """
 
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
@@ -63,11 +64,9 @@ class Plant:
             check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)
         plant_validation.check_names(robot, scene)
         self.robot, self.scene, self.simulator = robot, scene, simulator
-        self._step: float | None = None  # s, instead of the MJCF's
+        self._step: float | None = None  # s, in place of the timestep of the MJCF
         if robot.geoms is not None and not robot.geoms.of_scene(scene):
-            raise InputError(
-                f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles"
-            )
+            raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
         in_space = self.shape.centers is not None and not self.shape.in_plane
         bounded = "radius" not in robot.shape or robot.dynamics.state_coordinates.position
@@ -92,7 +91,7 @@ class Plant:
             if self.obstacles != self.world.names:
                 raise InputError(
                     f"simulator: got {simulator.name} for robot {robot.name}, which has neither a position nor balls to"
-                    f" find its collisions by, want one that has"
+                    f" find its collisions by, want a robot that has one"
                 )
             simulator.check(robot)
 
@@ -120,10 +119,10 @@ class Plant:
           InputError: it cannot.
         """
         if self.simulator is not None and parameter not in self.simulator.parameters:
-            raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, which cannot have it")
+            raise InputError(f"{what}: got a plant simulated by {self.simulator.name}, want one that can have it")
 
     def for_period(self, period: float) -> "Plant":
-        """The same plant with the longest physics step, up to its own, that divides a control period.
+        """The plant with the longest physics step that divides a control period and does not exceed the present step.
 
         A plan with a free duration has a period that the MJCF cannot know.
 
@@ -170,12 +169,12 @@ class Plant:
 
     @cached_property
     def without_contacts(self) -> mujoco.MjModel:
-        """The same model, but the robot passes through obstacles, and contacts are not sensed."""
+        """A copy of the model in which the robot passes through obstacles, and contacts are not sensed."""
         return self._compile(contacts=False)
 
     @cached_property
     def enclosed(self) -> bool:
-        """Whether all parts of the robot that collide are within its radius, so that it touches nothing before.
+        """Whether all colliding parts of the robot are within its radius, so that no part touches an obstacle earlier.
 
         For balls and geoms this is not known.
         """
@@ -189,8 +188,8 @@ class Plant:
         Args:
           qpos: (..., nq) of MuJoCo.
           qvel: (..., nv) of MuJoCo.
-          act: (..., na), activations of the actuators.
-          near: (..., n), for angles in the nearest representative; None for any representative.
+          act: (..., na), the activations of the actuators.
+          near: (..., n), a state; angles are returned in the representative nearest to it. None for any representative.
 
         Returns:
           (..., n).
@@ -201,9 +200,9 @@ class Plant:
         return np.concatenate([state, vectors_of("act", act, self.robot.activations)], axis=-1)
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
-        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls the least of all.
+        """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls, the least over all.
 
-        For geoms it is that of the nearest one, by MuJoCo.
+        For geoms, the distance of the nearest geom, by MuJoCo.
 
         Args:
           states: (..., n).
@@ -228,7 +227,7 @@ class Plant:
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
 
-        A robot with neither balls nor a position has one about what of it is farthest out.
+        A robot with neither balls nor a position is represented by a ball about its outermost part.
 
         Args:
           planned: states (T+1, n).
@@ -255,7 +254,7 @@ class Plant:
         return BallRecord(driven=places, planned=planned, radii=balls.radii, anchors=anchors)
 
     def _places_on(self, number: int, place: Array, states: Array) -> Array:
-        """Where a point of a body is, (k, 1, 3), in these states (k, n)."""
+        """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
         data, found = mujoco.MjData(self.model), np.zeros((len(states), 1, 3))
         for k, qpos in enumerate(self.robot.configuration(states)[0]):
             data.qpos[self.qpos] = qpos
@@ -282,7 +281,7 @@ class Plant:
             # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
             again = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
-            raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None
+            raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
         if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
             raise InputError(f"scene {self.scene.name}: got a model that differs from its xml, want one of load_scene")
@@ -313,14 +312,14 @@ class Plant:
 
 
 def extent(plant: Plant) -> float:
-    """An upper bound of the distance from its position at which the robot can touch something, in m; exact for balls.
+    """An upper bound of the distance from its position at which the robot can touch an obstacle, in m; exact for balls.
 
-    From above for a robot that is seen from above; else in space, for any plane. Moving parts count in all places that
-    their joints allow without limits.
+    The distance is seen from above for a robot that is seen from above; else it is the distance in space, for any
+    plane. Moving parts count in all positions that their joints would allow without limits.
     """
     model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
     space, rng = dynamics.state_coordinates, np.random.default_rng(0)
-    axes = [0, 1] if space.from_above else [0, 1, 2]  # of the world, for distances
+    axes = [0, 1] if space.from_above else [0, 1, 2]  # axes of the world that count for distances
     off, states = 0.0, rng.standard_normal((9, len(space)))
     states[-1] = 0.0  # the last state, for the geoms below
     for state in states:
@@ -329,7 +328,7 @@ def extent(plant: Plant) -> float:
         place = space.in_world(state[list(space.position)])
         off = max(off, float(np.linalg.norm((data.xpos[plant.body] - place)[axes])))
     obstacles = [model.geom(name).id for name in plant.obstacles]
-    thick = model.geom_margin + model.geom_gap  # at which MuJoCo sees a contact
+    thick = model.geom_margin + model.geom_gap  # distance at which MuJoCo detects a contact
     thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True

@@ -33,16 +33,16 @@ class PlantCheck:
       units: units of the states.
       errors: (n,) the largest difference of each state over the samples, in its unit.
       changes: (n,) the largest change of each state that the dynamics predict.
-      period: in seconds.
+      period: control period in seconds.
       state: (n,), the sample with the largest error of the worst state.
-      control: (m,), of this sample.
+      control: (m,), the control of this sample.
       simulated: (n,), the state after this sample in the simulator.
       predicted: (n,), the state after this sample by the dynamics.
       tolerance: largest allowed value of `relative`.
       samples: number of random states.
       contacts: pairs of geoms that touched, each with its number of samples, the most frequent first. The dynamics may
         not know of these contacts.
-      simulator: name of what simulated.
+      simulator: name of the simulator.
     """
 
     names: Annotated[tuple[Line, ...], "n"]
@@ -68,7 +68,7 @@ class PlantCheck:
 
     @property
     def relative(self) -> Array:
-        """(n,) errors relative to the changes, or to a thousandth of the largest change if that is more."""
+        """(n,) errors relative to the changes; a change counts as at least a thousandth of the largest one."""
         return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
 
     @property
@@ -119,22 +119,23 @@ def check_plant(
 ) -> PlantCheck:
     """Compare a robot's dynamics with its MJCF over one control period, from random states.
 
-    A different mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
-    Geoms that are no obstacles in runs stay: the floor that the robot stands on, or planes parallel to its own.
+    A wrong mass, sign or unit shows in the states on which it acts. `Plant.obstacles` are removed, floors included.
+    Geoms that are no obstacles in runs stay: the floor that the robot stands on, or planes parallel to the robot's
+    plane.
     Contacts with these, and between moving parts, are in the result, by the names of the geoms.
 
     Args:
       robot: the robot, with its dynamics.
       scene: a scene whose MJCF has the robot.
-      simulator: what the dynamics are compared with in place of MuJoCo; it knows of no contacts.
+      simulator: a simulator to compare the dynamics with, in place of MuJoCo; it does not report contacts.
       problem: a problem of the robot. The random states keep its StateBounds, and the controls its limits: beyond them
         the dynamics need not hold.
-      period: in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
+      period: control period in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
       around: (n,) mean of the random states; by default the problem's start, or zero.
       spread: their standard deviation, in each state's unit.
       controls: lowest and highest random control, (m,) each; by default the limits of the problem, or the dynamics'.
-      settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as those of
-        wheels; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
+      settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
+        speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
       tolerance: largest allowed error, relative to the largest change of the state.
       seed: seed of all random numbers.
@@ -191,14 +192,14 @@ class _Sample(NamedTuple):
 
 
 def _checked(problem: Problem, robot: Robot) -> Problem:
-    """The problem. Raises InputError unless it is one of the robot's states and controls."""
+    """The problem. Raises InputError unless it has the robot's states and controls."""
     check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
     check_same_system("problem", "one", spaces_of(problem.dynamics), spaces_of(robot.dynamics), "the robot")
     return problem
 
 
 def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> tuple[Array, Array]:
-    """The lowest and the highest state, (n,) each, infinite where there is no bound, with the mean between them."""
+    """The lowest and the highest state, (n,) each, infinite where unbounded, and the mean, which lies between them."""
     names = robot.dynamics.state_coordinates.names
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for one in () if problem is None else problem.constraints:
@@ -280,7 +281,7 @@ def _in_simulator(
         if not np.isfinite(after).all():
             raise InputError(
                 f"{simulator.name}: got a state that is not finite, from x = {np.array2string(state, precision=3)},"
-                f" u = {np.array2string(control, precision=3)}, want a simulator that starts there"
+                f" u = {np.array2string(control, precision=3)}, want a finite state after each step"
             )
         states.append(after)
     before = dynamics.state_coordinates.nearest(states[1], state)
@@ -291,7 +292,7 @@ def _in_simulator(
 def _worst_of(
     found: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
 ) -> PlantCheck:
-    """The check of all samples, with the sample that has the largest error of the worst state."""
+    """The result over all samples, with the sample in which the worst state has its largest error."""
     errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in found])
     changes = np.array([np.abs(sample.predicted - sample.before) for sample in found])
     space, first = robot.dynamics.state_coordinates, found[0]

@@ -1,4 +1,4 @@
-"""Checks that a robot fits a scene: its names exist, its maps fit MuJoCo's arrays, and its position is its body's."""
+"""Checks that a robot fits a scene: its names exist, its maps fit MuJoCo's arrays, and its body is at its position."""
 
 import itertools
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from lqrsim.scenes.world import PLANES, SPACE
 if TYPE_CHECKING:
     from lqrsim.simulation.plant import Plant
 
-OFF = 1e-4  # allowed error of positions in m, and of moves by a metre; numbers in an MJCF have six digits
+OFF = 1e-4  # allowed error in m of positions, and of moves by a metre; numbers in an MJCF have six digits
 UNLIMITED = 1e9  # used for an infinite limit of a control
 MIXED = 10  # largest number of controls for which all corners of the limits are checked
 
@@ -58,7 +58,7 @@ def check_names(robot: Robot, scene: Scene) -> None:
 
 
 def _present(kind: str, names: list[str]) -> str:
-    """A list of the names, and of the elements that have none, for a message."""
+    """A list of the names, and of the elements without a name, for a message."""
     named, unnamed = list(filter(None, names)), [str(number) for number, name in enumerate(names) if not name]
     if kind not in ("joint", "actuator") or not unnamed:
         return ", ".join(named) or "none"
@@ -67,7 +67,7 @@ def _present(kind: str, names: list[str]) -> str:
 
 
 def check_maps(plant: "Plant") -> None:
-    """Raise InputError unless the robot's maps fit its joints and actuators, and its position is that of its body."""
+    """Raise InputError unless the robot's maps fit its joints and actuators, and its body is at its position."""
     robot = plant.robot
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
@@ -168,7 +168,7 @@ def anchor_of(model: mujoco.MjModel, site: str) -> Array:
 
 
 def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
-    """Raise InputError unless the centre of each ball that names a site or a geom is there in MuJoCo."""
+    """Raise InputError unless each ball that names a site or a geom has its centre there in MuJoCo."""
     robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
     who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
     names = [model.site(number).name for number in range(model.nsite)]
@@ -196,7 +196,7 @@ def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
 
 
 def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:
-    """How each position state moves the body, and how to mend it."""
+    """A message that says how each position state moves the body, and how to correct this."""
     exact = np.abs(np.round(moves) - moves).max() <= OFF
     rows = np.round(moves)
     directions = [_direction(row) for row in (rows if exact else moves)]

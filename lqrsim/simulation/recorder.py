@@ -19,9 +19,9 @@ class Recorder:
     Attributes:
       states, measured: (K, T+1, n). clearance: (K, T+1). commanded, applied: (K, T, m). wrench: (K, T, 6).
       contacts: (K,) number of control periods in contact.
-      lost_since: (K,) knot from which on the records are invalid; T+1 if there is none.
-      failed_since: (K,) knot at which the controller failed; T+1 if it did not.
-      reasons: the reason for each trial whose controller failed or whose filter diverged; else empty.
+      lost_since: (K,) knot from which on the records are invalid; T+1 if all are valid.
+      failed_since: (K,) knot at which the controller failed; T+1 if it never failed.
+      reasons: the reason why each trial's controller failed or its filter diverged; empty for other trials.
       frames: arrays of MuJoCo's qpos, (K, nq) each.
     """
 
@@ -102,5 +102,5 @@ class Recorder:
 
 
 def _records(trials: int, steps: int, size: int) -> Array:
-    """Zeros (K, steps, size), in memory all trials of a step together, as they are written."""
+    """Zeros (K, steps, size). In memory, all trials of a step are adjacent, as they are written."""
     return np.zeros((steps, trials, size)).transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""The options of `simulate`, checked, also whether controller, plan and plant fit together."""
+"""The options of `simulate`, with checks that they are valid and that controller, plan and plant fit together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -88,7 +88,7 @@ class RunSettings:
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
         wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
         check_function("generators", self.generators, wanted, arguments=2)
-        wanted = "a function of the number of finished periods and of all"
+        wanted = "a function of the numbers of finished periods and of all periods"
         check_function("progress", self.progress, wanted, arguments=2)
         wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
         check_function("watch", self.watch, wanted, arguments=3)
@@ -123,7 +123,7 @@ class RunSettings:
 
 
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
-    """The coordinates of the controller's states and controls. Raises InputError unless they are the plant's."""
+    """The coordinates of the controller's states and controls. Raises InputError unless they match the plant's."""
     dynamics = plant.robot.dynamics
     kind = type(controller).__name__
     check_text(f"{kind}.digest", controller.digest, "a hash as text")
@@ -135,7 +135,7 @@ def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinate
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
         raise InputError(
-            f"controller: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f"controller: got a policy for a position {_place(meant)}, want the position of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
     # A command that the robot clips is at a limit, whatever limits the policy assumed.
@@ -150,16 +150,16 @@ def _check_plan(given: Plan, plant: Plant) -> None:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
-        raise InputError(f"plan: got one of {shapes}, want {n} and {m}")
+        raise InputError(f"plan: got {shapes}, want {n} states and {m} controls, as the robot has")
     if not plan.finite:
-        raise InputError(f"plan: got one that is not finite ({given.status.name}), want one that can be run")
+        raise InputError(f"plan: got a plan that is not finite ({given.status.name}), want one that can be run")
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
     """Raise InputError for a run that takes too many physics steps or too much memory."""
     if plan.steps * substeps > MOST_STEPS:
         raise InputError(
-            f"plan: got one with {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
+            f"plan: got {plan.steps} control periods of {plan.dt:g} s, which takes {plan.steps * substeps}"
             f" physics steps, want at most {MOST_STEPS}"
         )
     n, m = plan.states.shape[1], plan.controls.shape[1]

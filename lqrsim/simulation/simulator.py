@@ -1,7 +1,7 @@
-"""The physics of a plant that is not MuJoCo's: the class to subclass for another simulator.
+"""The base class for simulators other than MuJoCo.
 
-The scene is MuJoCo's all the same: obstacles, distances to them and pictures are of its MJCF. A robot that another
-simulator moves passes through obstacles; its first collision is found from its states, as in `collisions.py`.
+The scene is still MuJoCo's: obstacles, distances to them and pictures come from its MJCF. A robot that another
+simulator moves passes through obstacles. Its first collision is found from its states, as in `collisions.py`.
 """
 
 import abc
@@ -13,21 +13,21 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.robots.base import Robot
 
-PARAMETERS = ("mass", "inertia", "thrust")  # that disturbances may multiply
+PARAMETERS = ("mass", "inertia", "thrust")  # the parameters that disturbances may multiply
 
 
 class Simulator(abc.ABC):
-    """Another simulator, for `Plant(robot, scene, simulator)`. Subclass it to bring one, as a frozen dataclass.
+    """A simulator for `Plant(robot, scene, simulator)`. To add one, write a frozen dataclass that subclasses it.
 
-    It simulates K trials at once, and keeps them in an object of its own kind, `simulations` below. A trial must give
-    the same bits whatever the trials beside it. States (K, n) and controls (K, m) are those of the robot.
+    A simulator simulates K trials at once, and keeps them in an object of its own type, `simulations` below. A trial
+    must give the same bits whatever other trials run with it. States (K, n) and controls (K, m) are the robot's.
 
     Attributes:
-      name: for messages and records.
-      timestep: the longest timestep in s. A control period has a whole number of steps.
+      name: name for messages and records.
+      timestep: the longest timestep in s. A control period consists of a whole number of steps.
       parameters: which of "mass", "inertia" and "thrust" `start` can multiply. Disturbances that multiply others are
         refused.
-      wind: whether it has a wind. Without, a wind is a force on the robot: `robot.drag` times the wind.
+      wind: whether it simulates wind. If not, wind is a force on the robot: `robot.drag` times the wind.
     """
 
     name: str
@@ -42,14 +42,14 @@ class Simulator(abc.ABC):
 
     @property
     def versions(self) -> Mapping[str, str]:
-        """Name -> version of the packages that the bits of its results depend on; none by default."""
+        """Name -> version of each package that affects the bits of the results; none by default."""
         return {}
 
     def check(self, robot: Robot) -> None:  # noqa: B027 - a simulator may take any robot
-        """Check that it can simulate this robot.
+        """Check that the simulator supports this robot.
 
         Args:
-          robot: that of the plant.
+          robot: the robot of the plant.
 
         Raises:
           InputError: it cannot.
@@ -62,8 +62,8 @@ class Simulator(abc.ABC):
         Args:
           states: (K, n), where the trials begin.
           factors: parameter -> (K, 1), or (K, m) for the thrust: the factor of each trial, or of each of its controls.
-            Parameters that are not there keep their values.
-          timestep: of each step in s, at most its own.
+            Parameters without factors keep their values.
+          timestep: duration of each step in s, at most the simulator's `timestep`.
 
         Returns:
           The simulations.
@@ -75,7 +75,7 @@ class Simulator(abc.ABC):
 
         Args:
           simulations: what `start` returned; it is changed.
-          controls: (K, m), held, within the robot's limits.
+          controls: (K, m), held constant, within the robot's limits.
           wrench: (K, 6), force in N at the centre of mass and torque in N m, along the world's axes.
           wind: (K, 3), in m/s along the world's axes; zero unless `wind` is true.
           steps: number of timesteps.
@@ -93,7 +93,7 @@ class Simulator(abc.ABC):
         """
 
     def place(self, simulations: Any, states: Array) -> None:
-        """Put the robots elsewhere, for noise on the states. By default it is refused.
+        """Put the robots into other states, for noise on the states. Refused by default.
 
         Args:
           simulations: what `start` returned; it is changed.
@@ -102,11 +102,11 @@ class Simulator(abc.ABC):
         Raises:
           InputError: it cannot.
         """
-        raise InputError(f"StateNoise: got a plant simulated by {self.name}, which does not override `place`")
+        raise InputError(f"StateNoise: got a plant simulated by {self.name}, want one that overrides `place`")
 
 
 def states_of(simulator: Simulator, simulations: Any, shape: tuple[int, ...]) -> Array:
-    """A copy of the current states, of this shape (K, n). Raises InputError if it is another one."""
+    """A copy of the current states. Raises InputError unless it has this shape, (K, n)."""
     states = np.array(simulator.states(simulations), dtype=np.float64)
     if states.shape != shape:
         raise InputError(f"{simulator.name}: states: got shape {states.shape}, want {shape}: trials, states")

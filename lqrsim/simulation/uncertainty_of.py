@@ -1,4 +1,4 @@
-"""Disturbances as filters, tracking laws and predicted tubes take them: as numbers."""
+"""Disturbances as numbers, in the form that filters, tracking laws and predicted tubes use."""
 
 from collections.abc import Sequence
 
@@ -17,12 +17,12 @@ from lqrsim.simulation.plant import Plant
 
 
 def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) -> Uncertainty:
-    """Convert disturbances to zero-mean Gaussian uncertainty; those that do not fit are left out by name.
+    """Convert disturbances to zero-mean Gaussian uncertainty. Disturbances that do not fit are left out, by name.
 
     A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation. A
     truncated normal distribution counts with its own standard deviation. Losses in bursts count as independent ones,
-    and displaced obstacles as displaced by the same along all axes. `left_out` lists, with reasons, disturbances that
-    the robot's dynamics do not declare, and those that are not small, lasting and linear: pushes, narrower limits, the
+    and displaced obstacles as displaced equally along all axes. `left_out` lists, with reasons, the disturbances that
+    the robot's dynamics do not declare, and all that are not small, lasting and linear: pushes, narrower limits, the
     loss of an actuator.
 
     Args:
@@ -50,8 +50,8 @@ def tube_under(
     disturbances: Sequence[Disturbance],
     controller: ControllerLike | None = None,
 ) -> tuple[Tube | None, str]:
-    """Predict the tube of a run if possible. Returns it with a line that says what it leaves out, or why there is no
-    uncertainty.
+    """Predict the tube of a run if possible. Returns the tube, and a line that lists what the tube leaves out, or says
+    why there is no tube.
 
     Without disturbances there is neither a tube nor a line.
 

@@ -1,4 +1,4 @@
-"""crazyflow's identified Crazyflies as plants: their curves of thrust, their rotors' lag and momentum, their drag."""
+"""crazyflow's identified Crazyflies as plants: their thrust curves, rotor lag and momentum, and drag."""
 
 import warnings
 from collections.abc import Mapping
@@ -23,18 +23,18 @@ INTEGRATORS = ("euler", "rk4", "symplectic_euler")
 class Crazyflow(Simulator):
     """crazyflow's first-principles model for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
 
-    A control is the force of a rotor. Its speed follows that at which it would have this force, with the rotor's lag.
-    Rotors begin at hover speed. There is no floor, and a wind acts through the robot's linear drag. It computes in
-    double precision, one trial after the other, for the bits of crazyflow's batches depend on their size.
+    A control is the force of a rotor. The speed of the rotor follows the speed for this force, with the rotor's lag.
+    Rotors begin at hover speed. There is no floor, and a wind acts through the robot's linear drag. Trials are computed
+    in double precision, one after the other, because the bits of crazyflow's batches depend on their size.
 
     Args:
-      drone: one of crazyflow's: "cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350".
-      timestep: in s; 1 / timestep has to be a whole number.
+      drone: name of crazyflow's drone: "cf21B_500", "cf2x_L250", "cf2x_P250" or "cf2x_T350".
+      timestep: timestep of the physics in s; 1 / timestep has to be a whole number.
       integrator: "rk4", "euler" or "symplectic_euler".
 
     Raises:
-      InputError: there is no such drone or integrator. Its first use: crazyflow is not installed, or SciPy was imported
-        without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
+      InputError: there is no such drone or integrator. At the first use: crazyflow is not installed, or SciPy was
+        imported without SCIPY_ARRAY_API=1 in the environment, which crazyflow needs.
     """
 
     drone: str = "cf21B_500"
@@ -61,10 +61,11 @@ class Crazyflow(Simulator):
     def quadrotor(self, **changes: Any) -> Quadrotor:
         """Our model with the drone's numbers.
 
-        The inertia about the level axes is their mean, drag that along them, and a rotor's drag that at hover.
+        The inertia about the level axes is their mean. The drag is the drag along them, and the drag torque of a rotor
+        is the torque at hover.
 
         Args:
-          **changes: fields of `Quadrotor` with other values, such as a drag that was fitted.
+          **changes: fields of `Quadrotor` with other values, such as a fitted drag.
 
         Returns:
           A Quadrotor.
@@ -105,7 +106,7 @@ class Crazyflow(Simulator):
 
 
 class _Drones:
-    """States (K, 17) as crazyflow has them: position, quaternion, velocity, rates, rotor speeds in 1/min."""
+    """States (K, 17) in crazyflow's form: position, quaternion, velocity, rates, rotor speeds in 1/min."""
 
     def __init__(self, of: Crazyflow, states: Array, factors: Mapping[str, Array], timestep: float) -> None:
         frequency = round(1 / timestep)
@@ -141,14 +142,14 @@ def numbers_of(drone: str) -> dict[str, Any]:
 
 @cache
 def frame_of(drone: str) -> Frame:
-    """Our body axes in those of a drone: torques there are sums of y_i f_i about x, and of -x_i f_i about y."""
+    """Our body axes in the drone's body axes, where torques are sums of y_i f_i about x, and of -x_i f_i about y."""
     of = numbers_of(drone)
     mixed, arm = of["mixing_matrix"], of["L"]
     return Frame.of("crazyflow", np.stack([-mixed[1] * arm, mixed[0] * arm], axis=1), mixed[2])
 
 
 def speed_of(drone: str, forces: Array) -> Array:
-    """Speeds in 1/min at which rotors have these forces in N, of the same shape."""
+    """The speeds in 1/min at which rotors have these forces in N; same shape."""
     c, b, a = numbers_of(drone)["rpm2thrust"]
     return (-b + np.sqrt(b**2 - 4 * a * (c - forces))) / (2 * a)
 
@@ -158,7 +159,7 @@ def stepper(drone: str, integrator: str, frequency: int, steps: int) -> Any:
     """A function of a trial's 17 states, 4 rotor speeds, wrench (6,) and factors (6,) that returns its next states."""
     jax, sim = package("jax", "crazyflow"), package("crazyflow.sim", "crazyflow")
     with jax.enable_x64(True), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of its scene, which is not used
+        warnings.simplefilter("ignore")  # they concern its scene, which is not used
         one = sim.Sim(
             drone=drone, dynamics="first_principles", control="rotor_vel", integrator=integrator, freq=frequency
         )

@@ -1,7 +1,8 @@
-"""What simulators of quadrotors share: their vehicle in the terms of `Quadrotor`, and its states in theirs.
+"""Code shared by the quadrotor simulators: their vehicle as a `Quadrotor`, and conversions between the states of both.
 
-Both have rotors between the axes of the body. `Quadrotor` has them on its axes, so its body is turned against theirs
-about the vertical one, and rotors are numbered from its x axis, counterclockwise from above.
+Both simulators place the rotors between the axes of the body, in an X configuration. `Quadrotor` places them on its
+axes, in a plus configuration. Its body axes are therefore turned about the vertical relative to theirs. Rotors are
+numbered from its x axis, counterclockwise seen from above.
 """
 
 import contextlib
@@ -19,15 +20,15 @@ from lqrsim.robots.base import Robot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.versions import outdated
 
-TWIST = 1e-6  # m, by which rotors may be off the corners of a square
+TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The body axes of `Quadrotor` in those of a simulator.
+    """The body axes of `Quadrotor` relative to the simulator's body axes.
 
     Attributes:
-      turn: angle from their x axis to ours, in rad. order: (4,) the number there of each of our rotors. arm: in m.
+      turn: angle from their x axis to ours, in rad. order: (4,) their number of each of our rotors. arm: length in m.
     """
 
     turn: float
@@ -36,10 +37,10 @@ class Frame:
 
     @classmethod
     def of(cls, name: str, places: Array, turning: Array) -> "Frame":
-        """From the rotors' places (4, 2 or 3) in m, and the signs (4,) of the torque with which each drags on the body.
+        """Make it from the rotors' positions (4, 2 or 3) in m, and the signs (4,) of their drag torques on the body.
 
         Raises:
-          InputError: the rotors are not at the corners of a square about the centre of mass, or turn otherwise than in
+          InputError: the rotors are not at the corners of a square about the centre of mass, or do not turn in
             alternating directions.
         """
         angles = np.arctan2(places[:, 1], places[:, 0])
@@ -49,7 +50,7 @@ class Frame:
         corners = angles[first] + np.pi / 2 * np.arange(4)
         square = arm * np.stack([np.cos(corners), np.sin(corners)], axis=1)
         if np.abs(places[order, :2] - square).max() > TWIST or not np.array_equal(turning[order], [1, -1, 1, -1]):
-            raise InputError(f"{name}: got rotors at {places.tolist()}, want those of a square, turning alternately")
+            raise InputError(f"{name}: got rotors at {places.tolist()}, want a square with alternating spin")
         return cls(float(angles[first]), order, arm)
 
     def theirs(self, states: Array) -> tuple[Array, Array, Array, Array]:
@@ -58,7 +59,7 @@ class Frame:
         return states[:, :3], states[:, 3:6], turned.as_quat(), about_z(states[:, 9:], self.turn)
 
     def ours(self, position: Array, velocity: Array, attitude: Array, rates: Array) -> Array:
-        """The states (K, 12), NaN where something is not finite."""
+        """The states (K, 12); NaN in rows that are not finite."""
         parts = np.concatenate([position, velocity, attitude, rates], axis=1)
         known, states = np.isfinite(parts).all(axis=1), np.full((len(parts), 12), np.nan)
         if known.any():
@@ -75,7 +76,7 @@ def about_z(vectors: Array, angle: float) -> Array:
 
 
 def check_quadrotor(name: str, robot: Robot) -> None:
-    """Raise InputError unless it has the states and controls of a Quadrotor."""
+    """Raise InputError unless the robot has the states and controls of a Quadrotor."""
     check_kind(f"{name}: robot", robot, Quadrotor, "a Quadrotor, such as simulator.quadrotor()")
 
 
@@ -85,10 +86,10 @@ def package(module: str, extra: str) -> Any:
     if line := outdated(extra):
         raise InputError(f"{extra}: {line}")
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx says there what it can do without
+        with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which optional packages it lacks
             return importlib.import_module(module)
     except ImportError:
-        raise InputError(f"{name}: got none, want it installed: pip install 'lqrsim[{extra}]'") from None
+        raise InputError(f"{name}: got no such package, want it installed: pip install 'lqrsim[{extra}]'") from None
     except RuntimeError as error:
         if "SCIPY_ARRAY_API" not in str(error):
             raise

@@ -24,17 +24,17 @@ POSITIVE = ("mass", "Ixx", "Iyy", "Izz", "k_eta", "k_m", "rotor_speed_max")  # n
 class RotorPy(Simulator):
     """RotorPy's `Multirotor` for each trial: `Plant(simulator.quadrotor(), scene, simulator)`.
 
-    A control is the force of a rotor. Its speed follows that at which it would have this force, with the vehicle's lag;
-    a factor of the thrust acts through the speed. Rotors begin at hover speed. There is no ground.
+    A control is the force of a rotor. The speed of the rotor follows the speed for this force, with the vehicle's lag.
+    A factor of the thrust acts through the speed. Rotors begin at hover speed. There is no ground.
 
     Args:
-      vehicle: RotorPy's `quad_params`, or the name of one: "hummingbird", "crazyflie" and what else
-        `rotorpy.vehicles` has as NAME_params.
-      timestep: in s; within it RotorPy's integrator chooses its own steps.
+      vehicle: RotorPy's `quad_params`, or a name: "hummingbird", "crazyflie", or another NAME with a module NAME_params
+        in `rotorpy.vehicles`.
+      timestep: timestep in s; within it, RotorPy's integrator chooses its own steps.
 
     Raises:
-      InputError: RotorPy is not installed; there is no such vehicle; its rotors are not four at the corners of a
-        square; or it has noise of its own, which would be drawn from a generator that all trials share.
+      InputError: RotorPy is not installed; there is no such vehicle; it does not have four rotors at the corners of a
+        square; or it has its own noise, which would be drawn from a generator that all trials share.
     """
 
     vehicle: str | Mapping[str, Any] = "hummingbird"
@@ -58,7 +58,7 @@ class RotorPy(Simulator):
         if not isinstance(vehicle, Mapping):
             raise InputError(f"RotorPy: vehicle: got {excerpt(vehicle)}, want a name, or RotorPy's quad_params")
         if missing := [key for key in (*POSITIVE, "rotor_pos", "rotor_directions") if key not in vehicle]:
-            raise InputError(f"RotorPy: vehicle: got one without {', '.join(missing)}, want RotorPy's quad_params")
+            raise InputError(f"RotorPy: vehicle: got a dict without {', '.join(missing)}, want RotorPy's quad_params")
         for key in POSITIVE:
             check_number(f"RotorPy: vehicle: {key}", vehicle[key], above=0.0)
         for key in ("rotor_speed_min", "k_d"):
@@ -91,7 +91,7 @@ class RotorPy(Simulator):
 
     @property
     def hover_speed(self) -> float:
-        """Speed of each rotor in rad/s that carries the weight."""
+        """The speed of each rotor in rad/s at which the rotors carry the weight."""
         return float(np.sqrt(self.weight / 4 / self._numbers["k_eta"]))
 
     @property
@@ -101,10 +101,11 @@ class RotorPy(Simulator):
     def quadrotor(self, **changes: Any) -> Quadrotor:
         """Our model with the vehicle's numbers.
 
-        Drag is that of the rotors at hover speed, across their axes. The inertia about the level axes is their mean.
+        The drag is the drag of the rotors at hover speed, across their axes. The inertia about the level axes is their
+        mean.
 
         Args:
-          **changes: fields of `Quadrotor` with other values, such as a drag that was fitted.
+          **changes: fields of `Quadrotor` with other values, such as a fitted drag.
 
         Returns:
           A Quadrotor.
@@ -136,7 +137,7 @@ class RotorPy(Simulator):
 
 
 class _Vehicles:
-    """A `Multirotor` and its state, as RotorPy has it, for each trial."""
+    """A `Multirotor` and its state, in RotorPy's form, for each trial."""
 
     def __init__(
         self, simulator: RotorPy, frame: Frame, states: Array, factors: Mapping[str, Array], timestep: float

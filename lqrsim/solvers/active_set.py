@@ -1,13 +1,13 @@
-"""Newton steps with an active set, to a constrained optimum nearby, such as that of a problem solved a moment ago.
+"""Newton steps with an active set, to a nearby constrained optimum, such as after a small change of the problem.
 
 Each step solves the quadratic problem of second-order models about the plan, with linearised dynamics and constraints;
-gaps between the steps of the plan close on the way. Most active rows are known from the last solve, and are held at
-zero. Pivoting finds the others: rows with a multiplier of the wrong sign are released, and violated rows are held, of
-neighbouring steps only the worst, since holding one usually keeps them all. Where the number of wrong rows does not
-fall, they change one at a time, which terminates for convex models.
+gaps between the steps of the plan close on the way. Most active rows are known from the last solve, and are fixed at
+zero. Pivoting finds the others: rows with a multiplier of the wrong sign are released, and violated rows are fixed. Of
+neighbouring steps only the worst row is fixed, because fixing it usually satisfies them all. If the number of wrong
+rows does not decrease, rows change one at a time, which terminates for convex models.
 
-Second-order models have a minimum only with the right rows held. Where the known rows do not suffice, convex models
-choose the rows first; the step itself uses the largest share of the second order that leaves a minimum.
+Second-order models have a minimum only if the right rows are fixed. If the known rows are not enough, convex models
+choose the rows first. The step itself uses the largest fraction of the second-order terms with which a minimum exists.
 """
 
 import time
@@ -22,8 +22,8 @@ from lqrsim.solvers.interior_point import AT_LIMIT, REGULARISATION, Measures
 from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import FIRMNESS, MIXES, Stages
 
-STEPS = 12  # at most: a solve that needs more does not converge
-PIVOTS, FEW = 15, 4  # most pivots of a convex problem, and of one that need not be convex
+STEPS = 12  # largest number of steps: a solve that needs more does not converge
+PIVOTS, FEW = 15, 4  # largest number of pivots of a convex problem, and of a problem that may be nonconvex
 PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
 SHARES = (0.0, 0.3)  # fractions of the convex models in a step, tried in turn
 
@@ -33,14 +33,14 @@ class ActiveSet:
 
     Args:
       stages: stages of the problem.
-      plan: states (T+1, n) and controls (T, m), not necessarily a motion; the first state is the start.
+      plan: states (T+1, n) and controls (T, m), not necessarily feasible; the first state is the start.
       multipliers: multipliers of the constraints, (T+1, rows) each, or none.
       violation: tolerance of equalities; a fraction of it is the margin of inequalities.
 
     Attributes:
-      plan: the current plan. measures: of that. force, held: (T+1, R) the rows' multipliers, and 1 for rows held at
-        zero, else 0. sizes: typical sizes. hopeless: whether the plan is stationary but violates rows that no
-        multiplier corrects. looking: seconds that the models of a plan took.
+      plan: the current plan. measures: its measures. force, held: (T+1, R) the rows' multipliers, and 1 for rows fixed
+        at zero, else 0. sizes: typical sizes. hopeless: whether the plan is stationary but violates rows that no
+        multiplier corrects. looking: seconds spent on the models of a plan.
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
@@ -72,7 +72,7 @@ class ActiveSet:
         Args:
           tolerance: tolerance of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
-          late: called with a duration in seconds before work that takes about that long; True abandons the step.
+          late: called before a piece of work with its expected duration in seconds; True abandons the step.
         """
         self._late = late
         ended = False
@@ -90,7 +90,7 @@ class ActiveSet:
     def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
         """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values.
 
-        The gains are those of a step with a penalty on the active rows, and zero at limits.
+        The gains come from a step with a penalty on the active rows, and zero at limits.
         """
         stages = self.stages
         for share in MIXES:
@@ -110,7 +110,7 @@ class ActiveSet:
         return [(self.force[:, owners == k].copy(), price) for k, price in enumerate(prices)]
 
     def _measure(self, cost: float) -> None:
-        """Compute the measures of the plan that the models are about."""
+        """Compute the measures of the plan about which the models are made."""
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
         steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._gaps, self.sizes)
         self._kept = missed <= 0 and unequal <= self._violation
@@ -146,7 +146,7 @@ class ActiveSet:
         return self._late(2 * self.looking)
 
     def _from_convex(self) -> bool:
-        """Find a step with the active rows of the convex models, or nearly these; return whether there is one."""
+        """Find a step with the active rows of the convex models, or almost these; return whether it exists."""
         if self._pivoted(1.0, PIVOTS) is None:
             return False
         convex = self.held.copy()
@@ -160,7 +160,7 @@ class ActiveSet:
         return False
 
     def _pivoted(self, share: float, most: int) -> int | None:
-        """Solve the quadratic problem by at most `most` pivots from the held rows.
+        """Solve the quadratic problem by at most `most` pivots from the fixed rows.
 
         The change of the plan is in `stages`.
 
@@ -181,7 +181,7 @@ class ActiveSet:
         return None
 
     def _solve(self, share: float, price: float = 1.0) -> tuple[bool, int]:
-        """Solve the problem with the held rows; return whether there is a minimum, and the number of wrong rows."""
+        """Solve the problem with the fixed rows; return whether there is a minimum, and the number of wrong rows."""
         if share > 0 and not self._convex:
             self.stages.convexify(self.plan)
             self._convex = True

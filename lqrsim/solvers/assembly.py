@@ -72,7 +72,7 @@ def assemble(
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """What would help in this case, or where nothing is known, what helps others that end so; empty for a success."""
+    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success."""
     status = found.status
     if status.success:
         return ""
@@ -120,7 +120,7 @@ def _copied(value: Any) -> Any:
 def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
     """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position.
 
-    With a plan (T+1, n) that starts within it, a tenth of the way.
+    For a plan (T+1, n) that starts within the radius, it is a tenth of the way.
     """
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
@@ -134,7 +134,7 @@ def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
 def clearance_of(problem: Problem, states: Array) -> Array | None:
     """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles.
 
-    For a robot of several collision spheres or geoms it is the smallest of theirs.
+    For a robot of several collision spheres or geoms, it is their smallest distance.
     """
     found = []
     for one in each_once([one for one in problem.kept_clear if len(one.world)]):

@@ -1,12 +1,13 @@
-"""Constraints by the method of multipliers: from the optimum without them to one that keeps them.
+"""Constraints by the method of multipliers: from the optimum without constraints to an optimum that keeps them.
 
-The smoother minimises the augmented Lagrangian, roughly; then the multipliers are updated, and the penalty grows where
-the violation has not halved; and again. Updating after every iteration would make plans that slide along an obstacle
-swing to and fro, since the model leaves out how an obstacle curves. Where undamped iterations do not settle, the
-safeguard's damped ones minimise each augmented Lagrangian.
+The smoother minimises the augmented Lagrangian approximately. Then the multipliers are updated, and the penalty grows
+where the violation has not halved. Both steps are repeated. With an update after every iteration, plans that slide
+along an obstacle would oscillate, since the model leaves out the curvature of obstacles. If undamped iterations do not
+settle, the damped ones of the safeguard minimise each augmented Lagrangian.
 
-It serves problems that the interior point does not take: noise with constraints, an MJCF's dynamics, `finish=None`; and
-is one rung of the ladder among obstacles, see `strategy.py`. The compiled part is `kernels/augmented_lagrangian.py`.
+The method serves problems that the interior point does not take: noise with constraints, the dynamics of an MJCF, and
+`finish=None`. Among obstacles it is also one of the attempts in `strategy.py`. The compiled part is in
+`kernels/augmented_lagrangian.py`.
 """
 
 import dataclasses
@@ -33,8 +34,8 @@ ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped one
 # When a run has converged enough to update the multipliers, and the iterations after which they are updated anyway.
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
-STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
-REFINED = 5  # damped iterations from a plan of the search before Newton's method goes on
+STALE, CLOSER = 40, 0.9  # number of undamped iterations without progress that ends them; factor that counts as progress
+REFINED = 5  # damped iterations from a plan of the search before Newton's method continues
 
 
 def by_multipliers(run: SolveRun) -> RunResult:
@@ -43,19 +44,19 @@ def by_multipliers(run: SolveRun) -> RunResult:
         found = meet_constraints(run, None)
         if found.success or run.budget.over:
             return run.certified(found)
-        # Knowledge of another problem does not help here.
+        # Multipliers of another problem do not help here.
         run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
     run, found = _with_constraints(run, run.solve())
     return run.certified(found)
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
-    """Another run, with the rest of the budget."""
+    """A further run, with the rest of the budget."""
     return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
 
 
 def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
-    """Continue from the result without the constraints; also returns which run has the answer in its memory."""
+    """Continue from the result without the constraints; also return the run that has the answer in its memory."""
     if run.budget.over:
         if found.success and not run.work.keeps(run.work.constraint_values(found.states, found.controls)):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
@@ -69,7 +70,7 @@ def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunRes
 def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STALE) -> RunResult:
     """Continue from the result without the constraints or, without one, from another solution's multipliers.
 
-    `stale` is the number of undamped iterations that come no closer before damped ones follow.
+    `stale` is the number of undamped iterations without progress after which damped iterations follow.
     """
     lagrangian = AugmentedLagrangian(run)
     if found is None:
@@ -80,7 +81,7 @@ def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STA
         if lagrangian.kept:
             return found
         lagrangian.start()
-        # These will be overwritten.
+        # The arrays will be overwritten.
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     undamped = _undamped(run, lagrangian, known=found is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
@@ -89,9 +90,10 @@ def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STA
 
 
 def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
-    """First a plan that keeps the constraints, without the cost of obstacles; then the cost comes in.
+    """Find a plan that keeps the constraints without the cost of obstacles, then add that cost.
 
-    For where not even the problem without the constraints is solved: deep within obstacles, they cost beyond numbers.
+    This helps if not even the problem without the constraints is solved, because deep inside obstacles their cost
+    overflows.
     """
     problem, budget = run.problem, run.budget
     if not (run.settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
@@ -104,7 +106,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
         if kept.success and not budget.over:
             kept = meet_constraints(without, kept)
     if not kept.success or budget.over:
-        # Only the constraints of the plan are known; its certificate has the cost.
+        # Only the constraint values of the plan are known. The certificate provides the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
         return run, dataclasses.replace(kept, status=status, final=not kept.success, values={})
     initial_guess = dataclasses.replace(
@@ -119,9 +121,9 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
 
 
 def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, patience: int) -> RunResult:
-    """Undamped iterations, and updated multipliers in between; these are `known` at first from another solution.
+    """Undamped iterations, with updates of the multipliers, which may be `known` from another solution at first.
 
-    They end after `patience` that come no closer.
+    They end after `patience` iterations without progress.
     """
     work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
     rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
@@ -138,7 +140,8 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
         settled = ending.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
         if done == len(rows) or (settled and lagrangian.solved):
             break
-        # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
+        # From the optimum without constraints they soon settle or cycle. If they cycle, damped iterations are much
+        # faster.
         off = max(last.gap / most, last.violation / run.settings.violation_tolerance(run.problem))
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
@@ -159,7 +162,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
 def _damped(
     run: SolveRun, lagrangian: "AugmentedLagrangian", found: RunResult | None, undamped: RunResult
 ) -> RunResult:
-    """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
+    """The safeguard: from the plan without constraints, or the last plan with constraints, whichever is better."""
     work = run.work
     plans = [(work.last, undamped.cost)]
     plans += [(Motion(found.states, found.controls), found.cost)] if found is not None else []
@@ -180,7 +183,7 @@ def _damped(
 def damped_from_rollout(run: SolveRun) -> RunResult:
     """Run to the end, only by steps that lower the cost, from the rollout of the first policy; certified.
 
-    So it stays in the homotopy class that it begins with, which undamped iterations would leave.
+    The plan thus stays in its homotopy class, which undamped iterations would leave.
     """
     run.roll_out()
     optimality = run.linearize_about_plan() if np.isfinite(run.work.cost) else np.nan
@@ -234,7 +237,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
 
 
 def _forces(own: ConstraintMultipliers, values: Array) -> Array:
-    """The new multipliers: lambda - mu d, for inequalities not below 0; 0 where they do not act."""
+    """The new multipliers: lambda - mu d, at least 0 for inequalities; 0 if the row is inactive."""
     acting = np.where(np.isinf(values), 0.0, values)
     forces = np.clip(own.values - own.penalty * acting, -own.price if own.term.equality else 0.0, own.price)
     return np.where(np.isinf(values), 0.0, forces)
@@ -247,7 +250,7 @@ def _added(own: ConstraintMultipliers, values: Array) -> float:
 
 
 def _missed(own: ConstraintMultipliers, values: Array) -> float:
-    """By how much a constraint is missed, or an inequality's multipliers are off, at most."""
+    """The largest violation of a constraint, or error of an inequality's multipliers."""
     if own.term.equality:
         return float(np.abs(values).max(initial=0.0))
     forces = own.values / own.penalty if own.penalty > 0 else 0.0
@@ -260,10 +263,10 @@ class AugmentedLagrangian:
     Inequalities and equalities each have a tolerance, and their penalties grow on their own.
 
     Attributes:
-      kept: whether the last evaluated plan keeps the constraints.
-      solved: whether it does so as well as is aimed at: inequalities with the tolerance to spare, and where more than
-        that is left, with a multiplier that is not off by more: `|min(d, lambda / mu)|`; equalities `|d|`.
-      nearly: whether it would with the inequalities' tolerance for equalities, too.
+      kept: whether the last evaluated plan satisfies the constraints.
+      solved: whether it meets the aims: inequalities hold with the tolerance as a margin; if the margin is larger, the
+        error of the multiplier is within the tolerance, `|min(d, lambda / mu)|`; equalities hold, `|d|`.
+      nearly: whether it would meet them if equalities had the tolerance of inequalities.
       grown: factor by which a penalty has grown. stuck: number of times in a row that this did not help.
     """
 
@@ -275,7 +278,7 @@ class AugmentedLagrangian:
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
-        self._first = [own.penalty for own in self._own]  # zero, except those of another solution
+        self._first = [own.penalty for own in self._own]  # zero, except multipliers of another solution
 
     def _restart(self) -> None:
         self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
@@ -299,7 +302,7 @@ class AugmentedLagrangian:
         self.solved = all(_missed(own, values) <= self._tolerance[own.term.equality] for own, values in self._each())
 
     def start(self) -> None:
-        """No multipliers, and for each constraint a penalty that fits the cost of changing it."""
+        """Begin with zero multipliers, and with penalties that fit the cost of changing each constraint."""
         self._restart()
         for which, (own, values) in enumerate(self._each()):
             own.values[...] = 0.0
@@ -309,7 +312,7 @@ class AugmentedLagrangian:
             own.penalty = self._first[which]
 
     def update(self, growth: float = GROWTH) -> None:
-        """Take the forces for the multipliers; let the penalty grow where that helps too little."""
+        """Set the multipliers to the forces. Increase the penalties of constraints for which this helps too little."""
         missed = dict.fromkeys(self._tolerance, -np.inf)
         for own, values in self._each():
             own.values[...] = _forces(own, values)
@@ -332,12 +335,12 @@ class AugmentedLagrangian:
         return sum(_added(own, values) for own, values in self._each())
 
     def multipliers(self) -> tuple[Multipliers, ...]:
-        """As a solution has them: with the last plan taken into account."""
+        """The multipliers for a solution, updated for the last plan."""
         rows = self._problem.steps + 1, -1
         return tuple(Multipliers(_forces(own, values).reshape(rows), own.penalty) for own, values in self._each())
 
     def worst(self) -> str:
-        """The worst violated constraint, by how much, and when."""
+        """A text that names the worst violated constraint, its violation and its time."""
         if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
@@ -351,11 +354,11 @@ class AugmentedLagrangian:
         return f"{term.describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
 
     def _each(self) -> Iterator[tuple[ConstraintMultipliers, Array]]:
-        """For each constraint its multipliers, and its values relative to its target."""
+        """For each constraint, its multipliers, and its values relative to the target."""
         return zip(self._own, self._values, strict=True)
 
     def _worst_of(self, which: int) -> tuple[int, int]:
-        """Step and row of a constraint's worst violation: the first of equal ones, an equality's last, which acts."""
+        """Step and row of a constraint's worst violation: the first of several equal; for an equality, the last."""
         values, term = self._values[which], self._own[which].term
         last = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
         return divmod(last, term.rows)
@@ -369,7 +372,8 @@ class AugmentedLagrangian:
     def _curvature_of(self, which: int, step: int, row: int) -> float:
         """The cost of changing one entry of a constraint: twice the total cost of a change by 1 unit.
 
-        `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
+        It is `1 / n' (S + Sbar)^-1 n` for the entry's slope n: the curvature of the total cost if the rest of the
+        trajectory adapts.
         """
         states, controls = self._plan
         n, steps = states.shape[1], len(controls)

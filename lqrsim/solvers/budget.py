@@ -1,4 +1,4 @@
-"""The budget of a solve: time, iterations, and how it learns that the caller wants it to end."""
+"""The budget of a solve: time, iterations, and requests by the caller to stop."""
 
 import contextlib
 import logging
@@ -15,25 +15,25 @@ from lqrsim.results.solution_parts import Iteration, Status
 Callback = Callable[[Iteration], object]
 
 _log = logging.getLogger("lqrsim")
-SILENT = 2.0  # s without a word, after which a solve says how far it is, and then less and less often
+SILENT = 2.0  # s without a message after which a solve reports its progress; later reports come at growing intervals
 SELDOM = 60.0  # s
 
 
 @dataclass
 class Stop:
-    """Why a solve ends early: a deadline on the clock of `time.perf_counter`, or an exception.
+    """The reason for a solve to end early: a deadline on the clock of `time.perf_counter`, or an exception.
 
-    An exception of the callback, and Ctrl-C, end a solve as a deadline does: with the best plan so far. `finish` raises
+    An exception of the callback, or Ctrl-C, ends a solve like a deadline, with the best plan so far. `finish` raises
     the exception again, with that plan as its `solution`.
     """
 
     deadline: float = np.inf
     error: BaseException | None = None
-    # How long the next iteration may take, in s: one that would end after the deadline is not begun. By default as long
-    # as the last one took.
+    # Expected duration of the next iteration in s: an iteration that would end after the deadline is not begun. By
+    # default it is the duration of the last iteration.
     reserve: float = 0.0
     pace: float = 0.0
-    # Of all runs: number of iterations, the last one, and when the caller last heard of one.
+    # For all runs: the number of iterations, the last iteration, and the time at which the caller was last told of one.
     iterations: int = 0
     last: Iteration | None = None
     told: float = -np.inf
@@ -48,7 +48,7 @@ class Stop:
 
     @property
     def found(self) -> str:
-        """How far the solve is, as text: what has been found so far, and what is left."""
+        """The progress of the solve as text: the results so far, and the time that is left."""
         left = (
             "" if self.deadline == np.inf else f"; at most {max(self.deadline - time.perf_counter(), 0.0):.0f} s left"
         )
@@ -62,24 +62,24 @@ class Stop:
         return ", ".join(part for part in parts if not part.endswith(" nan")) + left
 
     def reporting(self, what: str, attentive: bool) -> contextlib.AbstractContextManager[None]:
-        """A block that says how far the solve is where the caller hears nothing for long, unless many are solved."""
+        """A block that reports the progress if the caller hears nothing for long, unless many problems are solved."""
         if not attentive:
             return contextlib.nullcontext()
         return reported(what, lambda: self.found, lambda: self.told)
 
     @contextlib.contextmanager
     def heeding(self) -> Iterator[None]:
-        """A block that any exception ends, Ctrl-C too; it is raised again when there is a solution."""
+        """A block that any exception ends, even Ctrl-C; the exception is raised again with the solution."""
         try:
             yield
         except BaseException as error:
             self.error = error
 
     def finish(self, solution: Solution) -> Solution:
-        """Return the solution; or raise what ended the solve, with the solution attached."""
+        """Return the solution; or raise the exception that ended the solve, with the solution attached."""
         if self.error is None:
             return solution
-        with contextlib.suppress(AttributeError, TypeError):  # an exception that takes no attributes
+        with contextlib.suppress(AttributeError, TypeError):  # some exceptions take no attributes
             self.error.solution = replace(solution, status=Status.INTERRUPTED, remedy=Status.INTERRUPTED.remedy)  # pyright: ignore[reportAttributeAccessIssue]
             self.error.add_note("lqrsim: the best plan so far is this exception's `solution`")
         raise self.error
@@ -91,8 +91,8 @@ class Budget:
     Attributes:
       log: the iterations so far, by any method.
       stop: the deadline, or the exception of the callback.
-      attentive: whether compiled code returns regularly, so that Ctrl-C ends it. Where many problems are solved at
-        once, it does not.
+      attentive: whether compiled code returns regularly, so that Ctrl-C ends it. If many problems are solved at once,
+        it does not.
     """
 
     def __init__(
@@ -103,17 +103,17 @@ class Budget:
         self.log: list[Iteration] = []
 
     def another(self) -> "Budget":
-        """The same for another run, with the same number of iterations."""
+        """A budget for another run, with the same number of iterations."""
         return Budget(self._most, self.stop, callback=self._callback, attentive=self.attentive)
 
     @property
     def left(self) -> int:
-        """How many iterations may follow."""
+        """The number of iterations that may follow."""
         return max(self._most - len(self.log), 0)
 
     @property
     def over(self) -> bool:
-        """Whether nothing may follow."""
+        """Whether no iteration may follow."""
         return self.stop.due or not self.left
 
     @property
@@ -151,7 +151,7 @@ class Budget:
 
     @contextlib.contextmanager
     def without_costs(self) -> Iterator[None]:
-        """Temporarily: iterations are of another problem, and their costs are not logged."""
+        """Temporarily treat iterations as iterations of another problem, whose costs are not logged."""
         begin, callback = len(self.log), self._callback
 
         def hidden(iteration: Iteration) -> Iteration:
@@ -166,7 +166,7 @@ class Budget:
 
     @contextlib.contextmanager
     def joined_with_last(self, method: str) -> Iterator[None]:
-        """For a while: a single iteration that follows is a look at the plan, and counts as part of the last one.
+        """Temporarily count a single further iteration, which only evaluates the plan, as part of the last iteration.
 
         The callback is called at the end.
         """
@@ -186,10 +186,10 @@ class Laps:
     """Records the iterations of a method that Python runs itself, with their seconds and improvements.
 
     Args:
-      budget: whose log they join. cost: that the first one improves on.
+      budget: the budget whose log they join. cost: the cost that the first iteration improves on.
 
     Attributes:
-      ended: when the last one did, on the clock of `time.perf_counter`.
+      ended: time at which the last iteration ended, on the clock of `time.perf_counter`.
     """
 
     def __init__(self, budget: Budget, cost: float = np.inf) -> None:
@@ -204,12 +204,13 @@ class Laps:
 
 @contextlib.contextmanager
 def reported(what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf) -> Iterator[None]:
-    """A block that says how far it is, once it has been silent for two seconds: as a warning of the log `lqrsim`.
+    """A block that reports its progress after two silent seconds, as a warning of the logger `lqrsim`.
 
     Args:
-      what: what is going on: "smooth".
-      found: what has been found so far, and what is left, as text.
-      told: when the caller last heard of it otherwise, on the clock of `time.perf_counter`.
+      what: name of the activity, such as "smooth".
+      found: function that returns the results so far, and the time that is left, as text.
+      told: function that returns the time at which the caller was last told otherwise, on the clock of
+        `time.perf_counter`.
     """
     ended, begun = threading.Event(), time.perf_counter()
 
@@ -225,6 +226,6 @@ def reported(what: str, found: Callable[[], str], told: Callable[[], float] = la
         watcher.start()
         yield
     finally:
-        ended.set()  # first of all: also where Ctrl-C came while the thread began
+        ended.set()  # first of all, so that it also happens if Ctrl-C came while the thread began
         if watcher.is_alive():
             watcher.join()

@@ -1,7 +1,7 @@
 """Certificates: before a solver reports success, its plan is checked against the problem itself.
 
-`kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a code path of its own; this module
-compares them with the solver's claims.
+`kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a separate code path. This module compares
+them with the solver's claims.
 """
 
 from collections.abc import Callable
@@ -20,10 +20,10 @@ from lqrsim.results.value_functions import Quadratic
 # Tolerances for rounding. A policy's control is a sum of a few terms; a step of the dynamics is some hundred
 # operations, which amplify each other's rounding errors.
 LAW, MOTION, COST = 1e-11, 1e-8, 1e-8
-# Where the terms of a cost cancel, a rounding error remains that is relative to the terms.
+# If the terms of a cost cancel, a rounding error remains that is relative to the terms.
 REST = 1e-13
-# The optimality is computed about the plan, the solver's about states within the gap tolerance of it: the certificate's
-# may be a little larger.
+# The optimality is computed about the plan; the solver computes its own about states within the gap tolerance of the
+# plan. The certificate's optimality may therefore be slightly larger.
 SLACK = 2.0
 
 
@@ -41,21 +41,21 @@ def certified(
     claimed: float | None,
     tolerance: float | None,
 ) -> tuple[Certificate, str]:
-    """Certify a plan; also return, in words, what contradicts a solver that claims convergence.
+    """Certify a plan; also return, in words, contradictions to a solver's claim of convergence.
 
     Args:
       work: runs the compiled `certify` for a task and a cost-to-go, and writes its results to an array (1,).
-      states: (T+1, n) of the plan. value: the cost-to-go; None where there is none.
+      states: (T+1, n) of the plan. value: the cost-to-go, or None.
       violation: violation of the worst constraint. kept: whether that is within the equalities' tolerance.
-      claimed: the last cost in the log; None where the solver does not claim success.
-      tolerance: tolerance of the optimality; None where only the cost was asked for.
+      claimed: the last cost in the log; None if the solver does not claim success.
+      tolerance: tolerance of the optimality; None if only the cost was tested.
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
 
     def none() -> CostToGo:
         return CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
 
-    if value is None and problem.noise_term is not None:  # what noise costs is weighed by the policy's own cost-to-go
+    if value is None and problem.noise_term is not None:  # the cost of noise is weighed by the policy's own cost-to-go
         work(declarations.EVALUATE, none(), numbers)
     else:
         parts = () if value is None else (value.hessian, value.gradient, np.asarray(value.constant))
@@ -66,7 +66,7 @@ def certified(
     if claimed is None:
         return certificate, ""
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
-        # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
+        # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
         own = np.zeros(1, CERTIFICATE)
         work(declarations.EVALUATE, none(), own)
         optimality = certificate_of(problem, own[0], states, violation=violation).optimality
@@ -93,12 +93,12 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
 def faults(
     certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None, kept: bool = False
 ) -> str:
-    """List what contradicts a claim of convergence, in words; empty if nothing does.
+    """List, in words, all contradictions to a claim of convergence; empty if there are none.
 
     Args:
       claimed: the last cost in the log. rest: the rounding error of a cost whose terms cancel.
-      tolerance: tolerance of the optimality; None where only the cost was asked for.
-      kept: whether the violation is that of equalities within their tolerance.
+      tolerance: tolerance of the optimality; None if only the cost was tested. kept: whether the violation comes from
+        equalities within their tolerance.
     """
     found = []
     if certificate.start != 0:

@@ -40,7 +40,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 
-# The forms of the cost-to-come, and the kernels of each.
+# The forms of the cost-to-come, with their kernels.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 
 
@@ -87,7 +87,7 @@ def arguments(
     """The arguments of the passes; compiles the problem's functions if they are new.
 
     Args:
-      multipliers: those of each constraint; by default none act.
+      multipliers: multipliers of each constraint; by default no constraint acts.
       second_order: whether the passes need second derivatives of the dynamics.
     """
     acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
@@ -109,7 +109,7 @@ def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> Dynamic
 
 
 def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
-    """The terms of a cost, those that may be indefinite first, as `CostModel` has them."""
+    """The terms of a cost in the order of `CostModel`: terms that may be indefinite come first."""
     return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
 
 
@@ -183,7 +183,7 @@ def costs_module(problem: Problem) -> CompiledModule:
 
 
 def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
-    """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
+    """Stage and final costs (K,) of K trajectories with states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
     flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
     costs_module(problem).costs_of(len(states), problem.steps, Motion(*flat), arguments(problem), costs)
@@ -228,20 +228,21 @@ def rollout(
 
 
 def law_about(states: Array, controls: Array, gain: Array) -> tuple[Array, Array]:
-    """The policy with these gains (T, m, n) that keeps to a plan: the gains, and its offsets (T, m)."""
+    """The policy with these gains (T, m, n) that tracks a plan: the gains, and its offsets (T, m)."""
     return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
 
 
 class ConstraintMultipliers:
-    """A constraint's multipliers, in the memory that compiled code reads; at first it does not act.
+    """A constraint's multipliers, in the memory that compiled code reads. Initially the constraint does not act.
 
     Args:
-      margin: by how much an inequality is to be kept. price: of missing it, in cost per unit.
+      margin: margin with which an inequality is to be kept. price: price of a violation, in cost per unit.
 
     Attributes:
       term: the constraint. margin, price: as given; the margin of an equality is 0. first: the first step at which it
         acts.
-      array: all numbers, as `kernels/augmented_lagrangian.py` has them. values: ((T+1) rows,) the multipliers in it.
+      array: all numbers, in the layout of `kernels/augmented_lagrangian.py`. values: ((T+1) rows,) the multipliers in
+        it.
     """
 
     def __init__(self, problem: Problem, term: ConstraintTerm, margin: float = 0.0, price: float = np.inf) -> None:
@@ -256,7 +257,7 @@ class ConstraintMultipliers:
 
     @property
     def penalty(self) -> float:
-        """The penalty, in cost per square of the constraint's unit; 0 where it does not act."""
+        """The penalty, in cost per square of the constraint's unit; 0 if the constraint does not act."""
         return float(self.array[PENALTY])
 
     @penalty.setter

@@ -1,4 +1,4 @@
-"""The ways to a plan that keeps the constraints, tried in turn; the interior point finishes each.
+"""The plans from which a plan that keeps the constraints is sought, in turn; the interior point finishes each.
 
     the optimum of the search for a free duration, which is only finished;
     the plan of another solution, with its multipliers;
@@ -33,15 +33,15 @@ from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, Interior
 from lqrsim.solvers.restoration import Restored, restore
 from lqrsim.solvers.stages import Sizes
 
-FAR = 100.0  # times the tolerance: a larger violation may be evidence that the constraints are infeasible
-# Iterations of the augmented Lagrangian: from the plan of smoothing; of these, undamped ones that come no closer; and
-# damped ones from a plan of the search, which creep along a wall's corner to optima that cost less.
+FAR = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
+# Iterations of the augmented Lagrangian: from the plan of smoothing; undamped iterations without progress among these;
+# and damped iterations from a plan of the search, which creep along a wall's corner to optima that cost less.
 AUGMENTED, STALE, REFINED = 50, 25, 100
-DEEP = 0.03  # part of a row's typical size by which the plan of smoothing may miss it for the interior point
+DEEP = 0.03  # largest violation by the plan of smoothing with which the interior point begins, relative to a row's size
 GUIDED = 60  # iterations of smoothing before constraints act, with an ObstacleCost
 RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
-PRICES = (1e2, 1e4)  # of violating a constraint by its typical size, relative to the cost
+PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, relative to the cost
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
 
 
@@ -60,7 +60,7 @@ class Known:
 
 
 class Ladder:
-    """Tries one way to a plan that keeps the constraints after another."""
+    """Tries one start after another for a plan that keeps the constraints."""
 
     def __init__(self, run: SolveRun, known: Known) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
@@ -77,12 +77,12 @@ class Ladder:
             self._point.without_multipliers()
 
     def climb(self, *, stay: bool = False) -> RunResult:
-        """Try the rungs in turn; with `stay`, only those that begin from the rollout of the first policy."""
+        """Try the rungs in turn; with `stay`, only rungs that begin from the rollout of the first policy."""
         guess = self._run.initial_guess
         start = self._point.start()
         given = guess.trajectory is not None or guess.gain.any() or stay
         if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
-            self._given = start  # the answer is no worse
+            self._given = start  # the answer must not be worse
         rungs: list[Callable[[], RunResult | None]] = []
         retried = False  # whether the start itself would be tried twice
         if (found := guess.found) is not None:
@@ -93,7 +93,7 @@ class Ladder:
         if stay and self._guided:
             rungs.append(self._refined)
         if given:
-            # A sketch of a path is not near the answer, even where standing still keeps the constraints.
+            # A sketch of a path is not near the answer, even if standing still keeps the constraints.
             begin = guess.trajectory or start
             kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
             rungs.append(lambda: self._interior(copied(begin), LITTLE if kept else MUCH))
@@ -127,7 +127,8 @@ class Ladder:
             return None
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             return self._interior(self._smoothed, MUCH)
-        # If the bottom of the valley keeps the constraints, it is the answer; with an ObstacleCost it is next to it.
+        # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
+        # answer.
         checkpoint = run.checkpoint()
         found = run.newton()
         if found.success and found.violation == 0:
@@ -135,7 +136,7 @@ class Ladder:
         bottom = copied(found) if found.success else self._smoothed
         run.go_on(checkpoint)
         if self._budget.stop.due or (self._guided and self._cuts(bottom)):
-            return None  # far into an obstacle, the interior point stalls: the augmented Lagrangian leaves it
+            return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
         return self._interior(bottom, LITTLE if self._guided else MUCH)
 
     def _cuts(self, plan: Motion) -> bool:
@@ -161,9 +162,9 @@ class Ladder:
         return self._after_multipliers(found)
 
     def _augmented(self, start: RunResult) -> RunResult | None:
-        """From the plan of the augmented Lagrangian, which stays in the valley that smoothing has chosen.
+        """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
 
-        Where it costs more than the start, it has diverged.
+        If that plan costs more than the start, the method has diverged.
         """
         run = self._run
         if self._smoothed is None or run.settings.elastic is not None or not self._guided:
@@ -184,8 +185,8 @@ class Ladder:
     def _at_a_price(self, plan: Motion | None) -> RunResult | None:
         """From the plan of a descent in which constraints may be violated at a price.
 
-        Where it comes nowhere at one price, a start that keeps the constraints, such as standing still, is tried before
-        the next.
+        If the descent makes no progress at one price, a start that keeps the constraints, such as standing still, is
+        tried before the next price.
         """
         if plan is None or self._run.settings.elastic is not None:
             return None
@@ -232,7 +233,7 @@ class Ladder:
         return restored
 
     def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
-        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
+        """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
         there = self._point.result(*plan)
         if not there.violation > FAR * self._allowed:
             return False
@@ -246,7 +247,7 @@ class Ladder:
         return found is not None
 
     def _interior(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
-        """From a plan by the interior point."""
+        """The result of the interior point from a plan."""
         return self._remember(self._point.solve(plan, barrier, multipliers=multipliers))
 
     def _remember(self, found: RunResult | None) -> RunResult | None:

@@ -1,8 +1,9 @@
-"""Plans at the edges of contact modes: descent that keeps to a mode, and what makes such a plan optimal.
+"""Plans at the edges of contact modes: a descent within a mode, and conditions for optimality of such a plan.
 
-A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. Plans
-that lower the cost end at a *switch*, beside a jump or at a kink: a contact that is just not reached, or just lets go.
-The gradient is not zero there, and steps along it go across. Here a switch is an inequality, like a limit of a control:
+A control period of an MJCF is smooth only while the same contacts and limits act; see `scenes/contact_modes.py`. A
+descent ends at a *switch*, next to a jump or at a kink: a contact that is just not reached, or just lets go. The
+gradient is not zero there, and steps along it cross the switch. Here a switch is an inequality, like a limit of a
+control:
 
 - The model of the cost is that of iLQR, in the offsets of the policy with its gains held, and derivatives are those of
   the plan's own mode. The step minimises it with all switches on their sides, linearised: a quadratic program.
@@ -122,7 +123,7 @@ class ModeModel:
 class ModeStep:
     """A minimiser of the model, (T m,), and the decrease that it predicts.
 
-    With the multipliers of the switches, (K,), and of the limits of the controls, (T, m), negative for upper ones.
+    Also the multipliers of the switches, (K,), and of the control limits, (T, m), negative for upper limits.
     """
 
     change: Array
@@ -135,7 +136,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     """Minimise `gradient d + 1/2 d curvature d` with all switches and limits on their sides; None if that fails.
 
     Args:
-      across: a switch that must be on its other side instead, by `depth`; the change is the least one then.
+      across: a switch that must be crossed by `depth` instead; the change is then as small as possible.
     """
     try:
         factor = scipy.linalg.cholesky(curvature, lower=True)
@@ -157,7 +158,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     rows, which, lengths = rows[felt] / lengths[felt, None], which[felt], lengths[felt]
     bounds = bounds[which] / lengths
     free = np.zeros(size) if across is not None else -scipy.linalg.solve_triangular(factor, model.gradient, lower=True)
-    # The nearest point to `free` with rows y >= bounds; Lawson and Hanson's way to least distances.
+    # The nearest point to `free` with rows y >= bounds, by Lawson and Hanson's least-distance algorithm.
     short, nearest, weights = bounds - rows @ free, free, np.zeros(len(bounds))
     active = np.flatnonzero(short > 0)
     for _ in range(ROUNDS):
@@ -171,7 +172,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
         except RuntimeError:
             return None
         rest = matrix @ pulls - target
-        if not abs(rest[-1]) > 1e-13:  # they contradict each other
+        if not abs(rest[-1]) > 1e-13:  # the rows contradict each other
             return None
         nearest = free - rest[:size] / rest[-1]
         weights[:] = 0.0
@@ -239,7 +240,7 @@ class Descent:
     """Descent from a plan, mode by mode.
 
     Attributes:
-      plan: the best so far. model: about it.
+      plan: the best plan so far. model: the model about it.
     """
 
     def __init__(
@@ -300,7 +301,7 @@ class Descent:
         return None
 
     def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
-        """The plan after a change of the offsets, corrected until it crosses no switch; or the last one tried."""
+        """The plan after a change of the offsets, corrected until it crosses no switch; or else the last trial."""
         model, wanted, factor = self.model, self.model.values + self.model.slopes @ change, None
         for _ in range(PUSHES):
             if not np.isfinite(there.cost):
@@ -334,7 +335,7 @@ class Descent:
         return there
 
     def _crossed(self, step: ModeStep) -> CostedPlan | None:
-        """A cheaper plan across a switch that this one is pressed against; None if there is none."""
+        """A cheaper plan across a switch that the present plan is pressed against; None if there is none."""
         for which in np.argsort(-step.multipliers)[: np.count_nonzero(step.multipliers)].tolist():
             best = beyond(self._problem, self.plan, self.model, which)
             if best is not None and best.cost < self.plan.cost - self._tolerance * abs(self.plan.cost):
@@ -358,7 +359,7 @@ class Descent:
 
 
 def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
-    """A period; where no switch is in sight, by the compiled derivatives, which are as good and quicker."""
+    """A period. If no switch is near, the compiled derivatives are used, which are as good and faster."""
     end, switches = modes.step(state, control)
     if len(switches.names):
         return modes.linearize(state, control)
@@ -396,7 +397,7 @@ def beyond(problem: Problem, plan: CostedPlan, model: ModeModel, which: int) -> 
 
 
 def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
-    """Descend from a plan within its contact modes; certified. None where no switch is in sight of it, or known."""
+    """Descend from a plan within its contact modes; certified. None if no switch is near it, or known."""
     problem, dynamics = run.problem, run.problem.dynamics
     modes = dynamics.contact_modes(problem.dt)
     if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
@@ -434,15 +435,15 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
 def optimality_in_mode(
     problem: Problem, modes: ContactModes, plan: CostedPlan, gain: Array, pulls: Sequence[Switches], limits: Array
 ) -> tuple[float, Quadratic]:
-    """The most that a plan's own mode still allows the cost to fall, relative to it; and the policy's cost-to-go.
+    """A bound on the relative decrease of cost within the plan's own mode, and the policy's cost-to-go.
 
     By duality: half the square of the Lagrangian's gradient in the offsets, weighed as in `kernels/certificate.py`, and
-    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives
-    in a recursion of its own, not the model from which the plan was found.
+    the products of multipliers and distances of switches and limits. It uses the problem's functions and derivatives in
+    a separate recursion, not the model from which the plan was found.
 
     Args:
-      pulls: multipliers of the switches of each period, by name, not negative. limits: those of the limits of the
-        controls, (T, m), negative for upper ones.
+      pulls: nonnegative multipliers of the switches of each period, by name. limits: multipliers of the control limits,
+        (T, m), negative for upper limits.
     """
     states, controls, steps = plan.states, plan.controls, problem.steps
     n, m = states.shape[1], controls.shape[1]
@@ -477,7 +478,7 @@ def optimality_in_mode(
 
 
 def surroundings(problem: Problem, model: ModeModel, plan: CostedPlan, pulls: Sequence[Switches]) -> ContactCertificate:
-    """What the true cost is beside a plan: across each switch that it is pressed against, and at random."""
+    """The true cost near a plan: across each switch that the plan is pressed against, and at random samples."""
     pressed = np.flatnonzero(np.concatenate([one.values for one in pulls]) > 0).tolist()
     plans = [beyond(problem, plan, model, which) for which in pressed]
     cheapest = min((one.cost for one in plans if one is not None), default=np.inf)

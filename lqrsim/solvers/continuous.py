@@ -1,4 +1,4 @@
-"""LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
+"""LQR smoothing and its iteration in continuous time, as in Secs. IV and V of the paper.
 
 `riccati_ode.py` has the equations and integrates them.
 """
@@ -218,17 +218,17 @@ def smooth_lq_continuous(
     """Solve a linear-quadratic problem in continuous time by LQR smoothing. Paper: Sec. IV, Eqs. (4)-(22).
 
     Args:
-      stage: the dynamics and the cost of a second, without a leading axis; where they change with time, a function
-        t [s] -> Stage. Where that jumps, the integrator takes many short steps.
+      stage: the dynamics and the cost per second, without a leading axis; or a function t [s] -> Stage if they change
+        with time. At jumps, the integrator takes many short steps.
       horizon: l, in seconds.
       initial: c_0: hessian (n, n), gradient (n,), constant. Together, stage, initial and final must give every state a
         total cost with one minimum.
-      final: c_l, likewise.
+      final: c_l, in the same form.
       rtol: relative tolerance of the integration of the Riccati equations.
-      atol: absolute tolerance of it.
+      atol: absolute tolerance of the integration.
 
     Returns:
-      A ContinuousSolution. A problem without a minimum does not raise: the status says where it was noticed.
+      A ContinuousSolution. A problem without a minimum raises no exception; the status says where this was noticed.
 
     Raises:
       InputError: an argument is not as described.
@@ -239,7 +239,7 @@ def smooth_lq_continuous(
     def at(t: float) -> Stage:
         given = stage(t) if callable(stage) else stage
         if not isinstance(given, Stage) or np.ndim(given.B) != 2:
-            got = f"one with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
+            got = f"a Stage with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
             raise InputError(
                 f"stage: got {got}, want a Stage without a leading axis, or a function of t that gives one"
             )
@@ -304,26 +304,26 @@ def smooth_continuous(
 ) -> ContinuousSolution:
     """Compute a locally optimal feedback policy by iterated LQR smoothing in continuous time. Paper: Sec. V.
 
-    The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
-    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step
-    gets the step in which the time lies, but at least 1, because some costs do not act at step 0. Controls have no
+    The horizon is `steps * dt`, the cost per second is `stage_cost / dt`, and the control is not held over a step. As
+    dt and the weights shrink, `smooth` approaches this solution at first order. A stage cost that depends on the step
+    gets the step that contains the time, but at least 1, because some costs do not act at step 0. Controls have no
     limits here.
 
     Args:
       problem: a problem with an initial cost, the paper's soft start.
       tolerance: tolerance of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol`
-        counts as that.
+        counts as `atol`.
       gap_tolerance: tolerance of the gap (see `Iteration`), checked every dt. The dynamics residual is not evaluated.
       max_iterations: number of iterations after which to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
-        InitialPrior, which adds to that. It has a say in which local optimum is found.
+        InitialPrior, which is added to the cost at first. The start influences which local optimum is found.
       rtol: relative tolerance of all integrations.
       atol: absolute tolerance of all integrations.
       callback: called with each `Iteration` as it ends.
 
     Returns:
-      A ContinuousSolution, of the last iteration that was completed. A hard problem does not raise: the status says how
-      it ended, and the detail where.
+      A ContinuousSolution, from the last completed iteration. A hard problem raises no exception: the status says how
+      the solve ended, and the detail where.
 
     Raises:
       InputError: an argument is not as described; the dynamics or a cost is not finite at the start.
@@ -336,11 +336,11 @@ def smooth_continuous(
             " the primal form has no other start"
         )
     if problem.constraints:
-        raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
+        raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
     if problem.noise is not None:
-        raise InputError("noise: got some, want none in continuous time: noise is per control period; smooth takes it")
+        raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
     if problem.dynamics.discrete:
-        raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
+        raise InputError(f"dynamics: got {problem.dynamics.name}, which has no rate xdot; use `smooth`")
     limits = _Limits(
         check_number("tolerance", tolerance, above=0.0),
         check_number("gap_tolerance", gap_tolerance, above=0.0),
@@ -367,7 +367,7 @@ def smooth_continuous(
 
 
 class _Limits(NamedTuple):
-    """When to stop; see `smooth_continuous`."""
+    """Conditions for stopping; see `smooth_continuous`."""
 
     tolerance: float
     gap_tolerance: float
@@ -417,12 +417,12 @@ def _iterate(
 
 
 class _Smoother:
-    """Runs the iterations, and keeps the state between them.
+    """Runs the iterations, and keeps the state between iterations.
 
     Attributes:
-      forward, backward: the passes of the last iteration that completed both; None before.
+      forward, backward: the passes of the last iteration that completed both passes; None before.
       where: the pass that is under way.
-      cost, gap: of the last rollout; see `Iteration`.
+      cost, gap: cost and gap of the last rollout; see `Iteration`.
     """
 
     def __init__(
@@ -432,7 +432,7 @@ class _Smoother:
         self.system, self._tolerances = System(problem), tolerances
         self._prior, self._prior_left = prior, prior.iterations if prior is not None else 0
         self._x_hat = state  # at 0
-        # Before the first pass: no cost-to-go, and a policy that plays the initial control.
+        # Before the first pass there is no cost-to-go, and the policy applies the initial control.
         law = np.hstack([np.zeros((m, n)), control[:, None]])
         self._to_go = Pass.constant(np.zeros((n + 1, n + 1)), law, self.system.horizon)
         self.forward: Pass | None = None
@@ -449,7 +449,7 @@ class _Smoother:
             system.model(self._to_go, prior), system.end_model("initial", self._x_hat), horizon, backward=False,
             tolerances=tolerances,
         )  # fmt: skip
-        # Eq. (33). With c_l quadratised there, the next pass begins at the minimiser anew, by Eq. (28) at l.
+        # Eq. (33). With c_l quadratised there, the next pass again begins at the minimiser, by Eq. (28) at l.
         x_end = minimizer(self._to_go.at(horizon)[0] + come.at(horizon)[0], horizon)
         self.where = "backward pass"
         go = riccati_pass(
@@ -476,11 +476,11 @@ class _Smoother:
         return None
 
     def improvement(self, before: float) -> float:
-        """See `Iteration.improvement`, of the cost before; a cost below the tolerance is the integrator's noise."""
+        """See `Iteration.improvement`. A cost below the tolerance is noise of the integrator."""
         return (before - self.cost) / max(abs(self.cost), self._tolerances.atol)
 
     def optimality(self) -> float:
-        """See `Iteration.optimality`; infinite where a model about the rollout has no minimum."""
+        """See `Iteration.optimality`; infinite if a model about the rollout has no minimum."""
         if self._states is None:
             return math.inf
         try:

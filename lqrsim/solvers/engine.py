@@ -46,7 +46,7 @@ _METHODS = {
     declarations.NEWTON: "newton",
 }
 _STATUS = {
-    declarations.RUNNING: Status.MAX_ITERATIONS,  # as many iterations as were asked for
+    declarations.RUNNING: Status.MAX_ITERATIONS,  # all requested iterations were done
     declarations.CONVERGED: Status.CONVERGED,
     declarations.COST_CONVERGED: Status.COST_CONVERGED,
     declarations.MAX_ITERATIONS: Status.MAX_ITERATIONS,
@@ -67,11 +67,11 @@ _DETAILS = {
     declarations.NO_PROGRESS: "the least cost so far no longer falls",
     declarations.STALLED: "the line search found no lower cost",
 }
-ATTENTION = 0.1  # s, after which compiled code returns to heed Ctrl-C
-MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the next solve, and bytes of each
-# Newton's method takes over where the states of least total cost are so near to the rollout, relative to its range:
-# smoothing has then found the valley, and what is left is the way along it. Damped iterations, which come there slowly,
-# end where the cost falls by less than NEARLY, twice, with a gap below NEAR.
+ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C
+MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory is kept for later solves, and largest size in bytes
+# Newton's method takes over when the states of least total cost are within VALLEY of the rollout, relative to its
+# range: smoothing is then near a local optimum. Damped iterations approach it slowly. They end when the cost falls by
+# less than NEARLY, twice, with a gap below NEAR.
 VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 _idle: "list[SolveRun]" = []
@@ -80,12 +80,12 @@ _lending = threading.Lock()
 
 @dataclass(frozen=True)
 class Ending:
-    """How iterations ended: the kernel's outcome, and what users read of it.
+    """The way in which iterations ended: the kernel's outcome, and its texts for users.
 
     Attributes:
-      outcome: outcome of `kernels/declarations.py`. done: how many iterations there are, those before included.
-      failed: the step of the pass that failed, or -1. backward: whether that was a backward pass.
-      raised: the exception of a user's function, if there was one.
+      outcome: outcome in `kernels/declarations.py`. done: total number of iterations, including earlier ones.
+      failed: the step at which a pass failed, or -1. backward: whether it was a backward pass.
+      raised: the exception of a user's function, or None.
     """
 
     outcome: int
@@ -104,13 +104,13 @@ class Ending:
 
     @property
     def pass_failed(self) -> bool:
-        """Whether a pass of one more iteration failed."""
+        """Whether a pass failed in a further iteration."""
         return self.outcome in (
             declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH
         )  # fmt: skip
 
     def detail(self, steps: int) -> str:
-        """The step at which it ended, of this number of steps, and the exception of a user's function there."""
+        """Text with the step at which it ended, of that many steps, and the exception of a user's function."""
         raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
         return ": ".join(part for part in (self._place(steps), raised) if part)
 
@@ -136,14 +136,14 @@ def iterate(
     """Run a loop of `kernels/iterations.py` until it ends, there are `last` rows, or the budget is over.
 
     Args:
-      problem: whose functions may raise meanwhile.
+      problem: the problem, whose functions may raise exceptions during the run.
       run: runs the iterations from its first argument up to its second, or fewer.
       rows: (any,) `LOG`, where `run` writes.
-      first: the row that comes next. last: how many rows there are to be, as far as the budget allows.
-      budget: whose log the iterations join. Compiled code returns after each iteration where there is a callback, a
-        deadline or a constraint to look at, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
-        an iteration are the average of those between two returns.
-      violation: violation of the constraints by the last result of `run`.
+      first: the next row. last: the desired number of rows, as far as the budget allows.
+      budget: whose log the iterations join. Compiled code returns after each iteration if there is a callback, a
+        deadline or a constraint to check, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
+        an iteration are averaged over the iterations between two returns.
+      violation: violation of the constraints in the last result of `run`.
     """
     functions, stop = functions_of(problem), budget.stop
     single = (
@@ -188,10 +188,10 @@ def check_finite_at_start(
 ) -> Ending:
     """Find the cause if the first iteration is not finite: a function that is not finite at the start (x, u).
 
-    `costs` are those of the iterations so far.
+    `costs` are the costs of the iterations so far.
 
     Raises:
-      InputError: there is one, and `refuse` is set; otherwise the returned ending names it.
+      InputError: there is such a function, and `refuse` is set; otherwise the returned ending names it.
     """
     lost = not len(costs) and ending.status is Status.NOT_FINITE
     if lost or (len(costs) and not np.isfinite(costs[0])):
@@ -209,11 +209,12 @@ class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 
     Attributes:
-      cost: cost of the plan, as the log has it; infinite where there is no plan.
-      law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
-      final: whether another start cannot do better.
+      cost: cost of the plan, as in the log; infinite without a plan.
+      law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, in the form for
+        `assemble`.
+      final: whether no other start can do better.
       stuck: whether the violation no longer falls, however large the penalty.
-      against: what conflicts with the constraints that are missed, in words, the strongest first.
+      against: in words, the constraints and limits that conflict with the violated constraints, the strongest first.
     """
 
     status: Status
@@ -233,7 +234,7 @@ class RunResult:
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
-        """The smaller, the better: success first, then INFEASIBLE before others, then the violation, then the cost."""
+        """Sort key, best first: success, then INFEASIBLE before other failures, then violation, then cost."""
         missed = 0.0 if self.success else float(f"{self.violation:.2g}")
         return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
 
@@ -246,7 +247,7 @@ class SolveRun:
     """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: its start. work: its memory. budget: its iterations and its time.
+      initial_guess: the start. work: the memory. budget: the iterations and the time.
       ending: the state of smoothing; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
         the smoothing before it; see `SmootherSettings`.
@@ -266,9 +267,9 @@ class SolveRun:
     def lent(
         cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
     ) -> "SolveRun":
-        """A run in memory that an earlier solve gave back, if there is some: allocating takes time.
+        """A run, if possible in memory that an earlier solve gave back, because allocating takes time.
 
-        It overwrites the result of the earlier solve, which therefore has to be copied before.
+        The run overwrites the result of the earlier solve, which must have been copied.
         """
         core, steps = compiled.core(problem, settings.form), problem.steps
         with _lending:
@@ -299,20 +300,20 @@ class SolveRun:
         self.second_order = settings.second_order(problem)
         self.final, self.rough = settings.final(problem), settings.rough(problem)
         self._valley = VALLEY if self.second_order else 0.0
-        # Fractions of the obstacle costs in the iterations, of which the last is for all that follow.
+        # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._shares = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
 
     @property
     def cost(self) -> float:
-        """True cost of the last rollout; infinite where there is none, or a pass failed."""
+        """True cost of the last rollout; infinite if there is no rollout, or a pass failed."""
         return np.inf if self.ending.pass_failed else _cost_of(self._last)
 
-    # How it goes.
+    # The phases of a run.
 
     def solve(self, *, look_back: bool = True) -> RunResult:
-        """Smooth; from the valley on take Newton's steps; where the method fails, the safeguard's.
+        """Smooth; near an optimum take Newton's steps; if the method fails, take the safeguard's steps.
 
-        With `look_back`, a run that is stopped answers with its best plan, which takes another pass to make a policy.
+        With `look_back`, a stopped run returns its best plan, which needs another pass for a policy.
         """
         self.smooth(len(self._rows))
         if self.ending.outcome == declarations.IN_VALLEY:
@@ -323,7 +324,7 @@ class SolveRun:
             self.go_on(checkpoint, self.budget.log[begin:])
             self.smooth(len(self._rows))
         ending = self.checked_ending()
-        lost = ending is not self.ending  # a function that is not finite at the start: nothing can help
+        lost = ending is not self.ending  # a function is not finite at the start, so nothing can help
         found = self.result(ending)
         if lost or (found.success and not self.second_order):
             return found
@@ -367,7 +368,7 @@ class SolveRun:
         self._loop(*self._arguments(0, 0, self._rows))
 
     def checked_ending(self) -> Ending:
-        """How smoothing ended; NOT_FINITE if a function is not finite at the start.
+        """The ending of smoothing; NOT_FINITE if a function is not finite at the start.
 
         Raises:
           InputError: a function is not finite at the start, and `budget.attentive` is set.
@@ -425,17 +426,17 @@ class SolveRun:
             self._last = self.budget.log[-1]
         return ending
 
-    # Where it stands, and going back to that.
+    # Checkpoints.
 
     def checkpoint(self) -> list[tuple[Array, Array]]:
-        """The arrays with the state of smoothing, and copies."""
+        """The arrays with the state of smoothing, and copies of them."""
         arrays = self.work.arrays
         return [(one, one.copy()) for one in (*arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat)]
 
     def go_on(self, checkpoint: list[tuple[Array, Array]], others: Sequence[Iteration] = ()) -> None:
         """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
 
-        Iterations of other methods that failed count as smoothing's: it has to make progress from there.
+        Iterations of other methods that failed count as smoothing's, which has to make progress from there.
         """
         for array, copy in checkpoint:
             array[...] = copy
@@ -462,10 +463,10 @@ class SolveRun:
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
-    # What it leads to.
+    # The results of a run.
 
     def result(self, ending: Ending) -> RunResult:
-        """Result of smoothing, with its ending."""
+        """The result of smoothing, with its ending."""
         work, last = self.work, self._last
         return RunResult(
             status=ending.status, detail=ending.detail(self.problem.steps), states=work.last.states,
@@ -482,12 +483,12 @@ class SolveRun:
             return found
         optimality = self.linearize_about_plan()
         detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
-        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
+        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan did not
         return self._about_plan(optimality, status, detail)
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
-        if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # stopped, and did not look back
+        if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # the run was stopped without looking back
             return self.best(
                 RunResult(
                     status=status, detail=detail, states=self.work.last.states, controls=self.work.last.controls,
@@ -502,12 +503,12 @@ class SolveRun:
         work = self.work
         states, controls = work.best
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
-        if not np.isfinite(optimality):  # there is no model about the plan, nor a policy
+        if not np.isfinite(optimality):  # there is neither a model about the plan nor a policy
             law, gap = (np.zeros_like(work.arrays.policy.gain), controls.copy()), np.nan
         else:
             values = work.value_functions()
             if not gap < self.settings.gap_tolerance:
-                # As from iLQR, whose steps need neither of these.
+                # As for iLQR, whose steps need neither of these.
                 values["cost_to_come"] = values["inverse_law"] = None
                 off, gap = gap, np.nan
                 detail += (
@@ -542,13 +543,13 @@ class SolveRun:
         cost, status = (self.cost, None) if found is None else (found.cost, found.status)
         return Candidate(name, cost, len(self.budget.log), status, plan)
 
-    # The compiled loop and its arguments.
+    # The compiled loop, and its arguments.
 
     def _iterate(
         self, arguments: Callable[[int, int, StructuredArray], tuple[Any, ...]], plan: Motion,
         rows: StructuredArray | None = None, first: int = 0, last: int | None = None,
     ) -> Ending:  # fmt: skip
-        """Run the loop with these arguments, each of whose iterations writes a plan; by default to the budget's end."""
+        """Run the loop with these arguments; each iteration writes a plan. By default until the budget is over."""
         left = self.budget.left
         rows, last = np.zeros(max(left, 1), LOG) if rows is None else rows, left if last is None else last
         return iterate(
@@ -562,7 +563,7 @@ class SolveRun:
         share = 1.0 if again else self._shares[min(first, len(self._shares) - 1)]
         if share != 1:
             last = min(last, first + 1)
-            tolerance = valley = 0.0  # a part of the cost must not converge
+            tolerance = valley = 0.0  # with only a part of the cost, the iterations must not converge
         guided = self.initial_guess.trajectory is not None and self.settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
         options = self._options(rows, tolerance)._replace(guided=guided, prior_iterations=count, valley=valley)
@@ -588,7 +589,7 @@ class SolveRun:
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
     def _options(self, rows: StructuredArray, tolerance: float, least_gap: float = 0.0) -> IterationSettings:
-        """Settings of the kernels for at most as many iterations as there are rows."""
+        """Settings of the kernels, for at most one iteration per row."""
         return IterationSettings(
             steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
             gap_tolerance=max(self.settings.gap_tolerance, least_gap), optimal=self.settings.stop == "optimal",
@@ -600,7 +601,7 @@ class SolveRun:
 
 
 class Workspace:
-    """The memory of a run: what its iterations read and write.
+    """The memory of a run, which its iterations read and write.
 
     Attributes:
       arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
@@ -619,7 +620,7 @@ class Workspace:
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
-        kept = steps if self.dual else 1  # the primal form recovers without it
+        kept = steps if self.dual else 1  # the primal form restores the state without it
 
         def plan() -> Motion:
             return Motion(zeros((steps + 1, n)), zeros((steps, m)))
@@ -640,7 +641,7 @@ class Workspace:
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        """Begin a solve, also after another one of the same size and number of steps."""
+        """Begin a solve. The memory may have served another solve of the same size and number of steps."""
         self._problem, self._tolerance, steps = problem, settings.violation_tolerance(problem), problem.steps
         self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
@@ -657,7 +658,7 @@ class Workspace:
             own.penalty, own.values[...] = known.penalty, known.values.ravel()
         self.model = compiled.arguments(problem, multipliers=self.multipliers, second_order=self._exact)
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
-        # Everything else is written before it is read.
+        # All other memory is written before it is read.
         self.memory_rows[...] = 0.0
         self.memory["watched"] = float(settings.safeguard)
         arrays.start[...] = arrays.x_hat[...] = start
@@ -666,7 +667,7 @@ class Workspace:
         known = (0.0, 0.0, 0.0) if value is None else (value.hessian, value.gradient, value.constant)
         for array, given in zip(arrays.to_go, known, strict=True):
             array[...] = given
-        # Without a trajectory: the start state, and the controls with which the dynamics can run backwards.
+        # Without a trajectory, use the start state, and the controls with which the dynamics can run backwards.
         plan = initial_guess.trajectory
         for array in (arrays.given, arrays.best):
             array.states[...] = start if plan is None else plan.states
@@ -705,7 +706,7 @@ class Workspace:
             return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_law": inverse}
         covariance, mean, _ = to_come
         law = None
-        if not self.fixed:  # or the first covariances are singular
+        if not self.fixed:  # otherwise the first covariances are singular
             # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
             with contextlib.suppress(np.linalg.LinAlgError):
                 gain = -np.linalg.solve(covariance[1:], np.swapaxes(inverse[0], 1, 2))
@@ -725,7 +726,7 @@ class Workspace:
         return self.model.stage._replace(data=tuple(data))
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
-        """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero where it does not act."""
+        """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero if it does not act."""
         values = [np.empty_like(one.values) for one in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
@@ -733,7 +734,7 @@ class Workspace:
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
-        """Gradient (n+m,) of one of a constraint's numbers."""
+        """Gradient (n+m,) of one row of a constraint."""
         slope = np.zeros(len(x) + len(u))
         self._costs.slope_of_constraint(which, row, x, u, step, self.model.stage.constraints, slope)
         return slope
@@ -754,5 +755,5 @@ class Workspace:
 
 
 def _cost_of(iteration: Iteration | None) -> float:
-    """Its cost; infinite where there is none, or it is not known."""
+    """The cost of the plan; infinite if there is no plan, or its cost is unknown."""
     return iteration.cost if iteration is not None and np.isfinite(iteration.cost) else np.inf

@@ -1,7 +1,7 @@
-"""A free final time: the duration is one more state, constant along the plan, with a free initial value.
+"""A free final time: the duration is an additional state, constant along the plan, with a free initial value.
 
 The number of steps is fixed and their length varies: the dynamics are scaled by duration / stated duration, so that a
-Runge-Kutta step over `dt` becomes one over `share * dt`. The interior point finds states, controls and duration at
+Runge-Kutta step over `dt` becomes a step over `share * dt`. The interior point finds states, controls and duration at
 once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
 """
 
@@ -29,9 +29,9 @@ from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
-STATE, STATED = "duration", "stated_duration"  # the added state, and the parameter that it is relative to
-MOST = 300  # iterations
-# How often a shorter duration is tried, by which factor, and with how many iterations.
+STATE, STATED = "duration", "stated_duration"  # the added state, and the parameter to which it is relative
+MOST = 300  # largest number of iterations
+# Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
@@ -41,10 +41,10 @@ def solve_for_duration(
     problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
     attentive: bool, callback: Callback | None,
 ) -> Solution:  # fmt: skip
-    """Solve for the stated duration, then find the best one near it, and finish the plan with that.
+    """Solve for the stated duration, then find the best duration near it, and finish the plan with that duration.
 
-    With a weight on time, and no start from the caller, shorter durations are tried, too, since they may lead another
-    way round. `solve` is for problems with a fixed duration; for `attentive` see `Budget`.
+    With a weight on time, and no start from the caller, shorter durations are also tried, because they may lead to
+    another route. `solve` is for problems with a fixed duration; for `attentive` see `Budget`.
     """
     budget = Budget(settings.max_iterations, callback=callback)
     stop, log = budget.stop, budget.log
@@ -89,7 +89,7 @@ def solve_for_duration(
 
 
 def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
-    """The smaller, the better: the violation of a plan that failed, then the cost with that of its time."""
+    """Sort key, best first: the violation of a failed plan, then the cost including the cost of time."""
     missed = 0.0 if solution.success else solution.violation
     return missed, solution.cost + time_weight * solution.trajectory.horizon
 
@@ -97,7 +97,7 @@ def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, floa
 def find_duration(
     problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, most: int, budget: Budget,
 ) -> tuple[Problem, Found]:  # fmt: skip
-    """Find the best duration near that of a plan. Return the problem with it, and the optimum, or how far it came.
+    """Find the best duration near a plan's duration. Return the problem with it, and the optimum or the last plan.
 
     `violation` is the tolerance of the constraints, `most` the number of iterations, up to `MOST`; they join the log of
     the budget, which may end the search earlier.
@@ -185,7 +185,7 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
 
 
 def _longer_cost(cost: Cost, n: int) -> Cost:
-    """A cost of n states as a cost of n + 1, independent of the last."""
+    """A cost of n states as a cost of n + 1 states, independent of the last state."""
     if isinstance(cost, QuadraticCost):
         return QuadraticCost(np.pad(cost.weight, (0, 1)), about=np.append(cost.about, 0.0))
     if isinstance(cost, SymbolicCost):
@@ -199,8 +199,8 @@ def _longer_cost(cost: Cost, n: int) -> Cost:
 
 
 def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
-    """A constraint of these dynamics' states as one of these and another, independent of the last."""
-    names = dynamics.state_coordinates.names  # numbers by unit would be those of the last state, too
+    """A constraint on the states of these dynamics as a constraint on n + 1 states, independent of the last."""
+    names = dynamics.state_coordinates.names  # numbers by unit would also apply to the last state
     if isinstance(constraint, GoalState):
         return GoalState({names[i]: number for i, number in constraint._numbers(dynamics).items()})
     if isinstance(constraint, StateBounds):

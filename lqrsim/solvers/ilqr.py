@@ -1,4 +1,4 @@
-"""Iterative LQR with line search: the baseline that the paper compares with."""
+"""Iterative LQR with line search: the paper's baseline for comparison."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -33,7 +33,7 @@ from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import named
 from lqrsim.solvers.settings import Settings, check_callback, check_problem, settings_from, warn_of_goal
 
-TOLERANCE = 1e-4  # by default
+TOLERANCE = 1e-4  # default tolerance
 
 
 def ilqr(
@@ -51,14 +51,14 @@ def ilqr(
     """Compute a locally optimal feedback policy by iterative LQR with a line search that halves the step.
 
     Each iteration is a backward pass about a feasible trajectory and the accepted rollout of its policy. The start is
-    fixed: the state of a `FixedState`, or the one that the initial cost is about. The cost never rises. The limits of
-    the controls are kept; constraints are not for this solver.
+    fixed: the state of a `FixedState`, or the state at which the initial cost is zero. The cost never rises. Control
+    limits are respected; constraints are not supported.
 
     Args:
-      problem: a problem whose start is given exactly, or by the initial cost.
-      stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      problem: a problem with a start that is given exactly, or by the initial cost.
+      stop: as in `smooth`; the gap is zero here, because every iterate is feasible.
       tolerance: tolerance of the relative change of cost, and of the optimality, as in `smooth`.
-      max_iterations: the most iterations.
+      max_iterations: the largest number of iterations.
       time_limit: as in `smooth`.
       start: controls of the first trajectory: (m,) or (T, m), by default the problem's nominal control; the controls of
         a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
@@ -67,7 +67,8 @@ def ilqr(
       risk: as in `smooth`.
 
     Returns:
-      The same Solution as `smooth`, without cost-to-come and inverse policy. A hard problem does not raise.
+      A Solution, as `smooth` returns, but without cost-to-come and inverse policy. A hard problem raises no
+      exception.
 
     Raises:
       InputError: an argument is not as described, or the problem names no start.
@@ -97,8 +98,8 @@ def ilqr_many(
 
     Args:
       problems: problems of one structure or of many; each structure is compiled once.
-      threads: how many to use; by default all processors that this process may run on.
-      progress: called with the numbers of solved and of all problems, as each solve ends.
+      threads: number of threads; by default all processors that this process may use.
+      progress: called with the number of solved problems and the number of all problems, as each solve ends.
       noise: as in `ilqr`, for all problems.
       risk: as in `ilqr`, for all problems.
       options: other keyword arguments of `ilqr`, except `callback`, for all problems.
@@ -122,10 +123,10 @@ def _check(problem: Problem, settings: Settings) -> None:
     if isinstance(settings.start, InitialPrior):
         raise InputError(_NO_PRIOR)
     if problem.duration is not None:
-        raise InputError("duration: got one, want None for ilqr; smooth solves for it")
+        raise InputError("duration: got a free duration, want None for ilqr; use `smooth`, which solves for it")
     if problem.constraints:
         raise InputError(
-            "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"
+            "constraints: got a problem with constraints, want none for ilqr, which keeps only limits; use smooth"
         )
     if problem.start is None:
         raise InputError(

@@ -1,12 +1,12 @@
 """Evidence that constraints are infeasible near a plan: the violation is stationary.
 
 The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the
-problem's own functions, on a code path that the solvers do not use. Rows that are just kept balance it with multipliers
-from 0 to 1, which the restoration finds; controls at their limits balance it by themselves. Where everything cancels,
-no plan nearby violates the constraints less.
+problem's own functions, on a code path that the solvers do not use. Rows that are just satisfied balance the gradient
+with multipliers from 0 to 1, which the restoration finds. Controls at their limits balance it by themselves. If the sum
+is zero, no plan nearby violates the constraints less.
 
-The augmented Lagrangian's evidence is a violation that does not fall while its penalty grows. Either says that the
-constraints are infeasible only if two starts lead to the same violation.
+With the augmented Lagrangian, the evidence is a violation that does not fall while the penalty grows. Either evidence
+counts as infeasibility only if two starts lead to the same violation.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers.engine import RunResult, Workspace
 
-STARTS, ALIKE = 2, 0.05  # starts that must lead to the same least violation, to within this fraction, for INFEASIBLE
+STARTS, ALIKE = 2, 0.05  # starts that must lead to equal violations, and relative difference up to which they are equal
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
 NEAR_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
 NAMED = 3  # most constraints that a message names beside the one that is violated most
@@ -29,7 +29,7 @@ class Evidence:
     """A plan whose violation is stationary.
 
     Attributes:
-      plan: that plan. missed: its violation, in the same measure for all of one search.
+      plan: the plan. missed: its violation, in a measure that is the same for a whole search.
       against: the other constraints that conflict, in words, the strongest first.
     """
 
@@ -43,7 +43,7 @@ class Evidence:
 
 
 def alike(found: Sequence[Evidence]) -> list[Evidence]:
-    """The evidence with the least violation, that first; none unless it is from `STARTS` starts."""
+    """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
     least = sorted(found, key=lambda one: one.missed)
     same = [one for one in least if one.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
@@ -75,11 +75,11 @@ def evidence(
 def _pulls(
     problem: Problem, work: Workspace, plan: RunResult, shares: list[Array], sizes: list[Array], allowed: float
 ) -> tuple[float, Array, Array, list[tuple[float, str]]]:
-    """The total violation, relative to the rows' sizes, and what pulls on it.
+    """The total violation, relative to the rows' sizes, and its slopes.
 
     Returns:
-      The violation; slopes (T+1, n+m) of all rows with their multipliers, and of the violated ones alone; and the rows
-      in words, each with its share.
+      The violation; slopes (T+1, n+m) of all rows with their multipliers, and of the violated rows alone; and the rows
+      in words, each with its fraction.
     """
     states, controls = plan.states, plan.controls
     steps, joint = len(controls), states.shape[1] + controls.shape[1]
@@ -111,7 +111,7 @@ def _pulls(
 def _balance(
     problem: Problem, plan: RunResult, slopes: Array, alone: Array, control_size: Array, state_size: Array
 ) -> tuple[float, float, Array]:
-    """The largest gradient in a control that is left, that of what cancels, and (m,) what limits balance."""
+    """The largest remaining gradient in a control, the size of the cancelling ones, and (m,) the limits' part."""
     states, controls = plan.states, plan.controls
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     space = problem.control_coordinates

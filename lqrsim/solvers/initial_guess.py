@@ -1,4 +1,4 @@
-"""Where a solver starts: from nothing, controls, a prior, a policy, a trajectory or another plan."""
+"""The start of a solver: nothing, controls, a prior, a policy, a trajectory or another plan."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 class InitialPrior:
     """`1/2 (x - about)' diag(weight) (x - about)` at all steps but the first, in the first iterations only.
 
-    It is not part of the cost. It keeps the first linearisations of the smoother reasonable, and thereby influences
-    which local optimum is found.
+    The prior is not part of the cost. It keeps the first linearisations of the smoother reasonable, and thereby
+    influences which local optimum is found.
 
     Args:
-      weight: (n,) not negative.
+      weight: (n,) weights, not negative.
       iterations: the number of iterations in which it acts.
       about: the state (n,), or trajectory (T+1, n), at which the prior is zero.
-      obstacles: fractions of the obstacle costs in the first iterations, one per iteration; afterwards it is 1.
+      obstacles: fractions of the obstacle costs in the first iterations, one per iteration; 1 afterwards.
       controls: the controls (m,) or (T, m) of the first pass; by default the problem's nominal control.
     """
 
@@ -66,7 +66,7 @@ class InitialPrior:
         """The state at which the prior is zero.
 
         Args:
-          step: a step, or a number between two.
+          step: a step, or a number between two steps.
 
         Returns:
           (n,).
@@ -102,23 +102,23 @@ class InitialPrior:
         return self
 
 
-# Controls (m,) or (T, m), or something that says more; or a function that makes one of these for a problem.
+# Controls (m,) or (T, m), or a richer start; or a function of a problem that makes one of these.
 Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Plan | None
 StartLike = Beginning | Callable[[Problem], Beginning]
 
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """What the first pass starts from.
+    """The initial guess of a solve, from which the first pass starts.
 
     Attributes:
       gain, offset: (T, m, n) and (T, m), the policy to begin with.
-      cost_to_go: the cost-to-go, if known.
+      cost_to_go: the cost-to-go, or None if unknown.
       trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
       summary: its entry in the options of a solution.
       prior: added to the cost in the first iterations.
-      multipliers: multipliers of the constraints, if known.
-      found: a result that the interior point already has, after the iterations in `log`; it is only finished.
+      multipliers: multipliers of the constraints; empty if unknown.
+      found: a result that the interior point has already found, with the iterations in `log`; only finishing remains.
     """
 
     gain: Array
@@ -147,9 +147,10 @@ class InitialGuess:
         return sha256(*(part for name, array in arrays for part in (f"{name} {array.shape}", array)))
 
     def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
-        """The same with the trajectory of its policy from a state (n,), about which a backward pass can begin.
+        """This guess with the trajectory of its policy from a state (n,), about which a backward pass can begin.
 
-        Where the rollout is not finite, the last finite state and control are repeated: it need not be feasible.
+        If the rollout is not finite, the last finite state and control are repeated; the trajectory need not be
+        feasible.
         """
         states, controls = [x], []
         with np.errstate(all="ignore"):
@@ -164,7 +165,7 @@ class InitialGuess:
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
     def penalised(self, problem: Problem, penalty: float | None) -> "InitialGuess":
-        """The same with this penalty for all constraints from the first iteration on; unchanged for None.
+        """This guess with a penalty for all constraints from the first iteration on; unchanged for None.
 
         Raises:
           InputError: the problem has no constraints, or there is a prior, during whose iterations constraints are off.
@@ -181,12 +182,12 @@ class InitialGuess:
 
 
 def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:
-    """Whether a start is a function of the problem. An AffinePolicy is callable, too, but is itself a start."""
+    """Whether a start is a function of the problem. An AffinePolicy is also callable, but is itself a start."""
     return callable(start) and not isinstance(start, AffinePolicy)
 
 
 def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
-    """The initial guess for what a caller gave as a start; by default the problem's nominal control, held.
+    """The initial guess for a caller's start; by default the problem's nominal control, held constant.
 
     Raises:
       InputError: it does not fit the problem.
@@ -210,7 +211,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
                               check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
         multipliers = start.multipliers
         if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
-            multipliers = ()  # of other constraints
+            multipliers = ()  # they belong to other constraints
         summary = _summary(start, policy.gain, policy.offset)
         return InitialGuess(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
     if isinstance(start, AffinePolicy):

@@ -2,15 +2,15 @@
 
 Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
 the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
-falls by Mehrotra's rule where the last step was long and the measures come down, and otherwise when its own problem is
-nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); corrections with the same
-models then reduce the residuals of a long step. Where a model has no minimum, the Hessian is mixed with that of the
-projected cost until it has.
+parameter is reduced by Mehrotra's rule if the last step was long and the measures decrease. Otherwise it is reduced
+when the barrier problem is nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006).
+Corrections with the same models then reduce the residuals of a long step. If a model has no minimum, the Hessian is
+mixed with the Hessian of the projected cost until the model has a minimum.
 
-A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
-between a lowest and a highest one, `d = s - p` has two slacks: s, whose product with y - lowest is the barrier's
-parameter, and p, whose product with highest - y is. An inequality has 0 for the lowest; without a highest there is no
-p. A highest multiplier is the price, in cost a unit, for which a constraint may be missed: then it is elastic.
+A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
+row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the
+barrier parameter, and so is the product of p and upper - y. For an inequality, the lower bound is 0. Without an upper
+bound there is no p. An upper bound is the price of a violation, in cost per unit: the constraint is then elastic.
 """
 
 from collections.abc import Callable
@@ -34,26 +34,26 @@ REGULARISATION = 1e-8  # of equalities, relative
 # Regularisation of active rows in the first step without a barrier. Where a row couples controls, curvature across it
 # must exceed 1e-9 of its weight, below which the kernel takes it for rounding.
 CROSSING = 1e-6
-LONG = 0.3  # part of a step above which the next one uses Mehrotra's rule
-LATELY = 4  # iterations with that rule; to continue, the measures must be better than in the worst of them
-# Most corrections after a long step, and the largest share of the violation that each may leave.
+LONG = 0.3  # fraction of a step above which the next step uses Mehrotra's rule
+LATELY = 4  # number of iterations with that rule; to continue, the measures must be below the worst of these
+# Largest number of corrections after a long step, and the largest fraction of the violation that each may leave.
 CLOSINGS, CLOSER = 3, 0.3
-# How much further the centring of a step that is not long looks, and the share of this that it must gain; the factor by
-# which products may then differ from the barrier's parameter.
+# If a step is not long: the longer fraction for which centring aims, the part of this gain that is required, and the
+# factor by which products may then differ from the barrier parameter.
 REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
-NOTHING, FAR = 1e-4, 1e-2  # scale of the first plan, relative to the typical cost of a change: the least; if infinite
-SHORTEST = 1e-7  # part of a step before the line search gives up
+NOTHING, FAR = 1e-4, 1e-2  # least scale of the first plan, relative to the typical cost of a change; if infinite
+SHORTEST = 1e-7  # fraction of a step below which the line search gives up
 MARGIN = 1e-5  # improvement that the filter requires
-ARMIJO = 1e-4  # part of the promised decrease that a step must achieve
-FORCED = 6  # most steps that are taken although the filter rejects them
+ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
+FORCED = 6  # largest number of steps that are taken although the filter rejects them
 WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
-CROSSINGS = 8  # most steps without a barrier, at the end
+CROSSINGS = 8  # largest number of final steps without a barrier
 FINER, FINEST = 1e-2, 1e-13  # factor by which the tolerance falls if these fail, and its least value
 AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
-CREEP, CREEPING = 0.1, 20  # part of a step that is short, and number of short ones in a row that end the run
-SLOW = 0.01  # unless the constraints are kept and the cost falls by this share meanwhile
-STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step that softens equalities, the factor, and its limit
+CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end it
+SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
+STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
 ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
 FARTHEST = 10.0  # largest violation relative to the first plan's
 EDGE = 0.05  # distance of the first controls from their limits, relative to the range
@@ -64,8 +64,9 @@ class Measures(NamedTuple):
 
     Attributes:
       cost: cost of the plan. stationarity: the largest slope of the Lagrangian in a control, times its range, relative
-        to the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
-        the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to the cost.
+        to the cost. violation: violation of the worst constraint, in its unit. gap: the largest gap between two steps,
+        relative to the states' ranges. complementarity: the largest product of a multiplier and its margin, relative to
+        the cost.
     """
 
     cost: float
@@ -75,7 +76,7 @@ class Measures(NamedTuple):
     complementarity: float
 
     def record(self, laps: Laps, method: str = INTERIOR) -> None:
-        """Record them as an iteration that ends now."""
+        """Record the residuals as an iteration that ends now."""
         optimality = max(self.stationarity, self.complementarity)
         laps.record(method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation)
 
@@ -85,10 +86,10 @@ class Found:
     """Result of a run.
 
     Attributes:
-      plan: states and controls, a motion except for gaps. gain: (T, m, n) about it. measures: its measures.
-      multipliers: multipliers of each constraint (T+1, rows); of the limits (T, m), positive where a control presses
-        against the upper one. solved: whether all measures are within tolerance.
-      sizes: typical sizes. scale: the cost that measures are relative to.
+      plan: states and controls, feasible except for gaps. gain: (T, m, n) about it. measures: its measures.
+      multipliers: multipliers of each constraint (T+1, rows), and of the limits (T, m), positive if a control presses
+        against its upper limit. solved: whether all measures are within tolerance.
+      sizes: typical sizes. scale: the cost to which measures are relative.
     """
 
     plan: Motion
@@ -126,14 +127,14 @@ class Step(NamedTuple):
 
 
 class Rows:
-    """The live rows of the stages (K,), and the slacks of the barrier (P,): one a row, or two where a row is elastic.
+    """The live rows of the stages (K,), and the slacks of the barrier (P,): one per row, or two for an elastic row.
 
     Each slack pairs with the distance of its row's multiplier from a bound.
 
     Attributes:
-      size, equality, limit: (K,) of each row. highest: (K,) largest multiplier. regularised: (K,) softness of hard
+      size, equality, limit: (K,) for each row. highest: (K,) largest multiplier. regularised: (K,) softness of hard
         equalities, else 0. elastic: whether any row has a price.
-      row, sign, bound: (P,) of each slack its row, its sign in `d = s - p`, and the multiplier's bound. hard: (P,)
+      row, sign, bound: (P,) for each slack, its row, its sign in `d = s - p`, and the multiplier's bound. hard: (P,)
         whether its row is an inequality without a price.
     """
 
@@ -151,7 +152,7 @@ class Rows:
         self.hard = np.concatenate([~np.isfinite(self.highest[self.below]), np.zeros(len(above), dtype=bool)])
 
     def beginning(self, numbers: Array, known: Array | None, *, parameter: float, room: float) -> tuple[Array, Array]:
-        """Slacks (P,) and multipliers (K,) to begin with, for rows of these values; `known` are given multipliers."""
+        """Initial slacks (P,) and multipliers (K,) for rows with these values; `known` are given multipliers."""
         below, equality = self.below, self.equality[self.below]
         force, least = np.zeros(len(numbers)) if known is None else known, room * self.size
         if known is not None:
@@ -189,7 +190,7 @@ class Rows:
         return self.sign * (force[self.row] - self.bound)
 
     def violation(self, numbers: Array) -> Array:
-        """How far values are on the wrong side of zero, (K,); negative for inequalities that are kept."""
+        """The violations of rows with these values, (K,); negative for inequalities that hold."""
         return np.where(self.equality, np.abs(numbers), -numbers)
 
 
@@ -211,15 +212,17 @@ class InteriorPoint:
 
     Args:
       problem: a problem with constraints, limits, or neither.
-      plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
-      barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
+      plan: initial states (T+1, n) and controls (T, m), which need satisfy neither dynamics nor constraints.
+      barrier: initial barrier parameter of each row, as a fraction of the cost divided by the number of rows.
       room: the least initial slack: relative to a row's size, or to a control's range.
-      price: price of missing a constraint, in cost a unit: then it is elastic. Infinite: it must not be missed.
-      multipliers: known ones of the constraints, (T+1, rows) each, or none.
-      stages: to use again, of the same problem.
+      price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
+        hold.
+      multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
+      stages: stages of the same problem, to be reused.
 
     Attributes:
-      point: the current iterate. measures: of it. sizes: typical sizes. parameter: of the barrier. iterations: so far.
+      point: the current iterate. measures: its measures. sizes: typical sizes. parameter: the barrier parameter.
+      iterations: their number so far.
     """
 
     def __init__(
@@ -244,7 +247,7 @@ class InteriorPoint:
         self.sizes = stages.sizes(plan)
         cost, arrived = stages.trial(plan)
         numbers = stages.values(plan)[stages.live]
-        # A cost near zero, as of standing still, says nothing about the scale of the problem.
+        # A cost near zero, as when standing still, says nothing about the scale of the problem.
         self._scale = max(cost, NOTHING * self.sizes.cost) if cost < np.inf else FAR * self.sizes.cost
         self._rows = Rows(stages, self.sizes, self._scale, price)
         self._barrier = barrier
@@ -260,7 +263,7 @@ class InteriorPoint:
         self._soft = 1.0
         self._begin_at(Iterate(plan, cost, arrived, numbers, slack, force, costates))
         self._measure()
-        # In a sum over many rows, those that are far from acting count, too.
+        # In a sum over many rows, even rows that are far from active count.
         begun, steps = self._off(self.point), stages.steps
         self._farthest_gap = FARTHEST * max(0.05 * steps, begun)
         self._farthest = FARTHEST * max(0.05 * max(steps, len(self._rows.row)), begun)
@@ -277,9 +280,10 @@ class InteriorPoint:
         """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
 
         Args:
-          tolerance: tolerance of stationarity, gaps and complementarity. violation: of the constraints, in their units.
-          most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after
-            each; True ends it.
+          tolerance: tolerance of stationarity, gaps and complementarity. violation: tolerance of the constraints, in
+            their units.
+          most: largest number of iterations. near: whether the plan may be next to the answer. watch: called with the
+            measures after each iteration; True ends the run.
         """
         if near and self._settle(tolerance, violation):
             watch(self.measures)
@@ -296,7 +300,7 @@ class InteriorPoint:
             ended = watch(self.measures) or creeping == CREEPING
         finer, found = tolerance, (self.point, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
-            # A lower barrier shows which rows are active, also where the cost is mostly constant.
+            # A lower barrier shows which rows are active, even if most of the cost is constant.
             finer *= FINER
             for _ in range(min(CROSSINGS, most - self.iterations)):
                 ended = not self._iterate(finer) or watch(self.measures)
@@ -344,7 +348,7 @@ class InteriorPoint:
         stages, point, rows = self.stages, self.point, self._rows
         self._gaps = stages.models.arrived - point.plan.states[1:]
         start, slopes = self._adjoint()
-        # Measures are relative to the cost, or to a millionth of its typical size where its terms cancel.
+        # Measures are relative to the cost, or to a millionth of its typical size if its terms cancel.
         least = 1e-6 * self.sizes.cost
         self._scale = max(abs(point.cost), least) if np.isfinite(point.cost) else least
         stationarity = float((np.abs(slopes) * self.sizes.controls).max())
@@ -383,9 +387,10 @@ class InteriorPoint:
         return False
 
     def _cross(self, tolerance: float, violation: float) -> bool:
-        """Cross over from the barrier to the active set: active rows become equalities; return whether they were right.
+        """Cross over from the barrier to the active set: active rows become equalities. Return whether they were right.
 
-        So controls end at their limits, and multipliers lose the barrier's contribution. Constraints keep a margin for
+        Controls then end exactly at their limits, and multipliers lose the barrier's contribution. Constraints keep a
+        margin for
         rounding.
         """
         rows, kept, size, highest = self._rows, self.point, self._rows.size, self._rows.highest
@@ -395,7 +400,7 @@ class InteriorPoint:
         presses = ~paid & (rows.equality | (force * size / self._scale > numbers / size))
         right = False
         for k in range(CROSSINGS):
-            # The first step may be long, and a weight as large as that of the others would spoil it by rounding.
+            # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.
             sigma = np.where(presses, self._scale / ((REGULARISATION if k else CROSSING) * size**2), 0.0)
             force = np.where(presses, force, np.where(paid, np.sign(force) * highest, 0.0))
             if not self._step_along(sigma, aim, force):
@@ -439,11 +444,11 @@ class InteriorPoint:
         return True
 
     def _iterate(self, tolerance: float) -> bool:
-        """Do one iteration; return whether there was a step."""
+        """Do one iteration; return whether a step was found."""
         least, free = 0.1 * tolerance * self._scale, self._falls()
         self._lower_barrier(least, free)
         while True:
-            # Far away, linearised equalities may be absurd; softened ones demand only a part.
+            # Far away, linearised equalities may be absurd; softened equalities demand only a part.
             soft = self._soft * self._rows.regularised
             system = self._system(soft)
             if system is None:
@@ -465,7 +470,7 @@ class InteriorPoint:
     def _falls(self) -> bool:
         """Whether the measures have decreased lately, so that Mehrotra's rule may choose the barrier parameter.
 
-        That rule empties the filter each time; without this condition iterations may cycle.
+        The rule empties the filter each time. Without this condition, iterations may cycle.
         """
         found, missed = self.measures, self._rows.largest_miss(self.point)
         error = max(found.stationarity, found.gap, missed, float(self._products.max(initial=0.0)) / self._scale)
@@ -496,7 +501,8 @@ class InteriorPoint:
     def _system(self, soft: Array) -> System | None:
         """The equations with the least fraction of the projected Hessian that has a minimum; the step is in `stages`.
 
-        None if none has, not even with a weight on changes of the controls. Rows are softened by `soft`, (K,).
+        None if no fraction has a minimum, not even with a weight on changes of the controls. Rows are softened by
+        `soft`, (K,).
         """
         stages, point, rows = self.stages, self.point, self._rows
         duals = rows.duals(self.point.force)
@@ -557,10 +563,10 @@ class InteriorPoint:
         return step.slack * moved if primal > 0.5 else none
 
     def _centred(self, step: Step, system: System, corrections: Array) -> tuple[Step, Array]:
-        """The step and its corrections; where a slack stops it early, another one if it goes further.
+        """The step and its corrections. If a slack stops the step early, another step if that goes further.
 
-        Its corrections bring the outliers among the products, as they would be a little further on, back to within a
-        factor of `OUTLIER` of the barrier's parameter (Gondzio, 1996).
+        The corrections of that step bring outliers among the products, predicted for a slightly longer step, back to
+        within a factor of `OUTLIER` of the barrier parameter (Gondzio, 1996).
         """
         rows, slack, duals = self._rows, self.point.slack, system.duals
         moved = rows.sign * step.multipliers[rows.row]
@@ -586,10 +592,11 @@ class InteriorPoint:
         """Backtrack along a step until the filter accepts; the first trial also with a second-order correction.
 
         The correction reduces the residuals after the whole step, which remain because rows and dynamics are not
-        linear. Without the step's corrections there is none.
+        linear. Without the step's corrections it is left out.
 
         Returns:
-          The point, the part of the step that leads there, and the step whose multipliers and costates belong to it.
+          The point, the fraction of the step that leads to it, and the step whose multipliers and costates belong to
+          it.
         """
         slope = self._slope(step)
         part, first = self._longest(self.point.slack, step.slack), True
@@ -602,7 +609,7 @@ class InteriorPoint:
             if first and tried is not None and corrections is not None:
                 corrected = self._corrected(tried, system, part, corrections)
                 if corrected is not None and self._acceptable(corrected, part, slope):
-                    # Multipliers and costates are those of the uncorrected step.
+                    # Multipliers and costates come from the uncorrected step.
                     return self._closed(corrected, system, part, slope), part, step
             first = False
             part /= 2
@@ -623,8 +630,8 @@ class InteriorPoint:
     def _closed(self, tried: Iterate, system: System, part: float, slope: float) -> Iterate:
         """The point nearer to a motion that keeps its rows, by the least changes, as far as the filter takes them.
 
-        With the models of the step, so that each change costs a Riccati pass and a look at where the steps lead. So a
-        plan that is good enough keeps everything long before it is the best.
+        The changes use the models of the step, so each change costs a Riccati pass and an evaluation of the steps. A
+        good plan is then feasible long before it is optimal.
         """
         stages, sigma = self.stages, system.sigma
         for _ in range(CLOSINGS):
@@ -644,7 +651,7 @@ class InteriorPoint:
     def _force_step(self, system: System) -> tuple[Iterate, float, Step] | None:
         """A step where the filter rejects every part of the last one; None if there is none, or there were too many.
 
-        It is that of the projected Hessian; or, if that is rejected too, a little of it, be it better or not.
+        It is the step of the projected Hessian; or, if the filter rejects that, a small fraction of it, better or not.
         """
         self._forced += 1
         none = np.zeros(len(self.point.slack))

@@ -1,8 +1,8 @@
 """The interior point as part of a run: from a plan to a result with a policy, within the run's budget.
 
-A plan that converges is finished by Newton's method on the augmented Lagrangian with the multipliers found, whose
-minimum it is: that puts controls exactly at their limits, and gives a policy and value functions. Any other plan is
-rolled out.
+A plan that converges is a minimum of the augmented Lagrangian with the multipliers found. Newton's method on that
+function finishes the plan. This puts controls exactly at their limits, and gives a policy and value functions. Any
+other plan is rolled out.
 """
 
 import time
@@ -27,7 +27,7 @@ UPDATES = 5  # of multipliers, if Newton's steps at the end violate constraints
 
 
 class Barrier(NamedTuple):
-    """How the interior point begins: barrier parameter, least slacks, and whether the plan may be near the optimum."""
+    """The beginning of the interior point: barrier parameter, least slacks, and whether an optimum may be near."""
 
     parameter: float
     room: float
@@ -41,7 +41,7 @@ class InteriorRun:
     """The interior point for the problem of a run.
 
     Attributes:
-      stages: of the problem. allowed: tolerance of its constraints.
+      stages: stages of the problem. allowed: tolerance of its constraints.
     """
 
     def __init__(self, run: SolveRun) -> None:
@@ -52,7 +52,7 @@ class InteriorRun:
         run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
 
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
-        """The result from a plan if it converges; None if not: smoothing can then go on."""
+        """The result from a plan if it converges; else None, so that smoothing can continue."""
         checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
         found = self.solve(copied(plan), MUCH)
         if found is not None and found.success:
@@ -61,7 +61,7 @@ class InteriorRun:
         return None
 
     def solve(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
-        """The result from a plan; None if the budget is over, or it leads nowhere. The iterations go to the log."""
+        """The result from a plan; None if the budget is over, or there is no result. The iterations go to the log."""
         budget, run, found = self._budget, self._run, None
         if budget.left < 2 or budget.stop.due:
             return None
@@ -83,7 +83,7 @@ class InteriorRun:
         return None if found is None else self.finish(found)
 
     def finish(self, found: Found) -> RunResult | None:
-        """Make a result of a plan: by Newton's method if it converged, else by a rollout. None if it is not finite."""
+        """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
         if not np.isfinite(found.plan.states).all():
             return None
         if found.solved and (result := self._polished(found)) is not None and result.success:
@@ -114,7 +114,7 @@ class InteriorRun:
             one.penalty, one.values[...] = 0.0, 0.0
 
     def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
-        """The rollout of a plan with gains about it; without gains if that violates the constraints less."""
+        """The rollout of a plan with gains about it, or without gains if this violates the constraints less."""
         candidates = []
         for gains in (gain.copy(), np.zeros_like(gain)):
             law = compiled.law_about(*plan, gains)
@@ -149,7 +149,7 @@ class InteriorRun:
         return replace(result, status=Status.MAX_ITERATIONS)
 
     def _at_limits(self, found: Found) -> tuple[Array, Array]:
-        """Controls and gains of a converged plan, where controls that press against a limit are at it."""
+        """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
         controls, gain = found.plan.controls.copy(), found.gain.copy()
         for side, sign in ((self.stages.low, -1.0), (self.stages.high, 1.0)):
             room = np.abs(side - controls) / found.sizes.controls
@@ -166,7 +166,7 @@ class InteriorRun:
             size = found.sizes.rows[self.stages.owners == k]
             own.penalty = FIRMNESS * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
-            presses = known > own.penalty * (numbers - own.margin)  # others are left over from the barrier
+            presses = known > own.penalty * (numbers - own.margin)  # other forces are remnants of the barrier
             acts = np.isfinite(numbers) & (own.term.equality | presses)
             own.values[...] = np.where(acts, force, 0.0).ravel()
 
@@ -177,7 +177,7 @@ class InteriorRun:
         return result
 
     def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
-        """The multipliers; zero for rows whose margin is larger than their force, which is only left by the barrier."""
+        """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
         values = self._run.work.constraint_values(result.states, result.controls)
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):

@@ -35,21 +35,22 @@ def smooth_lq(
     The states of least total cost are the optimal trajectory, x_hat: Eqs. (21)-(22), Lemma 1.
 
     Args:
-      stage: one stage a step, each of its arrays with a leading axis T; see `Stage`.
+      stage: one stage per step, as arrays with a leading axis T; see `Stage`.
       initial: c_0, a `Quadratic` of arrays (n, n), (n,), (); or a `FixedState`, which only the dual form takes.
-      final: c_l, a `Quadratic` likewise.
-      form: "dual" has the cost-to-come by its moments and needs a positive-definite initial Hessian; "primal" is the
-        paper's and needs an invertible A.
-      dt: seconds a step, for the times of the trajectory and the policy.
+      final: c_l, a `Quadratic` of the same form.
+      form: "dual" represents the cost-to-come by its moments and needs a positive-definite initial Hessian; "primal" is
+        the paper's form and needs an invertible A.
+      dt: seconds per step, for the times of the trajectory and the policy.
 
     Returns:
       A Solution with one iteration. The trajectory is the rollout of the policy. CONVERGED says that its cost equals
-      the predicted cost-to-go to a relative accuracy of ACCURACY (that is its optimality); NOT_POSITIVE_DEFINITE that
-      there is no unique minimum, or none to working precision, and the detail says where. Where the states of least
-      total cost are further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
+      the predicted cost-to-go to a relative accuracy of ACCURACY, which is recorded as the optimality.
+      NOT_POSITIVE_DEFINITE says that there is no unique minimum, or none to working precision; the detail says where.
+      If the states of least total cost deviate from the plan by more than ACCURACY, rounding has spoilt the
+      cost-to-come, which is then left out.
 
     Raises:
-      InputError: arrays that do not fit together, or that the form does not take.
+      InputError: the arrays do not fit together, or the form does not support them.
     """
     clock = time.perf_counter()
     check_name("form", form, tuple(compiled.FORMS))
@@ -86,7 +87,7 @@ def smooth_lq(
         trajectory=Trajectory(states, controls, dt),
         iterations=(iteration,) if solved else (),
         clearance=None,
-        # The plan is the rollout just made.
+        # The plan is the rollout that was just made.
         certificate=Certificate(
             cost=value,
             start=0.0,
@@ -116,9 +117,9 @@ class _Passes(NamedTuple):
 
     Attributes:
       law, inverse_law: gain (T, m, n) and offset (T, m).
-      cost_to_go, cost_to_come: the fields of a `Quadratic`; of `Moments` for the latter in the dual form.
+      cost_to_go, cost_to_come: the fields of a `Quadratic`; in the dual form, cost_to_come has the fields of `Moments`.
       x_hat: (T+1, n), the states of least total cost.
-      failure: the pass that failed, and where; empty if none did.
+      failure: the pass that failed, and the step; empty if none failed.
     """
 
     law: tuple[Array, Array]
@@ -156,10 +157,10 @@ def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
 
 
 def _start(passes: _Passes, initial: Quadratic | FixedState) -> tuple[Array, str]:
-    """The state of least total cost at step 0; also why there is none, empty if there is one."""
+    """The state of least total cost at step 0, and a reason if there is none, else an empty text."""
     if passes.failure or isinstance(initial, FixedState):
         return passes.x_hat[0], passes.failure
-    # With every step of the cost-to-go definite, this alone says that there is one minimum.
+    # If every step of the cost-to-go is definite, this alone ensures a unique minimum.
     hessian, gradient = passes.cost_to_go[0][0], passes.cost_to_go[1][0]
     curve = initial.hessian + hessian
     if not np.linalg.eigvalsh(curve)[0] > 0:
@@ -179,7 +180,7 @@ def _off_plan(parts: tuple[Array, ...], passes: _Passes, states: Array) -> tuple
 
 
 def _cost_at(initial: Quadratic | FixedState, state: Array) -> float:
-    """The initial cost of a state; 0 where the start is fixed."""
+    """The initial cost of a state; 0 if the start is fixed."""
     return float(initial(state)) if isinstance(initial, Quadratic) else 0.0
 
 
@@ -192,15 +193,15 @@ def _policy(gain: Array, offset: Array, nominal: Array, dt: float) -> AffinePoli
 
 
 def _parts(stage: Stage) -> tuple[Array, ...]:
-    """The stage's arrays. Raises InputError unless there is one a step."""
+    """The stage's arrays. Raises InputError unless there is one stage per step."""
     check_kind("stage", stage, Stage, "a Stage")
     if np.ndim(stage.B) != 3:
-        raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
+        raise InputError("stage: got a single stage, want one stage per step: B of shape (T, n, m)")
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
 
 
 def _size(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> float:
-    """Size of the cost's terms at the origin. Where they cancel, a rounding error relative to this remains."""
+    """Size of the cost's terms at the origin. If the terms cancel, a rounding error relative to this remains."""
     size = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
     return size + (abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0)
 

@@ -1,8 +1,8 @@
-"""The starts of `smooth` without one from the caller, and the choice among several starts.
+"""The starts that `smooth` tries if the caller gives none, and the choice among them.
 
 A homotopy draws the first iteration along a smooth path from start to goal, without obstacles, and then raises the
-obstacles' cost to its full weight. It ends in a good optimum far more often than a start from the nominal control does.
-Other paths, bent to the sides, lead to other optima. Which start is best shows after a few iterations.
+obstacles' cost to its full weight. This ends in a good optimum far more often than a start from the nominal control.
+Other paths, bent to the sides, lead to other optima. After a few iterations it becomes clear which start is best.
 """
 
 from collections.abc import Sequence
@@ -21,32 +21,33 @@ from lqrsim.solvers.parallel import workers
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows the gain from each of these choices.
 STARTS = 7
-ASIDE = 3  # the same where a constraint is to be passed
+ASIDE = 3  # number of starts for passing a constraint on another side
 SHARES = (0.0, 0.1, 0.4, 0.7)  # fractions of the obstacle costs in the first iterations
 PULL = 0.1  # weight of the path, relative to the curvature of an obstacle's cost at contact
-RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
-FOLD = 0.9  # the same for the states that move collision spheres: an arm must fold up before it passes an obstacle
-# What contacts hold, such as the tilt of a robot on a floor, is drawn to its start: the weight relative to the path's
-# for a state that moves by 1, and the least range of a state, relative to the largest of its unit.
+RING, STEP, WIDEST = 0.3, 0.2, 0.6  # sideways bend of the paths, relative to the distance from start to goal
+FOLD = 0.9  # bend for states that move collision spheres: an arm must fold up before it passes an obstacle
+# States that contacts hold, such as the tilt of a robot on a floor, are drawn to their start. HOLD is the weight,
+# relative to the path's, for a state that moves by 1. LEAST is the least range, relative to the largest of the unit.
 HOLD, LEAST = 0.01, 1e-3
-HALVE, CHOOSE = 3, 4  # iterations after which half of the starts remain, and one
-# Motions along paths, where constraints have no plan yet: how many, the weight of the path relative to a plan's cost,
-# and the iterations in which it acts.
+HALVE, CHOOSE = 3, 4  # numbers of iterations after which half of the starts remain, and one start
+# Trajectories along paths, tried while no plan keeps the constraints: their number, the weight of the path relative to
+# a plan's cost, and the number of iterations in which the path acts.
 MOTIONS, FOLLOWED, FOLLOW = 5, 100.0, 8
-# Where controls at rest have no effect alone, as for a swimmer: cycles of oscillating controls along the plan, and
-# their amplitude relative to the room within the limits.
+# For robots at rest on which no single control has an effect, as for a swimmer: numbers of cycles of oscillating
+# controls along the plan, and their amplitude relative to the distance from the limits.
 SWAYS, SWAY = (1, 2, 4, 8), 0.3
 
 
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
-    """The starts of a search and their names: paths to the goal, the straight one first.
+    """The starts of a search and their names: paths to the goal, the straight path first.
 
-    A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are those
-    of the position; for a robot of collision spheres without a position, those of the states that move its spheres,
-    such as the angles of an arm. What stands on contacts is drawn to a straight line in its other states, too.
+    A problem without obstacles, or without a start and a goal, has one start, the nominal control. The paths are paths
+    of the position. For a robot of collision spheres without a position, they are paths of the states that move the
+    spheres, such as the angles of an arm. The other states of a robot that stands on contacts are also drawn to a
+    straight line.
 
     Args:
-      count: the number of starts; by default `STARTS` where there are obstacles.
+      count: the number of starts; by default `STARTS` if there are obstacles.
     """
     weight_of_path = pull(problem)
     if weight_of_path == 0 or problem.start is None or problem.goal is None:
@@ -68,14 +69,14 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
 
 
 def _stands(problem: Problem) -> bool:
-    """Whether contacts act at the start, or a control period later, when what is set on the floor has sunk in."""
+    """Whether contacts act at the start, or a control period later, when a robot on the floor has settled."""
     assert problem.start is not None
     later = problem.dynamics.step(problem.start, problem.nominal_control, problem.dt)
     return problem.dynamics.touches(np.array([problem.start, later]))
 
 
 def _holding(problem: Problem) -> Array:
-    """Weights (n,) of all states, relative to the path's: the less a state moves with swaying controls, the heavier.
+    """Weights (n,) of all states, relative to the path's: larger for states that oscillating controls move less.
 
     Derivatives at rest say how controls tilt a robot, but not that the floor ends the tilt after a millimetre. About
     states of least total cost in which it is tilted, or above the floor, wheels drive nothing.
@@ -96,10 +97,10 @@ def _holding(problem: Problem) -> Array:
 
 
 def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]:
-    """Paths to the goal that bend to the sides, by name; none without a position, or where the goal is at the start.
+    """Paths to the goal that bend to the sides, by name; none without a position, or if the goal is at the start.
 
     Args:
-      count: the number of starts with the straight one, which is not among these; by default `ASIDE`.
+      count: the number of starts including the straight path, which is not returned; by default `ASIDE`.
     """
     place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
@@ -116,10 +117,10 @@ def detours(problem: Problem, count: int | None = None) -> dict[str, Trajectory]
 def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[str, InitialPrior]:
     """Starts whose first iterations follow paths from start to goal, by name; none without two such ends.
 
-    Smoothed, they are motions on one side of an obstacle or another, where a path alone is none.
+    After smoothing they are feasible motions on one side of an obstacle or the other; a path alone is not feasible.
 
     Args:
-      moving: the states that paths are of. cost: typical of a plan.
+      moving: the states that follow the paths. cost: typical cost of a plan.
     """
     begin, goal, place = problem.start, problem.goal, list(moving)
     if not place or begin is None or goal is None or np.array_equal(begin[place], goal[place]):
@@ -136,7 +137,7 @@ def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[st
 
 
 def passable(problem: Problem) -> list[bool]:
-    """Whether each constraint may be one that a robot passes on one side or another: an inequality of states."""
+    """Whether a robot may pass each constraint on one side or another: whether it is an inequality of states."""
     return [
         not (term.equality or term.final_only or term.uses_control or isinstance(constraint, StateBounds))
         for constraint, term in zip(problem.constraints, problem.constraint_terms, strict=True)
@@ -172,16 +173,16 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
 
 
 def check_starts(problem: Problem, count: int | None) -> None:
-    """Raises InputError if more than one start is asked for where there is nothing to go round."""
+    """Raises InputError if more than one start is requested although there is nothing to go round."""
     if count is not None and count > 1 and pull(problem) == 0 and not (any(passable(problem)) and detours(problem)):
         raise InputError(
-            f"starts: got {count}, want 1 without a start and a goal some way apart, and an ObstacleCost or a"
-            " constraint of states between them: there is nothing to go round; or give a start"
+            f"starts: got {count}, want 1: there is nothing to go round. More starts need a start and a goal apart from"
+            " each other, and an ObstacleCost or a constraint on states between them"
         )
 
 
 def pull(problem: Problem) -> float:
-    """The weight of the path in the first iteration; 0 where there is nothing to go round."""
+    """The weight of the path in the first iteration; 0 if there is nothing to go round."""
     moving = _moving(problem)
     if not moving or problem.start is None or problem.goal is None:
         return 0.0
@@ -201,14 +202,14 @@ def _moving(problem: Problem) -> list[int]:
 
 
 def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m") -> list[tuple[str, Array]]:
-    """Offsets of the middle of each path from the straight one, with names: none, then to the sides.
+    """Offsets of the middle of each path from the straight path, with names: first none, then to the sides.
 
-    In space the others are a ring about the straight one, in the plane pairs to the left and the right; in more
-    dimensions, pairs along directions orthogonal to it and to each other.
+    In space the other paths form a ring about the straight path; in the plane, pairs to the left and the right; in more
+    dimensions, pairs along directions orthogonal to the straight path and to each other.
 
     Args:
-      way: from start to goal, (k,). unit: of its numbers, for the names.
-      ring: how far those in more than a plane bend, relative to the way; by default RING.
+      way: vector from start to goal, (k,). unit: unit of its numbers, for the names.
+      ring: bend of paths in more than two dimensions, relative to the way; by default RING.
     """
     ring = RING if ring is None else ring
     distance = float(np.linalg.norm(way))
@@ -246,14 +247,14 @@ def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m")
 
 
 def path(start: Array, goal: Array, bend: Array, steps: int) -> Array:
-    """Positions (T+1, 2 or 3): from rest to rest with the least jerk, and aside by a sine."""
+    """Positions (T+1, 2 or 3): from rest to rest with minimum jerk, displaced sideways by a sine."""
     time = np.linspace(0, 1, steps + 1)[:, None]
     way = time**3 * (10 - 15 * time + 6 * time**2)
     return start + way * (goal - start) + np.sin(np.pi * way) * bend
 
 
 def choose(runs: Sequence[SolveRun], threads: int) -> list[SolveRun]:
-    """Run each for a few iterations, the worse half for fewer; return them with the one of least true cost first."""
+    """Run each start for a few iterations, the worse half for fewer; return the runs, the least true cost first."""
     left, dropped = list(runs), []
     for last, keep in ((HALVE, max(len(left) // 2, 1)), (CHOOSE, 1)):
         if len(left) > 1:
@@ -263,6 +264,6 @@ def choose(runs: Sequence[SolveRun], threads: int) -> list[SolveRun]:
             else:
                 for run in left:
                     run.smooth(last)
-            left.sort(key=lambda run: run.cost)  # a stable sort: of equals, the first
+            left.sort(key=lambda run: run.cost)  # a stable sort: of equal costs, the first run
             left, dropped = left[:keep], left[keep:] + dropped
     return left + dropped

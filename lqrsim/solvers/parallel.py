@@ -79,7 +79,7 @@ def check_threads(threads: int | None) -> int:
 
 
 def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
-    """The problems as a list, with noise and risk replaced where they are given. Raises InputError unless it is one."""
+    """The problems as a list, with noise and risk replaced if given. Raises InputError for anything else."""
     listed = list(check_items("problems", problems, object, "a list of Problem"))
     if noise is None and risk is None:
         return listed

@@ -45,13 +45,13 @@ def prepare(
 
     Args:
       problem: one of the problems; others may have other states, goals, obstacles and parameters.
-      tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, times that control's
-        range and relative to the cost; by default 1e-6.
+      tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, multiplied by the
+        control's range and relative to the cost; by default 1e-6.
       gap_tolerance: as in `smooth`.
       constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise, or
         the dynamics of an MJCF, the margin of inequalities, by default 1e-3.
       max_iterations: as in `smooth`.
-      finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
+      finish: as in `smooth`; with None, the augmented Lagrangian method keeps the constraints.
 
     Raises:
       InputError: an argument is not as described.
@@ -66,7 +66,7 @@ def prepare(
 
 
 class PreparedSolver:
-    """Solves problems of one structure from one state after another; `prepare` makes it.
+    """A solver for problems of one structure, from one state after another; `prepare` makes it.
 
     Attributes:
       problem: the problem that is solved by default.
@@ -76,7 +76,7 @@ class PreparedSolver:
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
         check_problem(problem)
         if problem.duration is not None:
-            raise InputError("problem: got one with a free duration, want a fixed one for solves in real time")
+            raise InputError("problem: got a free duration, want a fixed one for solves in real time")
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates
@@ -101,7 +101,7 @@ class PreparedSolver:
         if self.problem.constraints and run.second_order:
             stages, plan = Stages(self.problem), Motion(*run.work.best)
             _Neighbour(run, stages, plan, _Best(run)).find()
-            # Another solve may need what this one did not.
+            # Another solve may need code that this solve did not need.
             stages.convexify(plan)
             stages.change(worst=False)
             with np.errstate(all="ignore"):
@@ -112,22 +112,22 @@ class PreparedSolver:
     def _stages_of(self, problem: Problem) -> Stages:
         try:
             return self._idle.pop().renewed(problem)
-        except IndexError:  # other threads use all there are
+        except IndexError:  # other threads use all of them
             return Stages(problem)
 
     def check(self, problem: Problem) -> Problem:
         """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
         Args:
-          problem: to be solved.
+          problem: the problem to be solved.
 
         Raises:
-          InputError: it would have to be compiled.
+          InputError: the problem would have to be compiled.
         """
         check_problem(problem)
         if compiled.structure(problem) != self._structure:
             raise InputError(
-                "problem: got one of another structure, want the prepared one with other numbers: goal, weights,"
+                "problem: got another structure, want the prepared one with other numbers: goal, weights,"
                 " obstacles, parameters, limits, steps"
             )
         return problem
@@ -148,7 +148,7 @@ class PreparedSolver:
           state: (n,) the state to plan from.
           start: a plan with as many steps as the problem has left: `before.shifted(k)`.
           problem: the problem to solve from that state; by default the prepared one.
-          after: the number of steps that are over; the rest is solved.
+          after: number of steps that are over; the rest is solved.
           time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
 
         Raises:
@@ -178,7 +178,7 @@ class PreparedSolver:
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(found)
         answer = self._answer(problem, best, found, budget, clock, best.rolling_out + sum(seconds))
-        run.give_back()  # not after an exception
+        run.give_back()  # this is skipped after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
@@ -206,8 +206,8 @@ class PreparedSolver:
 def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
     """The plan to start from: the rollout of the old policy, but with the old plan's last state.
 
-    A horizon that moves along has a last step for which the old policy was not made. Where the rollout violates
-    constraints, it is the old plan itself, from the new state.
+    A moving horizon has a last step for which the old policy was not made. If the rollout violates constraints, the old
+    plan itself is used, from the new state.
     """
     plan = copied(best.plan)
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
@@ -245,12 +245,12 @@ class _Neighbour:
     """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
 
     Args:
-      run: with the law and multipliers to begin with. stages: of its problem.
-      plan: states and controls that the law belongs to, the first state being the start.
-      best: the plan that the law leads to. closing: how long what follows the last iteration takes, in s.
+      run: a run with the initial law and multipliers. stages: stages of its problem.
+      plan: states and controls to which the law belongs; the first state is the start.
+      best: the plan that the law leads to. closing: duration of the work after the last iteration, in s.
 
     Attributes:
-      laps: of its iterations; the last may be a step that was abandoned.
+      laps: the times of its iterations; the last iteration may be an abandoned step.
     """
 
     def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
@@ -301,7 +301,7 @@ class _Neighbour:
         return active.run(self._run.final, watch, self._late)
 
     def _late(self, seconds: float) -> bool:
-        """Whether something that takes so long would end too late; if so, the solve ends."""
+        """Whether work of this duration would end too late; if so, the solve ends."""
         self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
         return self._out_of_time
 
@@ -326,12 +326,13 @@ class _Neighbour:
 
 
 class _Best:
-    """The best plan so far, at first the one that the solve starts from. It is called after each iteration.
+    """The best plan so far, initially the plan that the solve starts from. It is called after each iteration.
 
     Attributes:
-      plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
-      multipliers: that it was found with. cost, violation: of it. before: the cost of the first.
-      improved: whether it is another than the first. rolling_out: time that its rollout took, in s.
+      plan: states and controls. law: gain and offset. cost_to_go: cost-to-go of the law; None if unknown.
+      multipliers: multipliers with which it was found. cost, violation: its cost and violation. before: the cost of the
+        first plan.
+      improved: whether it differs from the first plan. rolling_out: duration of its rollout, in s.
     """
 
     def __init__(self, run: SolveRun) -> None:
@@ -370,7 +371,7 @@ class _Best:
             self._keep(iteration.cost, iteration.violation, copies)
 
     def consider(self, found: RunResult) -> None:
-        """Take the final result if it converged and is as good as the best, or if it is better."""
+        """Adopt the final result if it converged and is as good as the best, or if it is better."""
         as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
         if as_good or self._beaten_by(found.cost, found.violation):
             there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())

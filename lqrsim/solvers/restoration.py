@@ -1,13 +1,14 @@
-"""Restoration: from a motion to one that violates constraints least, by descent on an exact penalty.
+"""Restoration: descent on an exact penalty, to a plan that violates the constraints least.
 
-A violated constraint costs its size times a price, smoothed by a logarithmic barrier whose parameter falls; a barrier
-of their own keeps controls within their limits. Steps are those of Newton's method in the Riccati recursion, and are
-rolled out in closed loop, so that every plan is a motion, and each has a lower merit than the one before. Far from a
-solution this is more reliable than the interior point, whose states may leave the dynamics; near to one it is slower.
+A violation costs its size times a price, smoothed by a logarithmic barrier with a decreasing parameter. A separate
+barrier keeps controls within their limits. Steps are Newton steps by the Riccati recursion, and are rolled out in
+closed loop. Every plan therefore satisfies the dynamics, and each has a lower merit than the previous iterate. Far
+from a solution this is more reliable than the interior point, whose states need not satisfy the dynamics. Near a
+solution it is slower.
 
 Far from feasibility the penalty is linear in the constraint. It has no curvature, so the minimum of a quadratic model
-may be anywhere. The curvature of the parabola that touches the penalty from above is added, and changes of controls are
-weighted; less of both after full steps, more after short ones.
+may be anywhere. Two things are added: the curvature of the parabola that touches the penalty from above, and weights on
+changes of controls. Both are reduced after full steps and increased after short steps.
 """
 
 from collections.abc import Callable
@@ -20,25 +21,25 @@ from lqrsim.errors import Array
 from lqrsim.kernels.records import Limits, Motion, Policy
 from lqrsim.solvers.stages import Sizes, Stages, joined
 
-FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; its factor
-SETTLED = 0.1  # promised decrease per row, relative to the parameter, below which that falls
-LAST = 1e-6  # the same for all rows at the end: shares are accurate to its square root
+FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # first and least barrier parameter, relative to the price; factor
+SETTLED = 0.1  # predicted decrease per row, relative to the parameter, below which the parameter falls
+LAST = 1e-6  # predicted decrease over all rows at the end: multipliers are accurate to its square root
 ARMIJO, SHORTEST = 1e-4, 1e-6
-INSIDE = 0.01  # part of the distance to a limit that a step leaves
+INSIDE = 0.01  # fraction of the distance to a limit that a step leaves
 EDGE = 0.01  # distance from the limits at the beginning, relative to the range
-WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to cost and price
-DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same for a damping of 1; bounds of the damping
-LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step above or below which the damping falls or grows, and the factor
-WIDE = 1e3  # factor by which a multiplier may differ from the one that the barrier implies
-# The descent ends after a violation (relative to the rows' sizes) and a change of cost this small, this many times in a
-# row.
+WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # weights on changes of controls, relative to cost and price
+DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # weight at a damping of 1; bounds of the damping
+LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # fractions above or below which the damping falls or grows; factor
+WIDE = 1e3  # factor by which a multiplier may differ from the multiplier that the barrier implies
+# The descent ends when the violation (relative to the rows' sizes) is below CLOSE and the change of cost below SLOW,
+# PATIENCE times in a row.
 CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
-LEVEL, FINER = 1e-4, 0.1  # negligible promised decrease, relative to the merit; factor by which it falls
+LEVEL, FINER = 1e-4, 0.1  # negligible predicted decrease, relative to the merit; factor by which it falls
 
 
 @dataclass(frozen=True)
 class Restored:
-    """A motion; whether its violation is stationary (`settled`), and whether it is nearly feasible (`near`)."""
+    """A trajectory; whether its violation is stationary (`settled`), and whether it is nearly feasible (`near`)."""
 
     plan: Motion
     settled: bool
@@ -46,10 +47,10 @@ class Restored:
 
 
 class Penalty:
-    """What violated rows (K,) cost, smoothed by a barrier. Limits of controls have no price, but their own barrier.
+    """The cost of violated rows (K,), smoothed by a barrier. Control limits have no price, but their own barrier.
 
     Attributes:
-      size, equality, limit: of each row. highest: the price of a unit; lowest: the least multiplier.
+      size, equality, limit: for each row. highest: the price per unit. lowest: the least multiplier.
     """
 
     def __init__(self, stages: Stages, sizes: Sizes, price: float) -> None:
@@ -69,7 +70,7 @@ class Penalty:
         return total if np.isfinite(total) else np.inf
 
     def model(self, numbers: Array, dual: Array | None, parameter: float, damping: float) -> tuple[Array, Array, Array]:
-        """Forces (K,) and curvatures of the penalties, and the multipliers, which are the forces if not known yet."""
+        """Forces (K,) and curvatures of the penalties, and the multipliers; unknown multipliers are the forces."""
         slack, excess = self._slacks(numbers, parameter)
         room = np.where(self.limit, numbers, slack)
         force = self.lowest + parameter / room
@@ -82,7 +83,7 @@ class Penalty:
         return force, curvature, dual
 
     def missed(self, numbers: Array) -> Array:
-        """Violations of all rows but limits; negative for inequalities that are kept."""
+        """Violations of all rows except limits; negative for inequalities that hold."""
         return np.where(self.limit, 0.0, np.where(self.equality, np.abs(numbers), -numbers))
 
     def shares(self, multipliers: Array) -> Array:
@@ -103,13 +104,15 @@ def restore(
     stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
     watch: Callable[[float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
 ) -> Restored | None:  # fmt: skip
-    """Descend from a motion (states (T+1, n), controls (T, m)).
+    """Descend from a feasible trajectory: states (T+1, n), controls (T, m).
 
     Args:
-      price: price of violating a constraint by its typical size, in units of the typical cost. most: iterations.
-      watch: called after each iteration with cost, violation and relative promised decrease; True ends the descent.
-      stationary: asked, once the promised decrease is negligible, whether the violation of a motion is stationary. It
-        gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends the descent.
+      price: price of violating a constraint by its typical size, in units of the typical cost. most: largest number of
+        iterations.
+      watch: called after each iteration with cost, violation and relative predicted decrease; True ends the descent.
+      stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
+        stationary. It gets each constraint's multipliers relative to the price, (T+1, rows), from -1 to 1. True ends
+        the descent.
     """
     live, penalty = stages.live, Penalty(stages, sizes, price)
     count = max(len(penalty.size), 1)

@@ -1,6 +1,6 @@
-"""The differential equations behind `continuous.py`, integrated by SciPy: Riccati's, and a problem's dynamics and cost.
+"""The differential equations of `continuous.py`, integrated by SciPy: Riccati equations, dynamics and cost.
 
-In the coordinates (x, 1) the three equations for S, **s** and s are one. With
+In the coordinates (x, 1) the three equations for S, **s** and s become one equation. With
 
     V = [S s; s' 2s]   F = [A c; 0 0]   G = [B; 0]   H = [Q q; q' 2q]   P = [P r]
 
@@ -29,7 +29,8 @@ from lqrsim.solvers.initial_guess import InitialPrior
 
 NO_MINIMUM = "S + Sbar is not positive definite"
 
-# Most evaluations of one right-hand side, a few seconds: a motion that needs more diverges or is far too stiff.
+# Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far
+# too stiff.
 _EVALUATIONS = 100_000
 
 # The dense output of DOP853 is a polynomial of degree 7 per step, which eight points determine.
@@ -46,12 +47,12 @@ class Tolerances(NamedTuple):
 
 def tolerances_of(rtol: float, atol: float) -> Tolerances:
     """Check the tolerances. Raises InputError."""
-    # SciPy replaces a smaller one, with a warning.
+    # SciPy replaces a smaller tolerance, with a warning.
     return Tolerances(check_number("rtol", rtol, at_least=1e-13), check_number("atol", atol, above=0.0))
 
 
 class IntegrationFailure(Exception):
-    """An integration failed. It becomes the status of the solve, and never reaches the caller."""
+    """The exception for a failed integration. It becomes the status of the solve, and never reaches the caller."""
 
     def __init__(self, status: Status, why: str, t: float) -> None:
         super().__init__(why)
@@ -59,7 +60,7 @@ class IntegrationFailure(Exception):
 
 
 class Model(NamedTuple):
-    """Linear dynamics and a quadratic cost at one time; the letters are those of the module's docstring."""
+    """Linear dynamics and a quadratic cost at one time. The letters are explained in the module's docstring."""
 
     F: Array
     G: Array
@@ -88,7 +89,7 @@ def bordered(hessian: Array, gradient: Array, constant: float) -> Array:
 
 
 def minimizer(V: Array, t: float) -> Array:
-    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises IntegrationFailure if there is none."""
+    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises IntegrationFailure if none exists."""
     _, x, info = dposv(V[:-1, :-1], V[:-1, -1])
     if info != 0:
         raise IntegrationFailure(
@@ -101,7 +102,7 @@ class Pass:
     """A value function and its policy as functions of time.
 
     Attributes:
-      times: (any,) where the pieces of the polynomials meet: the integrator's steps.
+      times: (any,) the times between the pieces of the polynomials: the integrator's steps.
       states, controls: n and m.
     """
 
@@ -111,7 +112,7 @@ class Pass:
 
     @classmethod
     def constant(cls, V: Array, law: Array, horizon: float) -> "Pass":
-        """The same value and law at all times."""
+        """A constant value function and law."""
         m, n = law.shape[0], law.shape[1] - 1
         return cls(PPoly(np.concatenate([V.ravel(), law.ravel()])[None, None], [0.0, horizon]), n, m)
 
@@ -128,7 +129,7 @@ def riccati_pass(
     """Integrate the Riccati equation of `model(t, V)` from V = `end`: back from the horizon, or forward from 0.
 
     Raises:
-      IntegrationFailure: it cannot be done.
+      IntegrationFailure: the integration failed.
     """
     n = len(end) - 1
     sign = 1.0 if backward else -1.0
@@ -169,7 +170,7 @@ def integrate(
 ) -> Any:
     """Run `solve_ivp` with dense output for `rate(t, y)` from y = `start` over `span`.
 
-    Where the rate cannot be evaluated, a shorter step is tried.
+    If the rate cannot be evaluated, a shorter step is tried.
 
     Raises:
       IntegrationFailure: shorter steps fail, too.
@@ -190,7 +191,7 @@ def integrate(
             return out
         except IntegrationFailure as failure:
             last[:] = [failure]
-            return np.full_like(y, math.nan)  # SciPy takes this for too large an error
+            return np.full_like(y, math.nan)  # SciPy treats this as too large an error
 
     with np.errstate(all="ignore"):
         guarded(span[0], start)
@@ -227,7 +228,7 @@ class System:
         self.knots = np.linspace(0.0, self.horizon, problem.steps + 1)
         self._last, self._data = max(problem.steps - 1, 1), data
         self._none = np.zeros(m)
-        # Buffers that compiled code writes to.
+        # Buffers into which compiled code writes.
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
         self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
         joint = self._hessian, self._gradient
@@ -247,7 +248,7 @@ class System:
         return value / self.dt
 
     def end_value(self, which: str, x: Array) -> float:
-        """The `initial` or `final` cost; leaves its derivatives in place."""
+        """The `initial` or `final` cost; its derivatives are left in the buffers."""
         return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
 
     def end_model(self, which: str, x: Array) -> Array:
@@ -281,7 +282,7 @@ class System:
         """Run a policy under the true dynamics; return its cost, and its states (n,) as a function of time.
 
         Raises:
-          IntegrationFailure: the motion diverges, or dynamics or cost are not finite.
+          IntegrationFailure: the trajectory diverges, or dynamics or cost are not finite.
         """
 
         def rate(t: float, y: Array) -> Array:
@@ -295,7 +296,7 @@ class System:
         return float(cost), _pieces(found, lambda t, y: y[: self.n])
 
     def decrease(self, states: PPoly, policy: Pass, tolerances: Tolerances) -> float:
-        """The decrease of cost that a linear-quadratic model about a rollout promises.
+        """The decrease of cost that a linear-quadratic model about a rollout predicts.
 
         Raises:
           IntegrationFailure: the model has no minimum.

@@ -62,22 +62,22 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
 def largest_risk(problem: Problem, solution: Solution) -> float:
     """The largest `risk` for which a backward pass about a solution's plan succeeds, found by bisection.
 
-    For a linear-quadratic problem with noise that is always the same, the plan does not matter. Infinite where no risk
-    is too high, as where the noise costs nothing.
+    For a linear-quadratic problem with noise that does not depend on the state, the plan does not matter. Infinite if
+    no risk is too high, as when the noise costs nothing.
 
     Args:
-      problem: with noise; its own risk does not count.
-      solution: any solution of it.
+      problem: a problem with noise; its own risk does not count.
+      solution: any solution of the problem.
 
     Returns:
-      The risk, in units of 1/cost; infinite where none is too high.
+      The risk, in units of 1/cost; infinite if no risk is too high.
 
     Raises:
-      InputError: the problem has no noise, the solution is not of such a problem, or the pass fails at no risk, too.
+      InputError: the problem has no noise, the solution is not of such a problem, or the pass fails even without risk.
     """
     check_problem(problem)
     if problem.noise is None:
-        raise InputError("problem: got one without noise, want Problem(noise=...), or problem.driven_by(noise)")
+        raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
     check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     plan = solution.trajectory
     wanted = (problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates))
@@ -97,11 +97,11 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
 
 
 def named(fails: Fails, risk: float, steps: int) -> str:
-    """Say at which step a risk is too high, and which risk is not; empty if that cannot be determined."""
+    """Text that says at which step a risk is too high, and which risk is not; empty if this cannot be determined."""
     failed = fails(risk)
     if failed < 0 or fails(0.0) >= 0:
         return ""
-    most = _bisect(fails, risk) * (1 - 1e-5)  # so that the rounded number works, too
+    most = _bisect(fails, risk) * (1 - 1e-5)  # so that even the rounded number works
     return f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
 
 

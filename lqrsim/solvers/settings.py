@@ -25,13 +25,13 @@ from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
 MOST_STARTS = 10_000
 _log = logging.getLogger("lqrsim")
 ROUGH, FINE = 1e-4, 1e-8  # default tolerances of smoothing and of Newton's method
-INSIDE = 1e-3  # how far constraints that press are kept inside, as a share of the tolerance, to leave room for rounding
+INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the tolerance
 MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Options that all solvers have; see `ilqr`."""
+    """Options that all solvers share; see `ilqr`."""
 
     stop: str = "optimal"
     tolerance: float | None = None
@@ -43,9 +43,9 @@ class Settings:
         check_name("stop", self.stop, ("optimal", "cost"))
         if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
-        # Plain Python numbers: NumPy's are other types for the compiler, and JSON cannot have them.
+        # Plain Python numbers: NumPy's numbers are other types for the compiler, and JSON has no form for them.
         self._check_positive("tolerance")
-        # A log of that length takes 48 MB.
+        # A log of this length takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
         keep(self, max_iterations=most)
         self._check_positive("time_limit")
@@ -110,7 +110,7 @@ class SmootherSettings(Settings):
         return self.tolerance or (FINE if self.second_order(problem) else ROUGH)
 
     def rough(self, problem: Problem) -> float:
-        """Tolerance at which smoothing ends, coarser where Newton's method follows."""
+        """Tolerance at which smoothing ends, coarser if Newton's method follows."""
         final = self.final(problem)
         return max(final, ROUGH) if self.second_order(problem) else final
 
@@ -131,7 +131,7 @@ def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
     """Make settings from keyword arguments.
 
     Raises:
-      InputError: one is not as described.
+      InputError: an argument is not as described.
       TypeError: there is no such argument.
     """
     names = [field.name for field in fields(kind)]

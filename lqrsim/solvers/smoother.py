@@ -1,4 +1,4 @@
-"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. What they try is in `strategy.py`."""
+"""`smooth` and `smooth_many`: iterated LQR smoothing, Sec. V of the paper. `strategy.py` describes what they try."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -46,61 +46,65 @@ def smooth(
 ) -> Solution:
     """Compute a locally optimal feedback policy by iterated LQR smoothing.
 
-    Each iteration is a forward pass (cost-to-come), a backward pass (cost-to-go) and a rollout of the new policy; both
-    passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
-    Once these states are near the rollout, Newton's method takes over; problems with constraints are finished by an
-    interior point.
+    Each iteration is a forward pass (cost-to-come), a backward pass (cost-to-go) and a rollout of the new policy. Both
+    passes linearise about the states of least total cost. No initial trajectory is needed. Paper: Sec. V. Once these
+    states are near the rollout, Newton's method takes over. Problems with constraints are finished by an interior
+    point.
 
-    Which local optimum it ends in depends on the start. With an ObstacleCost and no start, several starts are tried for
+    The start determines which local optimum is found. With an ObstacleCost and no start, several starts are tried for
     a few iterations each, and the most promising one is continued; see `solvers/strategy.py`.
 
     Args:
-      problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
-      form: "dual" has the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's.
-      first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
-        From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
-        which cannot, it runs forwards.
-      safeguard: where the method fails, continue from the best plan so far with steps that lower its cost; see
-        `kernels/damped_iterations.py`. Where that, too, does not converge among contacts or joint limits of an MJCF,
-        and there is no start, plan for softer ones and go on from there; see docs/mjcf_robots.md. Where the method
-        converges, the safeguard changes nothing, to the last bit.
-      stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
-        the paper's test, which looks at the change of cost alone and can pass early.
+      problem: a problem with an initial cost, the paper's soft start, or with a `FixedState`, which only the dual form
+        supports.
+      form: "dual" represents the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's
+        form.
+      first_pass: "forward" or "backward"; each iteration ends with a backward pass, so "backward" adds one pass.
+        From controls, "backward" runs the dynamics backwards in time, from the minimiser of the final cost. The
+        dynamics of an MJCF cannot run backwards, and are run forwards.
+      safeguard: if the method fails, continue from the best plan so far with steps that lower its cost; see
+        `kernels/damped_iterations.py`. If this does not converge either among contacts or joint limits of an MJCF, and
+        there is no start, plan for softer contacts and limits and continue from there; see docs/mjcf_robots.md. If the
+        method converges, results are bit-identical with and without the safeguard.
+      stop: "optimal" (gap and first-order optimality within tolerance; for smoothing, also the change of cost) or
+        "cost", the paper's test, which considers the change of cost alone and can pass early.
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and
         1e-4 without Newton's method.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
-        has as many, also those that are tried where no plan keeps the constraints yet.
+        may use that many, including the further starts that are tried while no plan satisfies the constraints.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. An iteration that would end later, if it took as long as the last, is not begun.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
-        problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
+        problem's nominal control; an InitialPrior, which attracts the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
-        multipliers it takes up. Or a function of the problem that returns one. Controls are cut off at their limits.
-        With constraints the answer costs no more than a feasible plan that is given.
-      starts: how many starts to try. By default 7 where there is an ObstacleCost; 3 where the first plan touches an
-        inequality of the states, other than StateBounds, in a problem with a position; else 1, the straight way to the
-        goal or the nominal control, and more where that leads to no plan that keeps the constraints. The candidates are
-        in the solution.
-      constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
-        equalities no more than that. Where the augmented Lagrangian handles them (see `finish`), inequalities are
-        solved with this margin, by default 1e-3.
+        multipliers are used. Or a function of the problem that returns one of these. Controls are clipped to their
+        limits. With constraints, the answer costs no more than a given feasible plan.
+      starts: number of starts to try. By default 7 with an ObstacleCost; 3 if the first plan touches an inequality on
+        the states, other than StateBounds, in a problem with a position; else 1, the straight path to the goal or the
+        nominal control, and more if that leads to no plan that keeps the constraints. The candidates are in the
+        solution.
+      constraint_tolerance: largest violation of constraints, each in its unit; by default 1e-6, which is also the
+        largest for equalities. If the augmented Lagrangian handles them (see `finish`), inequalities are solved with
+        this margin, by default 1e-3.
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
         they then act from the first iteration. It needs a start.
-      finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;
-        see `solvers/strategy.py`. None is the paper's method to the end, with constraints by an augmented Lagrangian;
-        so are `stop="cost"`, noise with constraints and the steps of an MJCF.
-      elastic: the price of missing a constraint, in cost per unit, summed over rows and steps. Constraints whose
-        multipliers would exceed it are missed, and the detail says by how much. None: they are to be kept.
-      noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
+      finish: "newton" leaves the last iterations to Newton's method, or with constraints to the interior point; see
+        `solvers/strategy.py`. None uses the paper's method to the end, with an augmented Lagrangian for constraints. So
+        do `stop="cost"`, noise with constraints and the steps of an MJCF.
+      elastic: the price of violating a constraint, in cost per unit, summed over rows and steps. Constraints whose
+        multipliers would exceed the price are violated, and the detail says by how much. None: they must hold.
+      noise: replaces the problem's own noise; see `Noise`. The cost is then an expectation, in the log, line searches
+        and
         the choice among starts.
-      risk: replaces the problem's own; see `Problem`.
-      threads: how many starts to run at once; by default as many as there are processors.
-      callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
-        What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.
+      risk: replaces the problem's own risk; see `Problem`.
+      threads: number of starts to run at once; by default the number of processors.
+      callback: called with each `Iteration` as it ends; in a search, with iterations of starts that are run to their
+        end.
+        An exception in it ends the solve, as Ctrl-C does; it is raised again, with the best plan so far as `solution`.
 
     Returns:
-      A Solution. A hard problem does not raise: the status says how it ended and what to try.
+      A Solution. A hard problem raises no exception: the status says how the solve ended and what to try.
 
     Raises:
       InputError: an argument is not as described.
@@ -129,14 +133,15 @@ def smooth_many(
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
-    The solutions are those of `smooth`, to the last bit, with any number of threads; only the seconds of an iteration
-    are an average. Constraints are checked after each iteration. Dynamics and costs that are plain Python take turns,
+    The solutions are identical to the solutions of `smooth`, to the last bit, with any number of threads; only the
+    seconds of an iteration
+    are an average. Constraints are checked after each iteration. Dynamics and costs in plain Python run one at a time,
     and gain nothing from threads.
 
     Args:
       problems: problems of one structure or of many; each structure is compiled once.
-      threads: how many to use; by default all processors that this process may run on.
-      progress: called with the numbers of solved and of all problems, as each solve ends.
+      threads: number of threads; by default all processors that this process may use.
+      progress: called with the number of solved problems and the number of all problems, as each solve ends.
       noise: as in `smooth`, for all problems.
       risk: as in `smooth`, for all problems.
       options: other keyword arguments of `smooth`, except `callback`, for all problems.
@@ -145,7 +150,7 @@ def smooth_many(
       One Solution per problem, in their order.
 
     Raises:
-      InputError: an argument is not as described; a problem that is refused is named by its place in the list. One that
+      InputError: an argument is not as described; a refused problem is named by its index in the list. A problem that
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
     settings = settings_from(SmootherSettings, "smooth_many", options)
@@ -162,7 +167,7 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             raise InputError(f"elastic: got {settings.elastic:g}, want {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     if problem.duration is not None and not settings.second_order(problem):
-        raise InputError('duration: got one without the interior point, want finish="newton" and stop="optimal"')
+        raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
     several = settings.start is None and len(problem.obstacle_costs) > 0
     check_runs(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:

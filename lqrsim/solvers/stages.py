@@ -1,8 +1,9 @@
 """The stages of a problem as quadratic models about a plan, and the step to the minimum of these models.
 
-All constraints and limits of the controls are rows of numbers: an inequality's are to be >= 0, an equality's = 0. The
-plan need not satisfy the dynamics; a step closes the gaps between its states. What is done with the rows is the matter
-of those who use the stages: the interior point, the active set, and the restoration.
+All constraints and control limits are rows of numbers, which must be >= 0 for an inequality and = 0 for an equality.
+The
+plan need not satisfy the dynamics; a step closes the gaps between its states. The users of the stages decide what to do
+with the rows: the interior point, the active set, and the restoration.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,11 +37,12 @@ class Stages:
     """The stages of a problem: their models, with all constraints and control limits as rows.
 
     Attributes:
-      live: (T+1, R) which rows act at which step. equality: (R,) which are to be zero. owners: (R,) the constraint that
-        a row is of; -1 for limits. models: `records.StageModels` of the last plan; slopes (T+1, R, n+m) of its rows.
-      active: `records.ActiveRows`, for an active set. policy: gain and offset of the last step.
-      free: (n,) which of the start's states are not fixed. limits: of each row that is one its sign, the control, and
-        where it ends.
+      live: (T+1, R) whether a row acts at a step. equality: (R,) whether a row must be zero. owners: (R,) the
+        constraint to which a row belongs; -1 for limits. models: `records.StageModels` of the last plan; slopes (T+1,
+        R, n+m) of its rows.
+      active: `records.ActiveRows`, for an active set. policy: gain and offset in the last step.
+      free: (n,) whether a state of the start is free. limits: for each row that is a limit, its sign, the control, and
+        the value of the limit.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -68,7 +70,7 @@ class Stages:
         self.changes = Motion(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
     def _take(self, problem: Problem) -> None:
-        """Read a problem's numbers, and which of its rows can act."""
+        """Read a problem's numbers, and determine which rows can act."""
         self.problem, self.steps = problem, problem.steps
         fixed, steps = isinstance(problem.initial, FixedState), problem.steps
         self.free, self._soft = np.full(self.n, 0.0 if fixed else 1.0), 0 if fixed else 1
@@ -108,7 +110,7 @@ class Stages:
         return call(*arguments)
 
     def values(self, plan: Motion) -> Array:
-        """The rows' values (T+1, R); undefined where they do not act."""
+        """The rows' values (T+1, R); undefined for rows that do not act."""
         numbers = np.empty(self.live.shape)
         if self._values:
             self._call("evaluate_constraints", self.steps, *plan, self._model.stage.constraints, self._values)
@@ -123,14 +125,14 @@ class Stages:
         return numbers
 
     def trial(self, plan: Motion) -> tuple[float, Array]:
-        """The cost of a plan, and the states that its steps arrive at, (T, n)."""
+        """The cost of a plan, and the states at the ends of its steps, (T, n)."""
         plan, arrived = Motion(*map(in_c_order, plan)), np.empty((self.steps, self.n))
         return self._call("trial_cost", self.steps, self._soft, plan, self._model, arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
         """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R).
 
-        Constraints whose multipliers are up to `least` count as linear.
+        Constraints with multipliers up to `least` count as linear.
         """
         rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
         self._look(plan, costates, rows, self.active._replace(size=0))
@@ -181,14 +183,14 @@ class Stages:
         return spread
 
     def of_constraints(self, numbers: Sequence[Array]) -> Array:
-        """Numbers of each constraint (T+1, rows) at their places in (T+1, R); zero for limits, or without any."""
+        """Numbers of each constraint (T+1, rows) at their places in (T+1, R); zero for limits, or if none are given."""
         rows = np.zeros(self.live.shape)
         for k, one in enumerate(numbers):
             rows[:, self.owners == k] = one
         return rows
 
     def of_each(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Numbers of the rows (R,) for each of the live ones, (K,)."""
+        """Numbers of the rows (R,) for each of the live rows, (K,)."""
         return np.broadcast_to(numbers, self.live.shape)[self.live]
 
     def pull(self, rows: Array) -> Array:
@@ -201,7 +203,7 @@ class Stages:
         return np.matmul(weighed.transpose(0, 2, 1), self.slopes)
 
     def follow(self, plan: Motion, part: float, policy: Policy, limits: Limits) -> Motion:
-        """Roll out a part of a step in closed loop; see the kernel."""
+        """Roll out a fraction of a step in closed loop; see the kernel."""
         out = Motion(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
         self._call("closed_loop_rollout", self.steps, float(part), plan, policy, limits, self._model, out)
         return out
@@ -257,7 +259,7 @@ class Stages:
         self, gaps: Array, models: StageModels | None = None, rows: ActiveRows | None = None, *,
         share: float = 0.0, scale: float = 1.0, weight: float = 1.0, price: float = 1.0,
     ) -> tuple[bool, int]:  # fmt: skip
-        """`direction` with held rows; also returns the number of wrong rows. See the kernel."""
+        """`direction` with fixed rows; also returns the number of wrong rows. See the kernel."""
         models, rows = self.models if models is None else models, self.active if rows is None else rows
         failed, wrong = self._call(
             "pivot", self.steps, self.free, share, scale, weight, price, models, gaps, rows, self.policy, self.to_go,
@@ -270,9 +272,9 @@ class Stages:
         self._call("update_active_set", self.steps, int(worst), self.active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
-        """Roll out a plan with gains (T, m, n) about it; return the motion, its cost and the constraints' values.
+        """Roll out a plan with gains (T, m, n) about it; return the trajectory, its cost and the constraints' values.
 
-        Controls are put at the limits that are held, and have no gain there.
+        Controls are set to the limits that are fixed, and have no gain there.
         """
         out = Motion(np.empty_like(plan.states), np.empty_like(plan.controls))
         limits = Limits(*(np.tile(side, (self.steps, 1)) for side in (self.low, self.high)))

@@ -1,27 +1,28 @@
-"""What `smooth` tries, top to bottom, until something converges.
+"""The attempts of `smooth`, in order, until one converges.
 
 `solve`
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
      With constraints, the others follow as long as they may cost less.
-  2. Where the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
-     ways round by heavier obstacles and goal; without an ObstacleCost, motions along other paths and oscillating
+  2. If the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
+     routes, found with larger weights of obstacles and goal; without an ObstacleCost, other paths and oscillating
      controls (`Search.widen`).
-  3. Where the best plan touches a constraint that may be passed on another side: paths to the left and to the right
+  3. If the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
-  4. Where the risk is too high on the way: the plan without risk, and on from there (`Search.retry_without_risk`).
-  5. Where nothing converges among contacts or joint limits of an MJCF: plans for softer ones, less and less soft, and
-     on to the true ones from there (`Search.soften`).
-  6. Where that ends at a jump or a kink: a descent that keeps to the contacts that act (`Search.keep_modes`).
-  A free duration is found around all of that (`free_duration.py`).
+  4. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
+     (`Search.retry_without_risk`).
+  5. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
+     step by step to the true ones (`Search.soften`).
+  6. If that ends at a jump or a kink: a descent that keeps the active contacts (`Search.keep_modes`).
+  A free duration is found in an outer loop around these steps (`free_duration.py`).
 
 `finish`, for one start
-  without constraints: smoothing; Newton's method once it has found the valley; damped iterations where smoothing fails
-     (`SolveRun.solve`). If controls have limits: the interior point where controls stay at them, or all of that fails.
-  with constraints: a ladder of plans to begin with, each finished by the interior point (`constrained.py`).
+  without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
+     (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
+  with constraints: a ladder of initial plans, each finished by the interior point (`constrained.py`).
   without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
      smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
 
-The budget of each start is `max_iterations`; the deadline is one for all (`budget.py`). Every answer is certified
+The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified
 (`certify.py`).
 """
 
@@ -64,9 +65,9 @@ from lqrsim.solvers.multistart import (
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
 
-# Controls are idle if they are this close to the nominal ones, relative to these and at least 1.
+# Controls are idle if they are this close to the nominal controls, relative to their size, which counts as at least 1.
 IDLE = 1e-6
-# Factors on the weights of obstacles and goal that find another way round.
+# Factors on the weights of obstacles and goal that lead to another route.
 HEAVIER = (10.0, 100.0)
 # Iterations for each softness of contacts.
 SOFT = 60
@@ -143,7 +144,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 
 
 def refine(run: SolveRun, known: Known) -> RunResult:
-    """Run to the end from the rollout of the first policy, on its side of the obstacles; certified."""
+    """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
     found = damped_from_rollout(run)
@@ -154,7 +155,7 @@ def refine(run: SolveRun, known: Known) -> RunResult:
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
-    """Smoothing and Newton's method. If controls have limits, the interior point where they stay there or all fails."""
+    """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
     problem, budget = run.problem, run.budget
     space = problem.control_coordinates
     if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
@@ -175,7 +176,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs; the most promising ones are finished. Its methods stand in the order in which `solve` tries them.
+    """Several runs, the most promising of which are finished. The methods are in the order in which `solve` calls them.
 
     Attributes:
       best: the run with the best result so far, and that result.
@@ -194,13 +195,13 @@ class Search:
         return self._finished[0]
 
     def run(self) -> None:
-        """Choose a run and finish it; with constraints, finish others too, as long as they may cost less."""
+        """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
         chosen, *others = choose([run for _, run in self._named], self._threads)
         self._offer(chosen, self._finish(chosen))
         if not chosen.problem.constraints:
             return
-        # Constraints can make the best way round the worst, or close it. The others' costs so far, without constraints,
-        # are about the least that they can cost with them.
+        # Constraints can make the best route the worst, or close it. The costs of the other runs so far, without
+        # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
             best = self.best[1]
             if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
@@ -208,7 +209,7 @@ class Search:
             self._offer(run, self._finish(run))
 
     def widen(self) -> None:
-        """Try other starts: another way round, or, where there is nothing to go round, other controls and paths."""
+        """Try other starts: other routes, or, if there is nothing to go round, other controls and paths."""
         if pull(self._problem) > 0:
             for times in HEAVIER:
                 self._try_reweighted(times)
@@ -218,7 +219,7 @@ class Search:
             self._try_sinusoidal_controls()
 
     def _try_reweighted(self, times: float) -> None:
-        """Solve for heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
+        """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
         if self._budget.stop.due:
             return
         heavier = reweighted(self._problem, times)
@@ -245,12 +246,12 @@ class Search:
                 return
             self._known.from_start = False
             run = self._add(resolve(one, problem), name)
-            # A motion is on its side of the obstacles; smoothing without the constraints would leave it. The augmented
-            # Lagrangian keeps to any start only where it begins with the start's own plan.
+            # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
+            # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
-        """Motions along paths from start to goal, by name; those first that violate the constraints least."""
+        """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
         problem, cost = self._problem, self.best[1].cost
         found = list[tuple[float, str, Trajectory]]()
         for name, prior in along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
@@ -265,7 +266,7 @@ class Search:
         return [(name, motion) for _, name, motion in sorted(found, key=lambda one: one[0])]
 
     def _steered(self) -> list[int]:
-        """The states that place the robot: its position, or else those on which constraints to be passed depend."""
+        """The states that place the robot: its position, or else states on which constraints to be passed depend."""
         problem, work, moving = self._problem, self.best[0].work, set[int]()
         position = list(problem.dynamics.state_coordinates.position)
         if position or problem.start is None or problem.goal is None:
@@ -297,7 +298,7 @@ class Search:
                     self._offer(run, self._finish(run))
 
     def retry_without_risk(self) -> None:
-        """If the risk was too high on the way: solve without risk, and continue from that plan."""
+        """If the risk was too high for an intermediate plan: solve without risk, and continue from that plan."""
         if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)
@@ -312,10 +313,10 @@ class Search:
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
     def soften(self) -> None:
-        """Plan for softer contacts and limits, less and less soft, and then for the true ones.
+        """Plan for softer contacts and limits, with decreasing softness, and then for the true ones.
 
-        Each solve begins with the policy of the one before, not with its controls: what comes to a contact a little
-        earlier or later must not lose the rest of the plan.
+        Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
+        earlier or later, the rest of the plan must not be lost.
         """
         problem, begin = self._problem, None
         for name, dynamics in problem.dynamics.softened(self.best[1].states):
@@ -335,7 +336,7 @@ class Search:
         self._offer(run, replace(found, detail=detail), better=found.rank < self.best[1].rank)
 
     def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
-        """Plan for softer contacts: from that policy, or by a search where there is none."""
+        """Plan for softer contacts: from the given policy, or by a search without one."""
         if begin is not None:
             run = self._another(begin, soft)
             with soft.dynamics.solving(self._threads), run.budget.limited(SOFT):
@@ -350,8 +351,8 @@ class Search:
         return search.best
 
     def keep_modes(self) -> None:
-        """From the best plan go on within its contact modes, where a plan may end beside a jump or at a kink."""
-        from lqrsim.solvers.contact_modes import keep_modes  # it imports MuJoCo, which few problems need
+        """Continue from the best plan within its contact modes, in which a plan may end next to a jump or at a kink."""
+        from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
         best = self.best[1]
         run = self._another(policy_of(best, "the best plan"))
@@ -369,7 +370,7 @@ class Search:
         found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
         return (*found, *self._softer) if len(found) > 1 else ()
 
-    # What the steps above are made of.
+    # Helper methods of the steps above.
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
@@ -383,23 +384,23 @@ class Search:
         return run
 
     def _finish(self, run: SolveRun, how: Finish = finish, known: Known | None = None) -> RunResult:
-        """Run to the end; the callback hears of all its iterations, also those before."""
+        """Run to the end. The callback is called for all iterations of the run, including earlier ones."""
         run.budget.report_to(self._callback)
         return how(run, self._known if known is None else known)
 
     def _offer(self, run: SolveRun, found: RunResult, *, better: bool | None = None) -> None:
-        """Take a result for the best if it is: `better` says so, and by default the rank of all."""
+        """Record a result; it becomes the best if `better` says so, by default if its rank does."""
         self._finished.insert(0 if better else len(self._finished), (run, found))
         if better is None:
-            self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+            self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
 
     @property
     def is_unacceptable(self) -> bool:
-        """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
+        """Whether the best plan so far is unacceptable: far from the goal, or through an obstacle.
 
-        Far is farther than the robot's radius, or, without a position, than the tolerance of a goal; through is deeper
-        than half the radius, or half that of the largest collision sphere. Without an ObstacleCost: one that violates
-        the constraints, or does nothing.
+        Far means farther than the robot's radius, or, without a position, than the tolerance of a goal. Through means
+        deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
+        is unacceptable if it violates the constraints, or does nothing.
         """
         problem = self._problem
         space = problem.dynamics.state_coordinates
@@ -437,7 +438,7 @@ class Search:
 
     @property
     def _stuck(self) -> bool:
-        """Whether there is a plan whose violation is stationary, and none that keeps the constraints."""
+        """Whether there is a plan whose violation is stationary, but none that satisfies the constraints."""
         return bool(self._known.evidence) and not self.best[1].success
 
 

@@ -1,4 +1,4 @@
-"""Stress tests: how often a policy fails, under what, and how sure that is."""
+"""Stress tests: how often a policy fails, under which disturbances, and with which confidence."""
 
 import lazy_loader
 

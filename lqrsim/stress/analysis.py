@@ -1,7 +1,7 @@
 """Analysis of a stress test: success rates, comparisons of policies, kinds of failures, and breaking points.
 
-Most functions take a table, `Mapping[Cell, Outcomes]`. A trial succeeds if its outcome is "reached"; all else is a
-failure.
+Most functions take a table, `Mapping[Cell, Outcomes]`. A trial succeeds if its outcome is "reached"; every other
+outcome is a failure.
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm,
 
 Table = Mapping[Cell, Outcomes]
 
-MEASURES = {  # with units; tracking errors and the distance from the goal are in metres for robots with a position
+MEASURES = {  # measure -> unit; tracking errors and the distance from the goal are in metres for robots with a position
     "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
     "saturated": "", "cost": "",
 }  # fmt: skip
@@ -46,7 +46,7 @@ class Success:
     """The success rate of a cell.
 
     Attributes:
-      exact: the rate with the interval of Clopper and Pearson, for claims. band: with Wilson's interval, for plots.
+      exact: the rate with Clopper and Pearson's interval, for claims. band: the rate with Wilson's interval, for plots.
       alike: whether all trials are the same run, as without disturbances; the rate is then exact.
     """
 
@@ -92,8 +92,8 @@ class BreakingPoint:
 
     Attributes:
       below: the limit of the success rate.
-      strength: the smallest tried strength at which the interval of the success rate lies below the limit; None if
-        there is none.
+      strength: the smallest tried strength at which the interval of the success rate lies below the limit; None without
+        such a strength.
       success: the success rate at this strength.
     """
 
@@ -122,8 +122,8 @@ class Comparison:
 
     Attributes:
       pairs: number of trials in which only one of them succeeded, with the exact test.
-      success: success rate of the first minus that of the second. rms: the same for the mean tracking error, over the
-        `both` trials in which both succeeded; None if there are fewer than two.
+      success: success rate of the first policy minus that of the second. rms: the difference of the mean tracking
+        errors, over the `both` trials in which both succeeded; None if there are fewer than two.
       adjusted: p-value, adjusted for the number of comparisons.
     """
 
@@ -137,9 +137,10 @@ class Comparison:
 
 
 def comparisons(table: Table) -> list[Comparison]:
-    """Compare the first policy of the table with each other one, for every sweep and strength that both have.
+    """Compare the first policy of the table with each other policy, for every sweep and strength that both have.
 
-    Differences are paired by trial: those of success with Tango's score interval, those of errors with Student's. If
+    Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
+    Student's. If
     all trials of both policies are the same run, there is nothing to test.
 
     Raises:
@@ -176,7 +177,7 @@ def modes(outcomes: Outcomes) -> dict[tuple[str, str], int]:
 
 
 def quantiles(outcomes: Outcomes, measure: str, levels: Sequence[float] = LEVELS) -> Array:
-    """Quantiles of a measure (see MEASURES) over the trials that have it; NaN if none has.
+    """Quantiles of a measure (see MEASURES) over the trials for which it is defined; NaN if there are none.
 
     Infinite values count: without obstacles, clearance is infinite.
 
@@ -188,7 +189,7 @@ def quantiles(outcomes: Outcomes, measure: str, levels: Sequence[float] = LEVELS
         raise InputError(f"levels: got {excerpt(levels)}, want numbers from 0 to 1")
     values = getattr(_checked(outcomes), check_name("measure", measure, MEASURES))
     values = values[~np.isnan(values)]
-    # Not interpolated: between two infinite values that gives NaN.
+    # Not interpolated: interpolation between two infinite values gives NaN.
     return np.quantile(values, shares, method="inverted_cdf") if len(values) else np.full(len(shares), np.nan)
 
 

@@ -78,12 +78,15 @@ def run_campaign(
     Args:
       campaign: the campaign to run.
       folder: where everything is stored.
-      workers: processes on this machine; by default one per processor. 0 runs everything in this process.
-      batch: trials that a worker simulates together; affects only time and memory.
+      workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
+      batch: number of trials that a worker simulates together; affects only time and memory.
       solution: a Solution, or the path of one, to run instead of solving the scenario. A solution of `ilqr` replaces
-        that of the policy "ilqr", any other solution those of all other policies. It is stored in the folder.
+        the solution of the policy "ilqr"; any other solution replaces the solutions of all other policies. It is stored
+        in the
+        folder.
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
-      progress: called with the number of finished trials and of all trials: at the start, and after each shard.
+      progress: called with the number of finished trials and the number of all trials, at the start and after each
+        shard.
 
     Raises:
       InputError: the campaign cannot be run; the solution is not of the scenario's robot, horizon and goal; the folder
@@ -108,13 +111,13 @@ def run_resolved(
     scheduler: str | None,
     progress: Callable[[int, int], object] | None,
 ) -> Results:
-    """The same, with the scenario that the campaign names: a user's function may return another one each time."""
+    """Run a campaign with its resolved scenario: a user's function may return another scenario each time."""
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_function("progress", progress, "a function of the number of finished trials and of all", arguments=2)
+    check_function("progress", progress, "a function of the numbers of finished trials and of all trials", arguments=2)
     given = None if solution is None else solving.given(scenario, solution)
     _check_runnable(campaign, scenario, given)
     _check_folder(folder)
@@ -128,10 +131,10 @@ def run_resolved(
         if unfinished:
             if others := changed(results.manifest["versions"]):
                 raise InputError(
-                    f"versions: got {others}, which may change the last bits, want those that {folder} was begun with,"
+                    f"versions: got {others}, which may change the last bits, want the versions of {folder},"
                     " or another folder"
                 )
-            results.trials.warm_up()  # here first: the workers then find everything compiled
+            results.trials.warm_up()  # done here first, so that the workers find everything compiled
         job = Job.of(results.trials, results.manifest["digest"], batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
@@ -174,7 +177,7 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
                 disturbance.start(plant, standing, [np.random.default_rng(campaign.seed)])
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
-            except Exception:  # it may depend on the trial or on the plan, and is then an error of those trials
+            except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
     if {*DESIGNED} & {*campaign.policies}:
         design_uncertainty(scenario, campaign.design_disturbances)
@@ -193,7 +196,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path, given: Solution | None) -> None:
-    """Solve for the policies, store them, and write the manifest; or check the one that is there."""
+    """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
         "model": sha256(
@@ -230,7 +233,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(f"{field}: got {excerpt(value)}, want {excerpt(was)}, as in {folder}, or another folder")
     for field, what in (("model", "MJCF or simulator"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
-            raise InputError(f"scenario: got another {what} than {folder} was begun with, want another folder")
+            raise InputError(f"scenario: got a {what} other than the one {folder} was begun with, want another folder")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / GIVEN
@@ -241,7 +244,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
 
 
 def _code(campaign: Campaign) -> dict[str, str | None]:
-    """The hash of the file that defines each disturbance of a user's; None for one that is not defined in a file."""
+    """The hash of the file that defines each of the user's disturbances; None if no file defines it."""
     used = (*campaign.sweeps.values(), campaign.design_disturbances or ())
     hashes: dict[str, str | None] = {}
     for kind in sorted({type(one) for one in itertools.chain(*used)}, key=lambda kind: kind.__qualname__):
@@ -279,7 +282,9 @@ def _is_intact(results: Results, shard: Shard) -> bool:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
         except OSError as problem:
-            raise InputError(f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror})") from None
+            raise InputError(
+                f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror}), want it removed"
+            ) from None
         _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
         return False
     return True

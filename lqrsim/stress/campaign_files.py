@@ -1,10 +1,10 @@
 """The files of a campaign's folder: its lock, the tables of its trials, and its manifest.
 
 A table is a parquet file with the columns of `Outcomes`, and `reason`, the cause of an error. It is written whole or
-not at all. Its metadata names the campaign, the cell and the trials, and has a hash of these and of the columns.
+not at all. Its metadata names the campaign, the cell and the trials, and contains a hash of these and of the columns.
 
-`manifest.json` has specification, versions and hashes. `sha256` covers the whole file, so that an edited one is
-refused. `digest` covers everything that the rows depend on. Each shard has it, too, so that a manifest with new
+`manifest.json` contains specification, versions and hashes. `sha256` covers the whole file, so that an edited file is
+refused. `digest` covers everything that the rows depend on. It is also in each shard, so that a manifest with new
 settings and a renewed hash does not fit the shards.
 
 The system releases the lock when the process dies, however it dies. File systems without locks are refused.
@@ -59,7 +59,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
                 ) from None
             reason = error.strerror or error
             raise InputError(f"folder: got {folder}, want one whose files can be locked ({reason})") from None
-        with contextlib.suppress(OSError):  # shows people which process has the lock
+        with contextlib.suppress(OSError):  # shows which process has the lock
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
         yield
@@ -71,7 +71,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _lock(handle: int) -> None:
-        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads: locked bytes cannot be read
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that is never read: locked bytes cannot be read
 
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
 else:
@@ -86,7 +86,7 @@ _KEY = b"lqrsim shard"
 
 
 class Damaged(Exception):
-    """A file that differs from what was written."""
+    """The exception for a file that differs from what was written."""
 
 
 def pack(table: Table, shard: Shard, campaign: str) -> bytes:
@@ -118,7 +118,7 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
 
 
 def write(contents: bytes, path: Path) -> None:
-    """Write a file to the disk, whole or not at all. Raises InputError if it cannot, as on a full disk."""
+    """Write a file to the disk, all or nothing. Raises InputError if this fails, as on a full disk."""
     with replacing(path) as unfinished, unfinished.open("wb") as file:
         file.write(contents)
         file.flush()
@@ -156,12 +156,12 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
-_LARGEST = 1 << 26  # bytes
+_LARGEST = 1 << 26  # bytes, largest manifest
 
 
 @dataclass(frozen=True)
 class _Manifest:
-    """The fields of the manifest; `Campaign` checks those of the campaign."""
+    """The fields of the manifest; `Campaign` checks the campaign's fields."""
 
     format: Line
     version: int
@@ -189,7 +189,7 @@ def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(parse(json.dumps(manifest)))  # without sorting: the order of the sweeps is that of the cells
+    _check(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
 
 
@@ -216,18 +216,18 @@ def _check(manifest: dict[str, Any]) -> None:
     _check_names("manifest", manifest, _Manifest)
     _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
-        raise InputError("sha256: got one that does not fit the content, want a file that has not been changed")
+        raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
     campaign = manifest["campaign"]
     _check_names("campaign", campaign, Campaign)
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
-        raise InputError("cells: got some that are not the campaign's, want each sweep, strength and policy")
+        raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     for policy, hashes in manifest["policies"].items():
         if hashes.keys() != {"digest", "sha256"}:
             raise InputError(f"policies: {policy}: got {excerpt(dict(hashes))}, want digest and sha256")
     if manifest["digest"] != digest_of_rows(manifest):
-        raise InputError("digest: got one that does not fit the campaign, want a file that has not been changed")
+        raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
 
 
 def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:
@@ -240,7 +240,7 @@ def _check_names(field: str, found: Mapping[str, Any], kind: type[Any]) -> None:
 
 def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     """Policy, sweep and strength of each cell, in order. Raises InputError if a field of the campaign is invalid."""
-    # Without the disturbances: they may be a user's, whose file is not loaded here.
+    # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
     bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
     return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
@@ -255,7 +255,7 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
-    """Hash of everything that the rows depend on; the same when the same campaign is begun again."""
+    """Hash of everything that the rows depend on. It is the same when the same campaign is begun again."""
     fields = ("cells", "model", "problem", "start", "solution", "code", "versions")
     hashed = {name: manifest[name] for name in fields} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
@@ -265,11 +265,11 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_solution(solution: Solution) -> str:
-    """Hash of everything in a solution that its runs depend on; not of the log of its solve."""
+    """Hash of everything in a solution that its runs depend on, which excludes the log of its solve."""
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
-    if solution.cost_to_go is not None:  # re-planning begins with it, and with the multipliers
+    if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
     arrays += [one.values for one in solution.multipliers]
     return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))

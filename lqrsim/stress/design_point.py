@@ -1,20 +1,19 @@
-"""The most likely failure: of all standard normal vectors z whose trial fails, the one nearest to the origin.
+"""The most likely failure: among the standard normal vectors z whose trial fails, the nearest to the origin.
 
 In reliability analysis this is the design point of FORM, the first-order reliability method. If the failures were the
 half-space beyond a plane, their probability would be Phi(-|z|), which is FORM's estimate. It is only a hint;
 multilevel_splitting.py measures the probability. The search uses no derivatives, and scores many vectors at once:
 
-1. It begins with given failures, or those of a splitting, and their mean, which shows what random failures share.
+1. It begins with given failures, or failures from a splitting, and with their mean, which shows their common direction.
 2. Along a ray it finds the smallest multiple that fails, on a grid that is refined.
 3. Around the best failure it scores pairs z + s e, z - s e with random e. The mean of (difference of scores) e
    estimates the gradient of the score; estimates of the last rounds are added up. The search then tries rays between
    the gradient and the best failure.
-4. The distance that is left depends on the noise of the gradient: along a wrong direction a plane is further away, by
-   the cosine of the angle. The two halves of the pairs have independent noise, so that their agreement tells this
-   angle. Rounds are added up while the failure stays where it is. The search ends when the noise leaves less to gain
-   than the tolerance.
+4. The remaining distance depends on the noise of the gradient: along a wrong direction a plane is further away, by the
+   cosine of the angle. The two halves of the pairs have independent noise, so their agreement tells this angle. Rounds
+   are added up while the failure does not move. The search ends when the possible gain is less than the tolerance.
 
-The result fails. There may be a nearer failure; a search from other failures is a check.
+The result is a failure. There may be a nearer failure; a search from other failures is a check.
 """
 
 from dataclasses import dataclass
@@ -48,12 +47,12 @@ class DesignPoint:
     """The nearest failure that was found.
 
     Attributes:
-      numbers: z, (d,). distance: |z|, the reliability index. score: of z, positive.
+      numbers: z, (d,). distance: |z|, the reliability index. score: score of z, positive.
       first_order_probability: Phi(-|z|), FORM's estimate of the probability of failure.
       history: |z| after each round, the start first. simulations: number of computed scores.
-      remaining: share of |z| that may be left to gain, by the noise of the gradient, if the failures lie beyond a
-        plane; NaN without a gradient. converged: this is less than the tolerance, and the last rounds did not come
-        closer.
+      remaining: fraction of |z| that could still be gained, by the noise of the gradient, if the failures lie beyond a
+        plane; NaN without a gradient. converged: whether this is less than the tolerance, and the last rounds did not
+        come closer.
     """
 
     numbers: Array
@@ -87,11 +86,11 @@ def smallest_failure(
       pairs: number of pairs in each round; by default half the size, and at least 250. With fewer the gradient is
         mostly noise.
       seed: seed of all random numbers.
-      progress: called with the number of finished rounds, that of all, and the distance so far as text.
+      progress: called with the number of finished rounds, the number of all rounds, and the distance so far as text.
 
     Raises:
       InputError: an option is out of range, or none of the failures fails.
-      NoFailure: none was given, and none was found.
+      NoFailure: no failure was given, and none was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
@@ -187,7 +186,7 @@ def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) 
     """Estimate the gradient of the score at the best failure from each half of the pairs, (2, d)."""
     steps = SPREAD * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
     scores = score(np.concatenate([best + steps, best - steps]))
-    # Trials that diverge have an infinite score: count it as a little worse than the worst finite one.
+    # Trials that diverge have an infinite score; it counts as slightly worse than the worst finite score.
     highest = scores[np.isfinite(scores)].max(initial=0.0)
     scores = np.minimum(scores, highest + 1.0)
     difference = scores[:pairs] - scores[pairs:]
@@ -197,15 +196,14 @@ def _gradients(score: Score, best: Array, pairs: int, rng: np.random.Generator) 
 
 
 def _remaining(halves: Array) -> float:
-    """Share of the distance to a plane that could still be gained without the noise of the gradient; NaN if the halves
-    disagree."""
+    """Fraction of the distance to a plane that could still be gained without gradient noise; NaN if halves disagree."""
     lengths = float(np.linalg.norm(halves[0]) * np.linalg.norm(halves[1]))
     agree = float(halves[0] @ halves[1]) / lengths if lengths > 0 else 0.0
     return 1 - float(np.sqrt(2 * agree / (1 + agree))) if agree > 0 else float("nan")
 
 
 def _nearer(score: Score, best: Array, gradient: Array) -> Array | None:
-    """A failure nearer than the best, on rays between it and the gradient of the score; None if there is none."""
+    """A failure nearer than the best, on rays between the best and the gradient of the score; None if there is none."""
     distance, steepness = float(np.linalg.norm(best)), float(np.linalg.norm(gradient))
     if steepness == 0:
         return None
@@ -225,9 +223,9 @@ class LargestEffect:
 
 
 def largest_effects(rollout: Rollout) -> list[LargestEffect]:
-    """The largest disturbances of the first trial in physical units, until it ends, without those that are always zero.
+    """The largest disturbances of the first trial until its end, in physical units, except those that are always zero.
 
-    The error of an applied control includes that by the actuators' limits.
+    The error of an applied control includes the error that the actuators' limits cause.
     """
     last = int(rollout.counts[0].sum()) - 1
     states, controls = rollout.state_coordinates, rollout.control_coordinates

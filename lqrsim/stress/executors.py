@@ -1,4 +1,4 @@
-"""Worker processes for a campaign, on this machine or a dask cluster. They may die or hang; the campaign continues.
+"""Worker processes for a campaign, on this machine or a dask cluster. If they die or hang, the campaign continues.
 
 On this machine each worker has a pipe of its own. On a cluster dask starts workers, distributes tasks, and repeats
 those of dead workers, up to its `allowed-failures`. Tables come back as bytes, so no folder needs to be shared. Added
@@ -32,18 +32,18 @@ from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
 
-ATTEMPTS = 3  # to run a shard, and to start a process
+ATTEMPTS = 3  # number of attempts to run a shard, or to start a process
 _START_TIMEOUT = 300.0  # s
 _ONE_THREAD = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")
 _context = multiprocessing.get_context("spawn")  # forking a process that has threads is not safe
 _NAME = "lqrsim worker"
-_RUNS_THE_SCRIPT = 79  # exit code of a worker whose import of the caller's script starts the campaign again
+_RUNS_THE_SCRIPT = 79  # exit code of a worker that, by importing the caller's script, would start the campaign again
 _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
 _serving = False  # whether this process is a worker that has imported the caller's script
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
-    """Run the shards in worker processes; yield each with its file as it is finished.
+    """Run the shards in worker processes; yield each shard with its file as it is finished.
 
     If a process dies, another one runs its shard again. The trials of a shard count as failed if its process dies three
     times, or if it exceeds the time limit.
@@ -90,8 +90,8 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
 def end_if_started_by_import() -> None:
     """End this process if it is a worker, and its import of the caller's script has started the campaign again.
 
-    Python would refuse to start processes there only after everything that the script does before, and with a page of
-    text from each worker. The driver recognises the exit code.
+    Python would refuse to start processes there, but only after all earlier work of the script, and with a page of text
+    from each worker. The driver recognises the exit code.
     """
     if multiprocessing.current_process().name == _NAME and not _serving:
         sys.exit(_RUNS_THE_SCRIPT)
@@ -113,7 +113,7 @@ class _Worker:
         self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
         with process.uninterrupted(), _worker_environment(), _without_ctrl_c():
             self.process.start()
-        theirs.close()  # so that the end of the process closes the pipe
+        theirs.close()  # then the end of the process closes the pipe
         self.ready = self.late = False
         self.deadline = time.monotonic() + _START_TIMEOUT
 
@@ -126,7 +126,7 @@ class _Worker:
                 self.connection.send(shard)
 
     def answer(self, time_limit: float) -> bytes | str | None:
-        """The shard's file; or the reason why there will be none; or None while the shard is being run."""
+        """The shard's file; or the reason why there will be no file; or None while the shard is being run."""
         try:
             while self.connection.poll():
                 message = self.connection.recv()
@@ -147,7 +147,7 @@ class _Worker:
         return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
 
     def end(self) -> None:
-        """Stop the process, also in the middle of a task."""
+        """Stop the process, even in the middle of a task."""
         self.connection.close()
         self.process.kill()
         self.process.join()
@@ -188,12 +188,12 @@ def _exit(code: int | None) -> str:
 def _worker_environment() -> Iterator[None]:
     """Processes started in this block use one thread each, and the GLFW library that this process has loaded.
 
-    Without the latter, importing MuJoCo starts a process that looks for GLFW. It would outlive a worker that is stopped
-    meanwhile, and complain that nobody reads its result.
+    Without the latter, importing MuJoCo starts a process that looks for GLFW. That process would outlive a worker that
+    is stopped meanwhile, and complain that nobody reads its result.
     """
     ours = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
-    if glfw is not None and sys.platform != "win32":  # it starts none there
+    if glfw is not None and sys.platform != "win32":  # on Windows it starts no process
         ours["PYGLFW_LIBRARY"] = glfw._name
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
@@ -234,7 +234,7 @@ def connected(address: str) -> Iterator[Any]:
         import distributed
     except ImportError:
         raise InputError(
-            "scheduler: got one without dask, want it installed: pip install 'lqrsim[distributed]'"
+            "scheduler: got an address without dask, want dask installed: pip install 'lqrsim[distributed]'"
         ) from None
     try:
         client = distributed.Client(address, timeout=10, set_as_default=False)
@@ -244,7 +244,7 @@ def connected(address: str) -> Iterator[Any]:
         try:
             versions_there: Any = client.run(versions)
         except Exception as error:  # a worker may raise anything
-            raise InputError(f"scheduler: got {address}, whose workers do not run lqrsim ({error})") from None
+            raise InputError(f"scheduler: got {address}, want workers that can run lqrsim ({error})") from None
         if not versions_there:
             raise InputError(f"scheduler: got {address}, which has no workers, want at least one")
         for worker, theirs in versions_there.items():
@@ -257,18 +257,18 @@ def connected(address: str) -> Iterator[Any]:
 
 
 def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float) -> FinishedShards:
-    """Run the shards on the cluster; yield each with its file. Raises InputError if the scheduler is lost."""
+    """Run the shards on the cluster; yield each shard with its file. Raises InputError if the scheduler is lost."""
     from distributed import wait
 
     waiting = iter(shards)
     submitted: dict[Any, Shard] = {}
-    started: dict[Shard, tuple[str, float]] = {}  # where and when a worker began it
+    started: dict[Shard, tuple[str, float]] = {}  # the worker that began a shard, and the time
     client.subscribe_topic(
         job.run, lambda event: started.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
     )
     try:
         while True:
-            room = 2 * max(1, sum(client.nthreads().values())) - len(submitted)  # one running and one waiting each
+            room = 2 * max(1, sum(client.nthreads().values())) - len(submitted)  # one running, one waiting for each
             for shard in itertools.islice(waiting, max(0, room)):
                 submitted[client.submit(_task, job, shard, key=f"{job.run}-{shard.file}")] = shard
             if not submitted:
@@ -284,9 +284,9 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
                     _restart_worker(client, future, started[shard][0])
                     yield shard, job.failed(shard, f"took longer than {time_limit:g} s, and was stopped")
     except (CancelledError, asyncio.CancelledError):
-        raise InputError(f"scheduler: got one that lost its tasks or was restarted, {RESUME}") from None
-    except OSError as error:  # dask's connection errors are OSErrors, too
-        raise InputError(f"scheduler: got no answer any more ({error}), {RESUME}") from None
+        raise InputError(f"scheduler: got a scheduler that lost its tasks or was restarted, {RESUME}") from None
+    except OSError as error:  # dask's connection errors are also OSErrors
+        raise InputError(f"scheduler: got no answer ({error}), {RESUME}") from None
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have ended
             client.unsubscribe_topic(job.run)
@@ -322,7 +322,7 @@ def _contents(job: Job, shard: Shard, future: Any) -> bytes:
 def _restart_worker(client: Any, future: Any, worker: str) -> None:
     """Restart a worker by its nanny: a thread that hangs cannot be stopped otherwise."""
     future.cancel()
-    with contextlib.suppress(Exception):  # it may have ended, or have no nanny
+    with contextlib.suppress(Exception):  # the worker may have ended, or have no nanny
         client.restart_workers([worker], timeout=30, raise_for_error=False)
 
 

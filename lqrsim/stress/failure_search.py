@@ -55,18 +55,19 @@ Report = Callable[[str], object]
 
 @dataclass(frozen=True)
 class ReliabilityProblem:
-    """A policy of a scenario under disturbances, and what counts as its failure. It is solved when first needed.
+    """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
 
     Attributes:
       scenario: as in `lqrsim solve`.
-      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default those of the scenario's demo.
+      sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
+        demo.
       strength: factor by which they are scaled.
       policy: as in `Campaign`.
       design_disturbances: the name of the set for which "track" or "offset_free" is designed; by default as in
         `Campaign`.
       failure: "collision": the robot collides, or its simulation diverges; "miss": it does not reach its goal.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the same for robots without a position, as a scaled error; by default the scenario's.
+      goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
       solution: a Solution, or the path of one, to run instead of solving the scenario, as in `run_campaign`.
 
     Raises:
@@ -103,7 +104,7 @@ class ReliabilityProblem:
     def score(self) -> TrialScore:
         """The score of trials as a function of their random numbers. Raises InputError if no such failure can occur."""
         scenario, plant = self.resolved, self.resolved.plant()
-        scenario.target_radius(self.goal_radius, self.goal_tolerance)  # before it is solved
+        scenario.target_radius(self.goal_radius, self.goal_tolerance)  # checked before the scenario is solved
         disturbances = self.disturbances
         if self.failure == "collision" and not len(plant.world):
             raise InputError(
@@ -119,7 +120,7 @@ class ReliabilityProblem:
             failure=FAILURES[self.failure],
         )
         if score.size == 0:
-            raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want one that draws numbers")
+            raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want a random disturbance")
         return score
 
     @cached_property
@@ -129,7 +130,7 @@ class ReliabilityProblem:
 
     @cached_property
     def given(self) -> Solution | None:
-        """The solution that was given instead of solving, or None. Raises InputError if it does not fit."""
+        """The solution that was given instead of solving, or None. Raises InputError if the solution does not fit."""
         return None if self.solution is None else solving.given(self.resolved, self.solution)
 
     @cached_property
@@ -165,14 +166,15 @@ class ReliabilityProblem:
           repetitions: number of independent estimates, from which the interval follows.
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level that the pilot run finds.
-          progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
+          progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
+            far as text.
 
         Returns:
           The probability with its interval, and the failures that were found.
 
         Raises:
-          InputError: an option is out of range, or as `score` does.
-          NoFailure: none was found.
+          InputError: an option is out of range, or for the reasons of `score`.
+          NoFailure: no failure was found.
           KeyboardInterrupt: Ctrl-C; its `found` is the RareFailures of the repetitions that are done, or None.
         """
         options: dict[str, Any] = {
@@ -199,7 +201,8 @@ class ReliabilityProblem:
           rounds: largest number of rounds.
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
-          progress: called with the number of finished rounds, that of all, and the distance so far as text.
+          progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
+            text.
 
         Returns:
           The failure, its distance, and the contribution of each disturbance.
@@ -216,7 +219,7 @@ class ReliabilityProblem:
         if score(np.zeros((1, score.size)))[0] > 0:
             raise InputError(
                 f"scenario: got {self.scenario}, where {self.policy} fails with all random numbers at zero, want a"
-                " policy that fails only with others"
+                " policy that succeeds when undisturbed"
             )
 
         def found(point: DesignPoint) -> SmallestFailure:
@@ -277,12 +280,12 @@ class RareFailures:
 
     @property
     def probability(self) -> Estimate:
-        """The probability of failure with its interval."""
+        """The probability of failure, with its interval."""
         return self.splitting.probability
 
     @property
     def stopped(self) -> str:
-        """How far it came if it was stopped, such as "after 3 of 10 repetitions"; else empty."""
+        """The progress if it was stopped, such as "after 3 of 10 repetitions"; else empty."""
         done, asked = len(self.splitting.repetitions), self.options["repetitions"]
         return f"after {done} of {asked} repetitions" if done < asked else ""
 
@@ -293,7 +296,7 @@ class RareFailures:
         return plain if np.isfinite(plain) else None
 
     def summary(self) -> str:
-        """Two lines: the probability with its interval, and the number of simulated trials; one more if stopped."""
+        """Two lines: the probability with its interval, and the number of simulated trials; a third if stopped."""
         one, plain = self.probability, self.plain_trials
         interval = f"{100 * one.confidence:g} % interval, {len(self.splitting.repetitions)} repetitions"
         needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
@@ -306,7 +309,7 @@ class RareFailures:
     __str__ = summary
 
     def typical(self, count: int = 8) -> Array:
-        """The random numbers of at most `count` failures, (k, d): the worst, then others in their own distribution.
+        """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others.
 
         Raises:
           InputError: `count` is not a positive whole number.
@@ -319,7 +322,7 @@ class RareFailures:
         return self.splitting.failures[[worst, *others[np.unique(chosen)[: len(others)]]]]
 
     def certificate(self) -> FailureCertificate:
-        """The probability with all that it takes to measure it again; `save` writes it, and `certify` checks it."""
+        """The probability with everything needed to measure it again; `save` writes it, and `certify` checks it."""
         problem, one = self.problem, self.probability
         asked = {name: getattr(problem, name) for name in _ASKED}
         return FailureCertificate(
@@ -354,7 +357,7 @@ _ASKED = (
 
 
 def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
-    """What the names of a problem stand for now: disturbances, model and policy."""
+    """The present meaning of the names in a problem: disturbances, model and policy."""
     score = problem.score
     law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
     described = tuple(one.describe(score.plant) for one in problem.disturbances)
@@ -363,14 +366,14 @@ def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Recheck:
-    """A certificate, measured again.
+    """The repeated measurement of a certificate.
 
     Attributes:
       certificate: the FailureCertificate.
-      measured: the RareFailures of the same seed.
-      differences: how the two differ, a line each; empty if nothing does.
-      changed: why the bits may differ, so that only the intervals were compared: another seed, or versions that have
-        changed since; else empty.
+      measured: the RareFailures with the same seed.
+      differences: a line for each difference of the two; empty if there is none.
+      changed: the reason why the bits may differ, so that only the intervals were compared: another seed, or changed
+        versions; else empty.
     """
 
     certificate: FailureCertificate
@@ -379,7 +382,7 @@ class Recheck:
     changed: str
 
     def summary(self) -> str:
-        """Lines that say what was measured again, and how it compares."""
+        """Lines that describe the repeated measurement and the comparison."""
         done, asked = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
         lines = [f"measured again: {done} of {asked} repetitions, {self.measured.splitting.simulations:,} trials"]
         if self.changed:
@@ -403,28 +406,28 @@ def certify(
     report: Report | None = None,
     progress: Progress | None = None,
 ) -> Recheck:
-    """Measure again what a certificate says, in whole or in part.
+    """Repeat the measurement of a certificate, in whole or in part.
 
     Args:
       certificate: from `RareFailures.certificate`, or `ls.load`.
-      repetitions: how many of its repetitions to run, at least 2; by default all.
-      seed: another seed, for fresh random numbers; by default that of the certificate.
+      repetitions: number of its repetitions to run, at least 2; by default all.
+      seed: another seed, for fresh random numbers; by default the seed of the certificate.
       scenario: reference to the scenario if it is your own function: files never choose code to run.
       report: as in `ReliabilityProblem.rare_failures`.
-      progress: likewise.
+      progress: as in `ReliabilityProblem.rare_failures`.
 
     Returns:
       A Recheck.
 
     Raises:
-      InputError: an option is out of range; or the scenario is someone's own, and none is given.
-      NoFailure: none was found.
+      InputError: an option is out of range; or the scenario is a user's function, and is not given.
+      NoFailure: no failure was found.
     """
     check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")
     every = len(certificate.repetitions)
     count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
     if scenario is None and ":" in certificate.scenario:
-        raise InputError(f"scenario: got none, want it for a certificate of {certificate.scenario}, which is code")
+        raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     asked: dict[str, Any] = {name: getattr(certificate, name) for name in _ASKED} | {"solution": certificate.solution}
     if scenario is not None:
         asked["scenario"] = scenario
@@ -459,9 +462,9 @@ class SmallestFailure:
 
     Attributes:
       problem: the ReliabilityProblem. options: `seed` and `rounds`.
-      point: its random numbers, their distance in standard deviations, and whether the search converged.
-      simulations: number of trials, those of the splitting before the search included.
-      disturbances: descriptions. shares: the share of each in the squared distance.
+      point: the random numbers of the failure, their distance in standard deviations, and whether the search converged.
+      simulations: number of trials, including the splitting before the search.
+      disturbances: descriptions. shares: the fraction of each in the squared distance.
       largest: the largest disturbances of the trial in physical units.
     """
 
@@ -475,12 +478,12 @@ class SmallestFailure:
 
     @property
     def stopped(self) -> str:
-        """How far it came if it was stopped, such as "after 3 of 40 rounds"; else empty."""
+        """The progress if it was stopped, such as "after 3 of 40 rounds"; else empty."""
         done, asked = len(self.point.history) - 1, self.options["rounds"]
         return f"after {done} of {asked} rounds" if done < asked and not self.point.converged else ""
 
     def summary(self) -> str:
-        """Lines with the distance, FORM's estimate, the share of each disturbance, and the largest disturbances."""
+        """Lines with the distance, FORM's estimate, the fraction of each disturbance, and the largest disturbances."""
         point = self.point
         lines = [
             f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"

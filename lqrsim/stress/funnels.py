@@ -1,4 +1,4 @@
-"""Funnels: the region around a plan from which a policy reaches the goal. `levels.py` says how a level is found."""
+"""Funnels: the region around a plan from which a policy reaches the goal. `levels.py` searches for a level."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,8 +41,8 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
 
-KNOTS = 5  # by default
-FAR = 2.0**20  # largest level, relative to the first one that is tried
+KNOTS = 5  # default number of knots
+FAR = 2.0**20  # largest level, relative to the first level that is tried
 DRAWN = 2**31  # number of the random stream for a trial's start; disturbances use the first streams
 FAILURES = 3
 
@@ -68,31 +68,32 @@ def funnel(
 ) -> Funnel:
     """Find the largest ellipsoids about a plan from which runs reach the goal with a given success rate.
 
-    The trials are simulated, so that limits, obstacles and everything else that ends a trial counts. The rate is over
+    The trials are simulated, so limits, obstacles and everything else that ends a trial are taken into account. The
+    rate is over
     states drawn uniformly in the ellipsoid, and over the disturbances; see `Funnel`. With the given confidence all
     levels are right at once: the error probability is divided among the knots. A level of 0, with its reason, means
     that no level was certified.
 
-    A run that begins at a later knot is taken to have followed the plan until then: see `simulate_from`.
+    A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`.
 
     Args:
       plant: as in `simulate`.
       solution: as in `simulate`.
       disturbances: as in `simulate`, without those that change the start of a run, such as `InitialStateError`.
       controller: as in `simulate`; by default the solution's policy.
-      rate: wanted success rate, above 0 and below 1.
-      confidence: that all levels are right, at least 0.5 and below 1.
+      rate: desired success rate, above 0 and below 1.
+      confidence: confidence that all levels are right, at least 0.5 and below 1.
       knots: numbers of the knots at which runs begin; by default 5, from the first on.
       states: names of the states that may be off the plan; by default all.
-      shape: family of the ellipsoids: by default that of the solution's cost-to-go; or a `Tube`, for its covariance; or
+      shape: family of the ellipsoids: by default from the solution's cost-to-go; or a `Tube`, for its covariance; or
         a covariance (n, n), or one per knot, (T+1, n, n). The certificate holds for any shape, but levels depend on it.
-      largest: largest level that is tried; by default that at which an angle is off by half a turn.
+      largest: largest level that is tried; by default the level at which an angle is off by half a turn.
       failures: number of trials of a test that may fail. With more, tests take more trials, and levels are larger.
       seed: seed of all random numbers.
       goal_radius: as in `simulate`.
       goal_tolerance: as in `simulate`.
       threads: as in `simulate`.
-      progress: called with the number of finished knots, that of all, and what is being tried as text.
+      progress: called with the number of finished knots, the number of all knots, and a text on the current trial.
 
     Raises:
       InputError: as `simulate`; a disturbance changes the start of a run; an option is out of range; there is no
@@ -129,7 +130,7 @@ class FunnelOptions(NamedTuple):
     Attributes:
       rate, confidence, failures, largest, seed: as in `funnel`.
       knots: in order. states: names.
-      test: what a level has to pass.
+      test: the test that a level has to pass.
     """
 
     rate: float
@@ -146,7 +147,7 @@ class FunnelOptions(NamedTuple):
         cls, space: Coordinates, steps: int, rate: float, confidence: float, knots: Sequence[int] | None,
         states: Sequence[str] | None, failures: int, largest: float | None, seed: int,
     ) -> "FunnelOptions":  # fmt: skip
-        """Raises InputError for what does not fit a plan of so many steps with these states."""
+        """Raises InputError for options that do not fit a plan with this number of steps and these states."""
         starts, names = _knots(knots, steps), _states(states, space)
         confidence = check_number("confidence", confidence, at_least=0.5, below=1.0)
         if largest is not None:
@@ -181,7 +182,7 @@ def _blank(trials: "_Trials", asked: FunnelOptions, shape: Tube | npt.ArrayLike 
 def _search(
     whole: Funnel, trials: "_Trials", asked: FunnelOptions, progress: Progress | None, found: list[FoundLevel]
 ) -> None:  # fmt: skip
-    """Find the level at each knot of a funnel that has none yet, and append it."""
+    """Find the level at each knot of a funnel without levels, and append it."""
     size, chosen, largest, run = len(whole.knots), whole.chosen, asked.largest, 0
     for done, knot in enumerate(whole.knots.tolist()):
         last = f", level {found[-1].level:.3g} at the one before" if found else ""
@@ -209,7 +210,7 @@ class FunnelCheck:
     """New trials at a knot of a funnel.
 
     Attributes:
-      knot: at which the trials began.
+      knot: the knot at which the trials began.
       level: level of the funnel at the knot.
       reached: the success rate with its exact interval.
       successes: whether each trial reached the goal, (K,).
@@ -252,7 +253,7 @@ def check_funnel(
       controller: as for `funnel`.
       trials: number of trials at each knot.
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
-      seed: seed of all random numbers; it must differ from the funnel's, or the trials would not be new.
+      seed: seed of all random numbers; it must differ from the funnel's, because the trials must be new.
       goal_radius: as for `funnel`.
       goal_tolerance: as for `funnel`.
       threads: as for `funnel`.
@@ -263,7 +264,7 @@ def check_funnel(
     check_kind("funnel", funnel, Funnel, "a Funnel, such as funnel(...) returns")
     runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
-        raise InputError("solution: got one with another plan than the funnel's, want the funnel's own solution")
+        raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
     check_count("trials", trials, at_most=MOST_TRIALS)
     shares = check_array("between", between, (2,))
     if not 0 <= shares[0] < shares[1]:
@@ -314,7 +315,7 @@ class _Trials:
 
     @property
     def described(self) -> tuple[str, ...]:
-        """The disturbances that act, in words. An error of the start is zero here: any other is refused."""
+        """The disturbances that act, in words. Errors of the start must be zero here; others are refused."""
         acting = (one for one in self.disturbances if not isinstance(one, InitialStateError))
         return tuple(one.describe(self.plant) for one in acting)
 
@@ -360,12 +361,12 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     knots, n = plan.states.shape
     if shape is None:
         if solution.cost_to_go is None:
-            raise InputError(f"shape: got none for a solution without a cost-to-go ({solution.status.name}), want one")
+            raise InputError(f"shape: got none and no cost-to-go ({solution.status.name}), want shape=")
         curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
         return np.array([_inverse(one) for one in curve])
     if isinstance(shape, Tube):
         if not np.array_equal(shape.plan.states, plan.states):
-            raise InputError("shape: got a tube of another plan, want that of the solution")
+            raise InputError("shape: got a tube of another plan, want a tube of the solution")
         given = shape.covariance
     else:
         given = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
@@ -377,7 +378,7 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
 
 
 def _inverse(curve: Array) -> Array:
-    """Inverse of a Hessian (d, d); zero if it is not that of an ellipsoid."""
+    """Inverse of a Hessian (d, d); zero if it does not describe an ellipsoid."""
     if flat(curve):
         return np.zeros_like(curve)
     inverse = inverse_of(curve)
@@ -385,14 +386,14 @@ def _inverse(curve: Array) -> Array:
 
 
 def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Array) -> float:
-    """The level at which the position is off by the robot's radius; 1 without a position or a radius."""
+    """The level at which the position deviates by the robot's radius; 1 without a position or a radius."""
     rows = [chosen.index(i) for i in position if i in chosen]
     widest = float(np.sqrt(max((shape[i, i] for i in rows), default=0.0)))
     return plant.robot.radius / widest if widest > 0 and plant.robot.radius > 0 else 1.0
 
 
 def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
-    """The level at which an angle is off by half a turn; a larger ellipsoid contains some states twice."""
+    """The level at which an angle deviates by half a turn; a larger ellipsoid contains some states twice."""
     space = solution.policy.state_coordinates
     groups = [[i] for i in space.angles] + [[i, i + 1, i + 2] for i in space.rotation_vectors]
     end = np.inf

@@ -1,9 +1,10 @@
 """The largest of nested levels at which trials succeed at a given rate, certified with a given confidence.
 
 A pilot search finds a candidate by steps and bisection, with the same random numbers at each level. Fresh trials then
-test fixed shares of that level, from the smallest up, each with the whole confidence, until one fails; the last level
-that passed is the result. The order is fixed before the fresh trials run, and a level is tested only if all smaller
-ones passed. So a result is wrong only if the first level with too low a rate passes its test, which is as improbable as
+test fixed fractions of that level, from the smallest up, each with the whole confidence, until a test fails; the last
+level that passed is the result. The order is fixed before the fresh trials run, and a level is tested only if all
+smaller levels passed. A result is therefore wrong only if the first level with too low a rate passes its test, which is
+as improbable as
 that test allows. The confidence need not be divided among the levels (the fixed-sequence procedure; Maurer, Hothorn &
 Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided bound of Clopper and
 Pearson is at least the rate.
@@ -18,9 +19,9 @@ import numpy.typing as npt
 from lqrsim.errors import InputError, check_count, check_number
 from lqrsim.stress.statistics import rate as rate_of
 
-SHARES = (0.7, 0.9, 1.0)  # of the pilot's level, in the order in which they are tested
+SHARES = (0.7, 0.9, 1.0)  # fractions of the pilot's level, in the order in which they are tested
 NEAR = 1.04  # the pilot's accuracy: ratio of a level with too many failures to its result
-HALVINGS = 40  # steps down after which the pilot gives up
+HALVINGS = 40  # number of steps down after which the pilot gives up
 FEW = 64  # trials of the pilot's coarse search
 BATCH = 512  # trials that are simulated together
 MOST_TRIALS = 1_000_000
@@ -33,8 +34,8 @@ class LevelTest:
     """The test that a level has to pass.
 
     Attributes:
-      trials: number of trials. failures: number of them that may fail. aim: number that may fail in the pilot; smaller,
-        because a level that just passes in the pilot would fail every second test.
+      trials: number of trials. failures: number of trials that may fail. aim: number that may fail in the pilot. It is
+        smaller, because a level that just passes in the pilot would fail every second test.
     """
 
     trials: int
@@ -61,7 +62,7 @@ def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
         if high > MOST_TRIALS:
             raise InputError(
                 f"rate: got {rate:g} with confidence {confidence:g} and failures {failures}, which needs more than"
-                f" {MOST_TRIALS:,} trials, want one of them smaller"
+                f" {MOST_TRIALS:,} trials, want a smaller one of the three"
             )
     low = failures  # trials that all fail
     while high - low > 1:
@@ -71,7 +72,7 @@ def smallest_test(rate: float, confidence: float, failures: int) -> LevelTest:
 
 
 def lowest_rate(successes: int, trials: int, confidence: float) -> float:
-    """The exact one-sided lower bound of a success rate: that of a two-sided interval with less confidence."""
+    """The exact one-sided lower bound of a success rate: the bound of a two-sided interval with less confidence."""
     if confidence < 0.5:  # there is no such two-sided interval
         raise InputError(f"confidence: got {confidence:g}, want a number >= 0.5")
     return rate_of(successes, trials, confidence=max(2 * confidence - 1, 1e-12)).low
@@ -82,8 +83,8 @@ class FoundLevel:
     """A certified level.
 
     Attributes:
-      level: 0 if none passed. trials, successes: of its test. reason: why the level is 0, or why no larger one was
-        tried; else empty. pilot: the pilot's level. simulated: number of all trials.
+      level: 0 if no level passed. trials, successes: the numbers in its test. reason: why the level is 0, or why no
+        larger level was tried; else empty. pilot: the pilot's level. simulated: number of all trials.
     """
 
     level: float
@@ -100,7 +101,8 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
     Args:
       runs: (level, numbers of the trials (K,)) -> whether each succeeds. Trials with different numbers are independent;
         a trial has the same random numbers at all levels.
-      guess: where the pilot begins. largest: level that is tried. rate: tested rate, for the text of the reason.
+      guess: level at which the pilot begins. largest: largest level that is tried. rate: tested rate, for the text of
+        the reason.
     """
     pilot = _Pilot(runs, test)
     aimed = pilot.level(min(guess, largest), largest)
@@ -127,7 +129,7 @@ def find_level(runs: Runs, test: LevelTest, *, guess: float, largest: float, rat
 
 
 def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
-    """Run the test's own trials, which the pilot has not used. Returns how many fail, and how many were run.
+    """Run the test's own trials, which the pilot has not used. Returns the number of failures and the number of trials.
 
     It stops as soon as too many trials have failed.
     """
@@ -140,9 +142,9 @@ def fresh(runs: Runs, level: float, test: LevelTest) -> tuple[int, int]:
 
 
 class _Pilot:
-    """Searches for a level. It assumes that a trial that succeeds also succeeds at all lower levels, and so runs less.
+    """The search for a level. It saves trials by assuming that a trial that succeeds also succeeds at all lower levels.
 
-    If that is wrong, the level is less accurate; the fresh trials do not rely on it.
+    If this is wrong, the level is less accurate. The fresh trials do not rely on the assumption.
     """
 
     def __init__(self, runs: Runs, test: LevelTest) -> None:
@@ -163,7 +165,8 @@ class _Pilot:
     def level(self, guess: float, largest: float) -> float:
         """The largest level that seems to pass; 0 if there is none.
 
-        A few trials find the rough level, then all trials run there. Further down only those that failed run again.
+        A few trials find the rough level, then all trials run there. At lower levels only the trials that failed run
+        again.
         """
         test = self.test
         few = min(FEW, test.trials)

@@ -1,18 +1,20 @@
 """The probability of a rare failure by multilevel splitting: the product of the probabilities of more frequent levels.
 
 A trial is a function of a vector z of standard normal numbers (trial_score.py), and fails if its score is positive. A
-pilot run finds levels of the score, each exceeded by about `keep` of the vectors above the level before, and a step
-size for each level. Each repetition uses these levels and step sizes: it begins with N vectors; those above the level
+pilot run finds levels of the score, each exceeded by a fraction of about `keep` of the vectors above the previous
+level, and a step size for each level. Each repetition uses these levels and step sizes: it begins with N vectors; those
+above the level
 replace the others; then all are moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi. A step is
 rejected if the score falls below the level, so that the steps preserve the distribution above the level. The estimate
-is the product of the shares above each level. With levels and step sizes fixed beforehand it is unbiased, for any
+is the product of the fractions above each level. With levels and step sizes fixed beforehand it is unbiased, for any
 number of particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2). Levels taken from the particles
 themselves, as in subset simulation, would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics
 and Computing 22, 2012).
 
 The interval uses the relative error. The standard deviation of a product grows with its mean, so repetitions that
 happen to be low also vary too little, and Student's interval about them misses the probability. The ratio of standard
-deviation and mean does not depend on the mean. So the interval holds each probability p from which the mean is at most
+deviation and mean does not depend on the mean. The interval therefore contains each probability p from which the mean
+is at most
 t standard errors away, with the standard error that belongs to p. It is not symmetric. If the repetitions vary so much
 that they give no upper bound, it ends at 1.
 """
@@ -28,13 +30,13 @@ from lqrsim.process import keeping
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 Score = Callable[[Array], Array]
-Progress = Callable[[int, int, str], object]  # how much is done, of how much, and the result so far
-MOST = 10_000  # repetitions, moves, levels and rounds
-ACCEPTANCE = 0.4  # share of accepted moves at which the pilot run aims
+Progress = Callable[[int, int, str], object]  # called with the amount done, the whole amount, and the result so far
+MOST = 10_000  # largest number of repetitions, moves, levels and rounds
+ACCEPTANCE = 0.4  # fraction of accepted moves at which the pilot run aims
 
 
 class NoFailure(InputError):
-    """No failure was found: failures are too rare, or there are none."""
+    """No failure was found: failures are too rare, or do not exist."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,12 @@ class SplittingResult:
     """An estimate of the probability of failure.
 
     Attributes:
-      probability: the mean of the repetitions, with its interval: see the top of this file. If there is only one level,
-        the repetitions are plain trials, and the interval is the exact one of Clopper and Pearson.
-      standard_error: standard error of that mean. repetitions: (R,), independent unbiased estimates.
+      probability: the mean of the repetitions, with its interval; see the top of this file. If there is only one level,
+        the repetitions are plain trials, and the interval is Clopper and Pearson's exact interval.
+      standard_error: standard error of the mean. repetitions: (R,), independent unbiased estimates.
       levels: levels of the score, the last one 0. step_sizes: b of the moves at each level but the last.
-      simulations: number of computed scores, those of the pilot run included.
-      failures: (k, d) vectors that fail, from all repetitions, in their own distribution. scores: (k,) of these.
+      simulations: number of computed scores, including the pilot run.
+      failures: (k, d) vectors that fail, from all repetitions, in their own distribution. scores: (k,) scores of these.
     """
 
     probability: Estimate
@@ -86,23 +88,24 @@ def failure_probability(
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
       particles: number of vectors N in each repetition.
-      keep: share of the vectors that exceeds the next level.
+      keep: fraction of the vectors that exceeds the next level.
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       seed: seed of all random numbers.
       most_levels: number of levels after which the pilot run gives up.
       level: called with each level that the pilot run finds.
-      progress: called with the number of finished repetitions, that of all, and the estimate so far as text.
+      progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so far
+        as text.
 
     Raises:
       InputError: an option is out of range, or a score is NaN.
-      NoFailure: none was found.
+      NoFailure: no failure was found.
       KeyboardInterrupt: Ctrl-C; its `found` is the result of the repetitions that are done, None if none has failed.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
     size = check_count("size", size)
     particles = check_count("particles", particles, at_least=10)
-    check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved ones, and copies of them
+    check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved vectors, and copies of both
     keep = check_number("keep", keep, at_least=2 / particles, at_most=0.5)
     moves = check_count("moves", moves, at_most=MOST)
     repetitions = check_count("repetitions", repetitions, at_least=2, at_most=MOST)
@@ -137,7 +140,7 @@ def failure_probability(
     if progress is not None:
         progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
     if found is None:
-        raise NoFailure(f"particles: got {particles}, of which none failed, want more")
+        raise NoFailure(f"particles: got {particles}, none of which failed, want more of them")
     return found
 
 
@@ -148,7 +151,7 @@ def _estimate(shares: Array, particles: int) -> Estimate:
         return rate(round(float(shares.sum()) * particles), count * particles)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
-    # Repetitions may agree by chance. Their spread is at least that of independent particles at each level.
+    # Repetitions may agree by chance. Their spread is at least the spread of independent particles at each level.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical) / particles)
@@ -159,8 +162,7 @@ def _estimate(shares: Array, particles: int) -> Estimate:
 
 
 class CountedScore:
-    """Counts the evaluations of a score and checks its results. Raises InputError unless it is one number for each
-    vector."""
+    """Counts the evaluations of a score and checks its results: InputError unless there is one for each vector."""
 
     def __init__(self, score: Score) -> None:
         self.score, self.evaluations = score, 0
@@ -184,7 +186,7 @@ def _pilot_run(
     rng: np.random.Generator,
     on_level: Callable[[float], object] | None,
 ) -> tuple[Array, Array]:
-    """Find the levels, of which the last is 0, and the step size at all levels but the last."""
+    """Find the levels, the last of which is 0, and the step size at all levels except the last."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     levels: list[float] = []
@@ -204,13 +206,15 @@ def _pilot_run(
             b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
         levels.append(level)
         step_sizes.append(b)
-    raise NoFailure(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
+    raise NoFailure(
+        f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none exist"
+    )
 
 
 def _repetition(
     score: Score, size: int, particles: int, moves: int, levels: Array, step_sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """One repetition: the share above each level, 0 once there is none; and the failures with their scores."""
+    """One repetition: the fraction above each level, 0 once no vector is left; and the failures with their scores."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     shares = np.zeros(len(levels))
@@ -227,7 +231,7 @@ def _repetition(
 
 
 def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Replace all vectors by copies of those above the level, equally often; a random choice takes up the remainder."""
+    """Replace all vectors by copies of those above the level, equally often, with a random choice for the remainder."""
     above = np.flatnonzero(scores > level)
     times, left = divmod(len(scores), len(above))
     chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
@@ -237,7 +241,7 @@ def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Genera
 def _crank_nicolson_step(
     score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
-    """Move each vector if it stays above the level. Returns vectors, scores and the share of accepted moves."""
+    """Move each vector if it stays above the level. Returns vectors, scores and the fraction of accepted moves."""
     proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
     proposed_scores = score(proposed)
     accepted = proposed_scores > level

@@ -20,15 +20,15 @@ class Outcomes:
     Attributes:
       trial: number of the trial.
       outcome: one of OUTCOMES.
-      obstacle: the obstacle it collided with; empty if none ended it.
+      obstacle: the obstacle that the trial collided with; empty if it ended otherwise.
       ended: time in seconds of its collision, divergence or error; the horizon without one.
       worst: largest tracking error, in `Rollout.tracking_unit`: metres for robots with a position.
       rms: root mean square of the tracking error, in the same unit.
       final: tracking error at the end of the plan; NaN if the trial ended before.
       goal: distance from the goal at the end, in `Target.unit`; NaN if the trial ended before.
-      clearance: the least, in metres; at most 0 after a collision.
+      clearance: the least clearance in metres; at most 0 after a collision.
       effort: integral of the squared applied controls over time, in their unit squared times s.
-      saturated: share of the control periods with a command at a limit.
+      saturated: fraction of the control periods with a command at a limit.
       cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before.
     """
 
@@ -82,9 +82,9 @@ def outcomes(
 
     Args:
       rollout: returned by `simulate`.
-      problem: for the cost; NaN without one.
-      goal_radius: in metres, replaces the rollout's; see `simulate`.
-      goal_tolerance: a scaled error, replaces the rollout's; see `simulate`.
+      problem: the problem that defines the cost; without it the cost is NaN.
+      goal_radius: radius in metres, in place of the rollout's; see `simulate`.
+      goal_tolerance: a scaled error, in place of the rollout's; see `simulate`.
 
     Raises:
       InputError: the problem does not fit the rollout, or a goal option is out of range or does not fit its goal.

@@ -1,4 +1,4 @@
-"""The policies that a stress test compares, by name: how each is solved for, and which controller runs it."""
+"""The policies that a stress test compares, by name, with the solver and the controller of each."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -25,11 +25,11 @@ _log = logging.getLogger("lqrsim")
 
 
 class PolicyKind(NamedTuple):
-    """How a policy is made.
+    """The way in which a policy is made.
 
     Attributes:
-      solver: computes its plan; a key of `scenarios.solutions.SOLVERS`.
-      controller: runs it; one of CONTROLLERS.
+      solver: the solver that computes its plan; a key of `scenarios.solutions.SOLVERS`.
+      controller: the controller that runs it; one of CONTROLLERS.
       designed: whether it is designed for disturbances that the user may choose.
     """
 
@@ -70,7 +70,7 @@ def design_disturbances(scenario: Scenario, design: Design = None) -> Sequence[D
 
 
 def design_uncertainty(scenario: Scenario, design: Design = None) -> Uncertainty:
-    """The same as an Uncertainty. Raises InputError if the scenario's robot cannot have one of them."""
+    """These disturbances as an Uncertainty. Raises InputError if the scenario's robot does not support one of them."""
     disturbances = design_disturbances(scenario, design)
     try:
         return uncertainty_of(scenario.plant(), disturbances)
@@ -83,13 +83,14 @@ def solve(
 ) -> dict[str, Solution]:
     """The solution that each policy runs, by the policy's name.
 
-    The policy of the solution for "track" is the tracking law. That for "offset_free" keeps the policy of "smooth".
+    In the solution for "track", the policy is the tracking law. The solution for "offset_free" keeps the policy of
+    "smooth".
 
     Args:
       policies: some of POLICIES.
       scenario: the scenario that is solved.
-      design: for "track" and "offset_free".
-      given: from `solutions.given`; replaces what its solver would compute.
+      design: the disturbances for which "track" and "offset_free" are designed.
+      given: a solution from `solutions.given`, in place of the result of its solver.
 
     Raises:
       InputError: a plan is not finite, or no policy uses the given solution.
@@ -104,7 +105,7 @@ def solve(
         solutions[policy] = plans[solver].open_loop() if policy == "open_loop" else plans[solver]
     for solver, plan in plans.items():
         if not np.isfinite(plan.trajectory.states).all():
-            raise InputError(f"policies: got those of {solver}, whose plan is not finite ({plan.status.name})")
+            raise InputError(f"policies: got a plan of {solver} that is {plan.status.name}, want a finite one")
         for remark in solving.remarks(scenario, plan):
             _log.warning("the solution of %s %s", solver, remark)
     if "track" in policies:
@@ -125,12 +126,12 @@ def check_used(given: Solution | None, policies: Sequence[str]) -> None:
     users = [policy for policy, kind in POLICY_KINDS.items() if kind.solver == solver_of(given)]
     if not {*users} & {*policies}:
         raise InputError(
-            f"solution: got one of {given.solver} with {', '.join(policies)}, want it with one of {', '.join(users)}"
+            f"solution: got a solution of {given.solver} with {', '.join(policies)}, want one of {', '.join(users)}"
         )
 
 
 def impossible_policies(scenario: Scenario, given: Solution | None = None) -> dict[str, str]:
-    """The policies that cannot run in the scenario, with the given solution if there is one, each with the reason."""
+    """The policies that cannot run in the scenario with the given solution, if any, each with the reason."""
     found: dict[str, str] = {}
     if scenario.problem.constraints:
         found["ilqr"] = "which cannot keep the scenario's constraints"
@@ -160,8 +161,8 @@ def make_controller(
       name: one of CONTROLLERS. "feedback" is the solution's policy; "track" and "offset_free" are `lqrsim.track` and
         `lqrsim.OffsetFree` for its plan; "replan" re-plans during the run.
       scenario: the scenario that was solved.
-      solution: with the plan.
-      design: for "track" and "offset_free".
+      solution: the solution with the plan.
+      design: the disturbances for which "track" and "offset_free" are designed.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
 
     Raises:

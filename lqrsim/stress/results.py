@@ -25,7 +25,7 @@ from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.trials import Trials
 
-MOST_REASONS = 5  # that a summary lists
+MOST_REASONS = 5  # largest number of reasons in a summary
 
 
 class Results:
@@ -33,7 +33,7 @@ class Results:
 
     Args:
       folder: written by `run_campaign`.
-      scenario: the campaign's reference, needed if it is a function of yours: files never choose code to run.
+      scenario: the campaign's reference, needed if the scenario is your own function: files never choose code to run.
 
     Attributes:
       manifest: the contents of manifest.json.
@@ -56,13 +56,13 @@ class Results:
 
     @cached_property
     def resolved(self) -> Scenario:
-        """The campaign's scenario. Raises InputError if it is a function of yours, and no scenario was given."""
+        """The campaign's scenario. Raises InputError if it is your own function, and no scenario was given."""
         return resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
 
     @cached_property
     def campaign(self) -> Campaign:
-        """The specification. Raises InputError if it has disturbances of yours, and no scenario was given."""
-        _ = self.resolved  # may define disturbances
+        """The specification. Raises InputError if it contains your own disturbances, and no scenario was given."""
+        _ = self.resolved  # resolving the scenario may define disturbances
         return Campaign.from_json(self.manifest["campaign"])
 
     @cached_property
@@ -95,7 +95,7 @@ class Results:
           partial: whether to accept a cell that is not finished.
 
         Raises:
-          InputError: a file is damaged, no trial has been run, or, without `partial`, one is missing.
+          InputError: a file is damaged, no trial has been run, or, without `partial`, a trial is missing.
         """
         tables = [table for _, table in self.tables(cell, partial=partial)]
         if not tables:
@@ -174,7 +174,7 @@ class Results:
         return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def hints(self) -> list[str]:
-        """A line for each preset under which no trial reached the goal: how to see which disturbance it is."""
+        """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance."""
         reached: dict[str, int] = {}
         for cell, ends, found in self.cell_successes():
             if found is not None and cell.strength > 0:
@@ -218,10 +218,10 @@ class Results:
         """The solution that a policy runs.
 
         Args:
-          policy: its name.
+          policy: name of the policy.
 
         Raises:
-          InputError: its file is damaged.
+          InputError: the policy's file is damaged.
         """
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
@@ -250,10 +250,10 @@ class Results:
         """The index of a cell among `cells`.
 
         Args:
-          cell: one of them.
+          cell: one of `cells`.
 
         Raises:
-          InputError: it is none of them.
+          InputError: it is not one of `cells`.
         """
         check_kind("cell", cell, Cell, "a Cell of the campaign")
         if cell not in self.cells:
@@ -272,7 +272,7 @@ class Results:
         return self.folder / "shards" / shard.file
 
     def read(self, shard: Shard) -> Table:
-        """The rows of a shard. Raises Damaged.
+        """The rows of a shard. Raises Damaged if its file is missing or damaged.
 
         Args:
           shard: one of `shards`.
@@ -359,8 +359,8 @@ def replay(
       contacts: whether obstacles stop the robot.
 
     Raises:
-      InputError: there is no such cell or trial, or the scenario is a function of yours, and `Results` was not given
-        it.
+      InputError: there is no such cell or trial, or the scenario is your own function, which was not given to
+        `Results`.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
@@ -379,7 +379,7 @@ def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:
 def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> list[str]:
     """A line for each value of a replayed trial that differs from its row in the table.
 
-    A row describes the time until the trial ended, so it does not matter whether obstacles stopped the robot then.
+    A row describes the time until the trial ended, so it does not matter whether obstacles then stopped the robot.
 
     Raises:
       InputError: the row's file is missing or damaged.

@@ -1,4 +1,4 @@
-"""The safest plan: among the candidates of a solve, the one whose runs reach the goal most often."""
+"""The safest plan: the candidate of a solve whose runs reach the goal most often."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from lqrsim.stress.levels import MOST_TRIALS
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.statistics import rate as rate_of
 
-SAME = 0.02  # of a state's range along the plan; plans that differ nowhere by more count as the same
+SAME = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,10 @@ class SafestPlan:
     """The plan with which most of the common trials reached the goal.
 
     Attributes:
-      solution: with that plan.
+      solution: the solution with that plan.
       compared: all plans that were compared, the best first.
-      reached: its success rate in fresh trials, with the exact interval. The trials that selected it would be biased.
+      reached: its success rate in fresh trials, with the exact interval. The trials by which it was selected would be
+        biased.
     """
 
     solution: Solution
@@ -86,7 +87,7 @@ def smooth_safest(
     """Choose among the candidates of `smooth` by success rate instead of cost.
 
     Each candidate is solved to convergence; duplicates are dropped. All plans run in the same trials. The result is the
-    plan with the most successes; the cheapest one if there are several.
+    plan with the most successes; the cheapest plan if there are several.
 
     Args:
       problem: as for `smooth`.
@@ -115,7 +116,7 @@ def smooth_safest(
     if not found and first.success:
         found.append(("the search's own", first))
     if not found:
-        raise InputError(f"problem: got one without any converged plan ({first.status.name}), want one that has some")
+        raise InputError(f"problem: got no converged plan ({first.status.name}), want a problem that can be solved")
 
     def reached(solution: Solution, begin: int) -> npt.NDArray[np.bool_]:
         run = simulate(

@@ -26,7 +26,7 @@ from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.policies import DEFAULT_POLICIES, POLICIES, check_designed
 
-_MOST_FILES = 1_000_000  # shards in a folder
+_MOST_FILES = 1_000_000  # largest number of shards in a folder
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Cell:
     """A combination of policy, disturbances and strength. All cells use the same random numbers.
 
     Attributes:
-      policy: its name; see `Campaign`.
+      policy: name of the policy; see `Campaign`.
       sweep: the name of the disturbances.
       strength: factor by which they are scaled, 0 or more.
 
@@ -106,13 +106,14 @@ class Campaign:
       policies: some of POLICIES. "smooth" and "ilqr" come from lqrsim.smooth and lqrsim.ilqr; "open_loop" is the plan
         of smooth without feedback; "replan" re-plans during the run; "track" and "offset_free" follow the plan of
         smooth, with lqrsim.track and lqrsim.OffsetFree. By default the first four.
-      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of those in a
-        trial. By default those of the preset "moderate": one policy serves all strengths, and it is in the middle.
+      design_disturbances: the disturbances for which "track" and "offset_free" are designed, independent of the
+        disturbances in a trial. By default the preset "moderate": one policy serves all strengths, and this preset is
+        in the middle.
       trials: number of trials of each cell.
       seed: seed of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
       goal_radius: distance in metres within which the goal counts as reached; by default the scenario's.
-      goal_tolerance: the same for robots without a position, as a scaled error; by default the scenario's.
+      goal_tolerance: the tolerance for robots without a position, as a scaled error; by default the scenario's.
       shard: trials per file.
       time_limit: seconds after which a shard counts as hung.
 
@@ -152,7 +153,7 @@ class Campaign:
         for field in ("strengths", "policies"):
             values = getattr(self, field)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
+                raise InputError(f"{field}: got {excerpt(values)}, want at least one entry, each at most once")
         if self.design_disturbances is not None:
             check_designed(self.policies)
             design = check_items("design_disturbances", self.design_disturbances, Disturbance, wanted)
@@ -185,7 +186,7 @@ class Campaign:
         """The disturbances of a cell's trials.
 
         Args:
-          cell: one of the campaign's.
+          cell: one of the campaign's cells.
 
         Raises:
           InputError: the cell belongs to another campaign.
@@ -206,7 +207,7 @@ class Campaign:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
-        """The campaign that `as_json` describes. Resolve its scenario first: that may define disturbances.
+        """The campaign that `as_json` describes. Resolve its scenario first, because this may define disturbances.
 
         Args:
           fields: the result of `as_json`.
@@ -231,7 +232,7 @@ class Campaign:
 
 
 def disturbances_as_json(disturbances: Iterable[Disturbance]) -> list[dict[str, Any]]:
-    """The kind and the settings of each. Raises InputError if a setting is not plain data."""
+    """The kind and the settings of each disturbance. Raises InputError if a setting is not plain data."""
     return [_disturbance_as_json(one) for one in disturbances]
 
 
@@ -272,7 +273,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:
-    """Every kind of disturbance that is defined, users' own included; the newer one if a file was loaded twice."""
+    """Every kind of disturbance that is defined, including users' own; the newer kind if a file was loaded twice."""
     for kind in base.__subclasses__():
         yield from _kinds(kind)
         defined = getattr(sys.modules.get(kind.__module__), kind.__qualname__, None) is kind

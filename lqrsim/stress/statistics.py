@@ -1,4 +1,4 @@
-"""Statistics of trials: exact intervals of rates, paired comparisons, bootstrap intervals. Most of it is SciPy's."""
+"""Statistics of trials: exact intervals of rates, paired comparisons, bootstrap intervals, mostly by SciPy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -96,8 +96,9 @@ def _flags(field: str, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
 def paired_difference(only_first: int, only_second: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
     """The difference of the success rates of two policies on the same trials, with Tango's score interval.
 
-    The interval holds each difference that the score test does not reject, with the shares that are most likely under
-    that difference (Tango, Statistics in Medicine 17, 1998). It has a width even if the policies agree in all trials.
+    The interval contains each difference that the score test does not reject, with the fractions that are most likely
+    under that difference (Tango, Statistics in Medicine 17, 1998). It has a width even if the policies agree in all
+    trials.
 
     Args:
       only_first, only_second: number of trials in which only this policy succeeded. trials: number of all trials.
@@ -113,7 +114,8 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
     surplus, z = only_first - only_second, float(stats.norm.ppf(0.5 + confidence / 2))
 
     def accepted(difference: float) -> bool:
-        # The likeliest share of trials in which only the second succeeds, given the difference, is a quadratic's root.
+        # The likeliest fraction of trials in which only the second succeeds, given the difference, is the root of a
+        # quadratic.
         linear = (2 * trials - surplus) * difference - apart
         constant = -only_second * difference * (1 - difference)
         share = (np.sqrt(max(linear**2 - 8 * trials * constant, 0.0)) - linear) / (4 * trials)

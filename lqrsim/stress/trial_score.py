@@ -32,16 +32,16 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 
 Size = int | Sequence[int] | None
-_LARGEST = np.nextafter(1.0, 0.0)  # of the numbers that NumPy's `random` draws from [0, 1)
+_LARGEST = np.nextafter(1.0, 0.0)  # the largest number that NumPy's `random` draws from [0, 1)
 
 
 class PrescribedDraws:
-    """The methods of NumPy's generators that disturbances use, with numbers made from given standard normal ones.
+    """The methods of NumPy's generators that disturbances use, with numbers made from given standard normal numbers.
 
-    Each number that is drawn uses the next of them. Uniform numbers are their normal distribution function.
+    Each draw uses the next given number. Uniform draws are its normal distribution function.
 
     Attributes:
-      used: how many numbers have been used.
+      used: number of given numbers that have been used.
     """
 
     def __init__(self, numbers: Array) -> None:
@@ -92,7 +92,7 @@ class PrescribedDraws:
 
     def __getattr__(self, name: str) -> Any:
         raise InputError(
-            f"disturbance: got one that draws with {name}, want standard_normal, normal, random, uniform, exponential,"
+            f"disturbance: got draws by {name}, want standard_normal, normal, random, uniform, exponential,"
             " integers or choice, which can be made from standard normal numbers"
         )
 
@@ -103,7 +103,7 @@ def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
 
 
 class _CountedDraws(PrescribedDraws):
-    """Counts the numbers that are drawn; each is zero."""
+    """Counts the numbers that are drawn; each number is zero."""
 
     def __init__(self) -> None:
         super().__init__(np.zeros(0))
@@ -117,10 +117,10 @@ LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 
 
 def collision_score(rollout: Rollout) -> Array:
-    """The depth in metres to which each trial gets into obstacles, (K,); minus the least clearance without a collision.
+    """The depth in metres to which each trial enters obstacles, (K,); minus the least clearance without a collision.
 
-    The score is positive exactly for trials that collide, diverge or whose controller fails; infinite for the latter
-    two. The depth needs a rollout without contacts, in which the robot moves on through the obstacles.
+    The score is positive exactly for trials that collide, diverge or have a failing controller; infinite for the latter
+    two. The depth needs a rollout without contacts, in which the robot moves through the obstacles.
 
     Args:
       rollout: K trials.
@@ -136,9 +136,9 @@ def collision_score(rollout: Rollout) -> Array:
 
 
 def miss_score(rollout: Rollout) -> Array:
-    """How far each trial ends outside its goal, or its `collision_score` if that is larger, (K,); positive if it fails.
+    """The distance by which each trial misses its goal, or a larger `collision_score`, (K,); positive if it fails.
 
-    In metres; for a goal without a position, the scaled error by which it is judged.
+    The unit is metres; for a goal without a position, it is the scaled error by which the trial is judged.
 
     Args:
       rollout: K trials.
@@ -152,7 +152,8 @@ def miss_score(rollout: Rollout) -> Array:
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 
-    A trial fails if its score is positive. Standard normal numbers give trials distributed as those of `simulate`.
+    A trial fails if its score is positive. Standard normal numbers give trials with the same distribution as in
+    `simulate`.
 
     Args:
       plant: the simulated robot.

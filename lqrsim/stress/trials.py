@@ -49,7 +49,7 @@ class Trials:
         """Compile everything, by running undisturbed trials."""
         options: dict[str, Any] = {"frames": False, "contacts": False, "threads": 1}
         self.outcomes(simulate(self.plant, next(iter(self.solutions.values())), **options))
-        if (solution := self.solutions.get("offset_free")) is not None:  # its filter is compiled, too
+        if (solution := self.solutions.get("offset_free")) is not None:  # its filter is also compiled
             simulate(self.plant, solution, controller=self._controller("offset_free"), **options)
 
     def outcomes(self, rollout: Rollout) -> Outcomes:
@@ -84,7 +84,7 @@ class Trials:
             return _failed_rows(trial, 1, format_error(error))
 
     def _controller(self, policy: str) -> Controller | AffinePolicy:
-        """The controller of a policy, made once: its gains take a while."""
+        """The controller of a policy, made once because its gains take time."""
         if policy not in self._controllers:
             self._controllers[policy] = make_controller(
                 POLICY_KINDS[policy].controller,
@@ -98,12 +98,12 @@ class Trials:
 
 @dataclass(frozen=True)
 class Job:
-    """All that a worker needs for a campaign.
+    """Everything that a worker needs for a campaign.
 
     Attributes:
-      campaign: as JSON. digest: of the campaign's manifest. solutions: by policy.
-      batch: how many trials to simulate together.
-      run: differs in every run, also of the same campaign.
+      campaign: the campaign as JSON. digest: digest in the campaign's manifest. solutions: solutions by policy.
+      batch: number of trials to simulate together.
+      run: an identifier that differs in every run, even of the same campaign.
     """
 
     campaign: Mapping[str, Any]
@@ -114,7 +114,7 @@ class Job:
 
     @classmethod
     def of(cls, trials: Trials, digest: str, batch: int) -> "Job":
-        """The job of running these trials elsewhere. Its solutions are without the log of how they were found."""
+        """The job of running these trials elsewhere. Its solutions lack the logs of their solves."""
         unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
         solutions = {policy: replace(solution, **unused) for policy, solution in trials.solutions.items()}
         return cls(trials.campaign.as_json(), digest, solutions, batch)
@@ -123,7 +123,7 @@ class Job:
         """The trials of this job, kept in this process until there is another job."""
         if self.run not in _prepared:
             _prepared.clear()
-            scenario = resolve(self.campaign["scenario"])  # first: it may define disturbances
+            scenario = resolve(self.campaign["scenario"])  # first, because it may define disturbances
             trials = Trials(Campaign.from_json(self.campaign), scenario, self.solutions)
             trials.warm_up()
             _prepared[self.run] = trials
@@ -138,7 +138,7 @@ class Job:
         return pack(_failed_rows(shard.first, shard.count, reason), shard, self.digest)
 
 
-_prepared: dict[str, Trials] = {}  # of the last job that this process worked for
+_prepared: dict[str, Trials] = {}  # trials of the last job that this process worked for
 
 
 def _failed_rows(first: int, count: int, reason: str) -> Table:

@@ -1,1 +1,1 @@
-"""The files that `lqrsim new` writes, for a robot named my_robot: programs that run as they are."""
+"""The files that `lqrsim new` writes, for a robot named my_robot: programs that run unchanged."""

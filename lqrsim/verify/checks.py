@@ -1,4 +1,4 @@
-"""Verification of runs: by drawing them, and from their videos; and whether the parts of a record fit together."""
+"""Verification of runs, by drawing them or from their videos, with checks that the parts of a record fit together."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ Progress = Callable[[int, int], object]
 
 
 def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
-    """Raises InputError unless these are a solution and a function, or None."""
+    """Raises InputError unless the arguments are a solution and a function, or None."""
     check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
 
@@ -128,7 +128,7 @@ def verify_run(
 
     Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
     plane, and from both if it moves in space. The pictures are segmentations that show only a part of the robot that
-    can collide, like X-rays, in which obstacles hide nothing. For a robot without a position, the place of its last
+    can collide, like X-rays, in which obstacles hide nothing. For a robot without a position, the position of its last
     ball is read.
 
     Args:
@@ -247,9 +247,10 @@ def _silhouettes(
             yield masks, data.geom_xpos[geom] - place_in(data, rollout, body)
 
 
-FEWEST_PIXELS = 20  # of the tracked object; the centre of fewer is too uncertain
-LEAST_SHARE = 0.5  # share of the mark that must be visible; the rest may be outside the picture
-# Green minus the larger of red and blue: a pixel below EMPTY does not count, one above FULL counts fully. Video blurs
+FEWEST_PIXELS = 20  # of the tracked object; with fewer, the centre is too uncertain
+LEAST_SHARE = 0.5  # fraction of the mark that must be visible; the rest may be outside the picture
+# Green minus the larger of red and blue: a pixel below EMPTY does not count, a pixel above FULL counts fully. Video
+# blurs
 # the edge of the mark, and mixes the colours of overlays into its surroundings.
 EMPTY, FULL = 0.2, 0.9
 
@@ -302,7 +303,7 @@ def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) ->
     """Positions (N, d) that best fit measurements (N, views, 2) of N frames, and the disagreement of the views, (N,).
 
     Args:
-      plane: the axes of the positions: "xyz", or the two of a planar robot.
+      plane: the axes of the positions: "xyz", or the two axes of a planar robot.
 
     Raises:
       InputError: the views do not measure all axes.
@@ -320,7 +321,7 @@ def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) ->
     return positions, np.sqrt(2) * np.linalg.norm(values - positions @ axes.T, axis=1)
 
 
-VIDEO_BOUND = 1 / 35  # largest error, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
+VIDEO_BOUND = 1 / 35  # largest error, in radii of the robot: 8.6 and 4.9 mm for the packaged robots
 RECORD_BOUND = 1 / 350  # largest distance between frames and states, in radii of the robot
 
 
@@ -328,7 +329,7 @@ def run_beside(path: str | os.PathLike[str]) -> Path:
     """The file, in the folder of a video, of the rollout that it shows. Raises InputError if there is none."""
     metadata, folder = video_metadata.read(path), Path(path).parent
     for found in sorted(folder.glob("*.npz")):
-        with contextlib.suppress(InputError):  # a solution, or what is damaged
+        with contextlib.suppress(InputError):  # the file is a solution, or damaged
             if video_metadata.digest(save_load.load(found, Rollout)) in metadata.runs:
                 return found
     raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
@@ -345,15 +346,15 @@ def verify_video(
     """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
 
     Args:
-      path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
-        move in space both, whatever else is in the picture.
+      path: a video by `lqrsim render`, whatever else it shows. It needs the camera `top`; for a robot in a vertical
+        plane the camera `side`; for a robot that moves in space both.
       rollout: the run that the video shows.
       trial: row of the rollout; by default the first that the video shows.
       solution: as for `verify_run`.
       progress: as for `verify_run`.
 
     Raises:
-      InputError: the file is not lqrsim's, or has not the panes that it takes.
+      InputError: the file was not written by lqrsim, or lacks the necessary panes.
     """
     check_arguments(solution, progress)
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
@@ -365,10 +366,10 @@ def verify_video(
     trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
     panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
     views = [pane.camera for pane in panes if pane.camera is not None]
-    triangulate(views, np.zeros((0, len(views), 2)), plane)  # names missing views before the slow part
+    triangulate(views, np.zeros((0, len(views), 2)), plane)  # reports missing views before the slow part
     model, radius = drawable_model(rollout, trial), metadata.markers[run]
     measured: list[list[Array]] = []
-    off = 0.0  # seconds between when a frame is shown and when it should be, at most
+    off = 0.0  # s, largest difference between the actual and the intended time of a frame
     for time, image in _decoded(path):
         off = max(off, abs(time - len(measured) / float(metadata.rate)))
         measured.append([_measure_marker(image, pane, view, radius) for pane, view in zip(panes, views, strict=True)])
@@ -407,7 +408,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
     Args:
       frames: number of frames that were decoded.
       off: largest error of the time of a frame, in seconds.
-      area: area of the smallest mark, in
+      area: area in pixels of the smallest mark, in
     """
     return (
         Criterion(

@@ -9,18 +9,18 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError
 from lqrsim.results.fields import LINE, Line, check_fields
 
-FEW_FRAMES = 4  # up to this number of wrong frames, each is named
+FEW_FRAMES = 4  # up to this number, each wrong frame is named
 
 
 def diagnose(
     numbers: npt.NDArray[np.intp], times: Array, seen: Array, actual: Array, bound: float, interval: float
 ) -> str:
-    """The explanation that leaves nearly all positions within twice the bound, as a line.
+    """A line with the explanation that leaves nearly all positions within twice the bound.
 
     Args:
-      numbers: (k,) of the frames in which the robot is seen.
-      times, seen, actual: of all frames.
-      bound: on the error, in metres.
+      numbers: (k,) numbers of the frames in which the robot is seen.
+      times, seen, actual: times and positions for all frames.
+      bound: bound on the error, in metres.
       interval: seconds between frames.
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
@@ -29,7 +29,7 @@ def diagnose(
     if 0 < len(wrong) <= FEW_FRAMES:
         return _single_frames(wrong, numbers, where, truth, 2 * bound)
     for axis, name in zip(range(truth.shape[1]), "xyz", strict=False):
-        # Mirrored in one of the two views that show it, a coordinate seems to stand still.
+        # If a coordinate is mirrored in one of the two views that show it, it seems to stand still.
         spread = truth[:, axis] - truth[:, axis].mean()
         slope = spread @ (where[:, axis] - where[:, axis].mean()) / max(spread @ spread, 1e-12)
         if slope < 0.25 and spread.std() > 5 * bound:
@@ -78,7 +78,7 @@ def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
     """The first frame whose error is velocity times a delay, and the delay; earlier frames have no errors."""
     products, squares = ((error * velocity).sum(axis=1), (velocity**2).sum(axis=1))
     tails = [np.cumsum(part[::-1])[::-1] for part in (products, squares)]
-    gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # the reduction of the squares by a break there
+    gained = tails[0] ** 2 / np.maximum(tails[1], 1e-12)  # reduction of the sum of squares by a break there
     split = int(gained.argmax())
     return split, float(tails[0][split] / max(tails[1][split], 1e-12))
 
@@ -101,7 +101,7 @@ def _quantile_95(vectors: Array) -> float:
     return float(np.quantile(_lengths(vectors), 0.95))
 
 
-HIDDEN = 0.05  # share of the frames in which the robot may be hidden
+HIDDEN = 0.05  # fraction of the frames in which the robot may be hidden
 SCALE = 0.002  # largest error of the scale
 VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
@@ -113,7 +113,7 @@ class Criterion:
     Attributes:
       name: name of the test.
       passed: None if it could not be checked.
-      detail: the measured value, and the wanted one.
+      detail: the measured value, and the required value.
     """
 
     __test__ = False  # pytest would collect it
@@ -141,7 +141,7 @@ class Verification:
       worst: largest distance between seen and actual, in metres.
       shift: shift of the pictures ahead of the run, in seconds.
       scale: scale of the seen motion relative to the actual one.
-      tests: each with a verdict.
+      tests: the tests, each with a verdict.
       likely: the likely cause if a test failed; otherwise empty.
     """
 
@@ -219,7 +219,7 @@ def compare(
     """Compare the positions from pixels with the actual ones.
 
     Args:
-      bound: on the distance between seen and actual, in metres, in any frame.
+      bound: bound on the distance between seen and actual positions in any frame, in metres.
       interval: seconds between two frames; the shift must be less than a quarter of it.
       others: tests that have been made already.
     """

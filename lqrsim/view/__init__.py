@@ -1,4 +1,4 @@
-"""Pictures of what was planned and what happened."""
+"""Pictures of plans and of runs."""
 
 import lazy_loader
 

@@ -1,10 +1,10 @@
 """MuJoCo's viewer in a browser, on loopback only.
 
 MuJoCo 4.0's server listens on all network interfaces, has no password, accepts uploads from anyone and requests from
-the pages of any site. It has no options for that. The functions that make its socket and its server are therefore
+the pages of any site. It has no options to change this. The functions that make its socket and its server are therefore
 replaced while it starts. It then answers only requests with its own host name and port, which rules out DNS rebinding,
-and only pages of its own origin. Before anything is shown the server is tested: if it answers elsewhere than on
-loopback, or lets in a foreign request, it is closed.
+and only pages of its own origin. Before anything is shown, the server is tested. If it answers anywhere but on
+loopback, or admits a foreign request, it is closed.
 """
 
 import contextlib
@@ -35,12 +35,12 @@ from lqrsim.view.viewer_base import PUSHES, Viewer
 
 TESTED_VERSION = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
-HOST_NAMES = LOOPBACK, "localhost"  # names by which requests may address it
+HOST_NAMES = LOOPBACK, "localhost"  # names by which requests may address the server
 # No other page may read, embed or frame its responses.
 PRIVATE_HEADERS = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
 SHARING_HEADER = "Access-Control-Allow-Origin"
 START_TIMEOUT = 10.0  # s, for the server to start
-# A message about a dragged goal has the first and not the second; one about an earlier state of the run has both.
+# A message about a dragged goal contains the first but not the second; a message about an earlier state contains both.
 MOCAP, TIME = mujoco.mjtState.mjSTATE_MOCAP_POS.value, mujoco.mjtState.mjSTATE_TIME.value
 RELEASE_AFTER = 0.5  # s without a message, after which a drag counts as released
 
@@ -148,14 +148,14 @@ class _SimulationSide(plugin.SimPlugin):
 class Browser(Viewer):
     """A viewer in a browser, to be used with `with`: its server runs as long as the block.
 
-    There can be one in a process: MuJoCo's user interface is global, and a second one may crash.
+    There can be only one in a process: MuJoCo's user interface is global, and a second viewer may crash.
 
     Args:
-      port: 0 takes the first free port from 8080 on.
-      title: title of the page. The other arguments are those of a Viewer.
+      port: port of the server; 0 takes the first free port from 8080 on.
+      title: title of the page. The other arguments are the arguments of a Viewer.
 
     Attributes:
-      port: on which the server listens.
+      port: port on which the server listens.
 
     Raises:
       InputError: the port is taken, MuJoCo's version is not a tested one, or other machines can reach the server.
@@ -174,7 +174,7 @@ class Browser(Viewer):
             self._handle = launch_web.launch(config, plugins=[app.App(layout), viewer_side, _SimulationSide(self)])
             try:
                 while not viewer_side.started.wait(0.02):
-                    self._handle.is_running()  # raises the exception of the viewer's thread
+                    self._handle.is_running()  # re-raises an exception of the viewer's thread
                 self.port = sockets[0].getsockname()[1] if sockets else port
                 _check_private(self.port)
             except RuntimeError as error:
@@ -192,7 +192,7 @@ class Browser(Viewer):
 
     @property
     def instructions(self) -> str:
-        """How to open the page."""
+        """Instructions for opening the page."""
         tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
         return (
             f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
@@ -290,7 +290,7 @@ def _with_private_headers(response: Any) -> Any:
 def _check_private(port: int) -> None:
     """Raises InputError unless the server answers on loopback only, and refuses foreign requests."""
     until = time.monotonic() + START_TIMEOUT
-    while not _listens(LOOPBACK, port):  # it starts on another thread
+    while not _listens(LOOPBACK, port):  # the server starts on another thread
         if time.monotonic() > until:
             raise InputError(f"browser: the server does not answer at {LOOPBACK}:{port} after {START_TIMEOUT:g} s")
         time.sleep(0.02)
@@ -315,7 +315,7 @@ def _check_private(port: int) -> None:
 
 def _other_addresses() -> list[str]:
     """Addresses of this machine at which a server on all interfaces answers, and ours must not."""
-    found = {"127.0.0.2", "::1"}  # a server on all interfaces answers there, one on 127.0.0.1 does not
+    found = {"127.0.0.2", "::1"}  # a server on all interfaces answers there; a server on 127.0.0.1 does not
     with contextlib.suppress(OSError):
         found |= {str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None)}
     for family, elsewhere in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
@@ -326,7 +326,7 @@ def _other_addresses() -> list[str]:
 
 
 def _request(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:
-    """Status of the answer, and whether other pages may read it; with an origin, a WebSocket is opened."""
+    """Status of the answer, and whether other pages may read it. With an origin, a WebSocket is opened."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=START_TIMEOUT)
     with contextlib.closing(connection):
         headers = {"Host": host}

@@ -1,8 +1,8 @@
 """Cameras of panes: calibrated ones, an overview, a chase view, and the model's own.
 
-Calibrated cameras are fixed, so that pixels measure positions. They are orthographic, as an engineering drawing is: a
-metre has the same number of pixels everywhere. The centre of a ball's pixels is therefore exactly its own centre, at
-any distance and anywhere in the picture, and the place of a camera along its line of sight does not matter.
+Calibrated cameras are fixed, so that pixels measure positions. They are orthographic, like an engineering drawing: a
+metre has the same number of pixels everywhere. The centre of a ball's pixels is therefore exactly the centre of the
+ball, at any distance and anywhere in the picture. The position of a camera along its line of sight does not matter.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from lqrsim.view.recorded_trial import RecordedTrial
 _Number = Annotated[float, Bounds()]
 Vector = tuple[_Number, _Number, _Number]
 
-NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so that a wide range is no loss
+NEAR, FAR = 0.01, 1000.0  # m; the depth buffer is linear in an orthographic view, so a wide range loses no precision
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Camera:
 
     @property
     def axes(self) -> Array:
-        """(2, 3), unit vectors to the right and up in the picture: the directions that it measures."""
+        """Unit vectors (2, 3) to the right and up in the picture: the directions that it measures."""
         return np.array([np.cross(self.forward, self.up), self.up])
 
     def place(self, scene: mujoco.MjvScene, aspect: float) -> None:
@@ -83,7 +83,7 @@ def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 
 
 def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
-    """A level camera at the side that shows the same, the longer horizontal side across."""
+    """A level camera at the side that shows the same, with the longer horizontal side across the picture."""
     low, high = _bounds(rollout)
     plane = rollout.plane
     level = plane.replace("z", "")
@@ -93,7 +93,7 @@ def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 
 
 def measuring(plane: str) -> tuple[str, ...]:
-    """The cameras, of `top` and `side`, that together measure positions along these axes of the world."""
+    """Those of the cameras `top` and `side` that together measure positions along these axes of the world."""
     return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
 
 
@@ -127,10 +127,10 @@ def _right(span: Array, aspect: float) -> Array:
 # The overview cameras of models are made for 16:9; in a narrower picture they would cut off both sides.
 OVERVIEW_ASPECT = 1.7
 OBLIQUE = np.array([0.30, 0.75, -0.60])  # direction of an overview in a scene without an overview camera
-POSES = 9  # of an arm, that an overview contains
-FIELD_OF_VIEW = 40.0  # degrees, of cameras that are not the model's
-DISTANCE, HEIGHT = 11.0, 4.5  # of the chase camera, in radii of the robot
-TURN_SECONDS = 0.8  # s, over which the chase camera averages its direction
+POSES = 9  # number of poses of an arm that an overview contains
+FIELD_OF_VIEW = 40.0  # degrees, field of view of cameras that are not the model's
+DISTANCE, HEIGHT = 11.0, 4.5  # distance and height of the chase camera, in radii of the robot
+TURN_SECONDS = 0.8  # s, time over which the chase camera averages its direction
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class CameraView:
     """A view of one trial.
 
     Attributes:
-      place: sets the cameras of a scene, after its update, for a time.
+      place: function that sets the cameras of a scene, after its update, for a given time.
       camera: the calibrated camera, if the view has one.
     """
 
@@ -194,7 +194,7 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
     rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
     back = 0.0
-    for _ in range(20):  # each centres the view of the one before
+    for _ in range(20):  # each iteration centres the previous view
         local = points - middle
         x, y, z = local @ right, local @ up, local @ forward
         back = float(np.max(np.maximum(np.abs(x) / (rise * aspect), np.abs(y) / rise) - z))
@@ -206,10 +206,10 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
 
 
 def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
-    """Points (k, 3) of the run, and corners of fixed geoms as far as they are near it."""
+    """Points (k, 3) of the run, and corners of fixed geoms that are near it."""
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    if recorded.rollout.balls is not None:  # of an arm the links reach farther than what the run follows
+    if recorded.rollout.balls is not None:  # the links of an arm reach farther than the tracked point
         run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3), *_outer_points(recorded, data, signs)])
     low, high = run.min(axis=0), run.max(axis=0)
     margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
@@ -236,11 +236,11 @@ def _outer_points(recorded: RecordedTrial, data: mujoco.MjData, signs: Array) ->
 
 
 def _chase(recorded: RecordedTrial) -> CameraView:
-    """From behind and above; it turns smoothly with the direction of the plan."""
+    """A view from behind and above that turns smoothly with the direction of the plan."""
     times = np.linspace(0, recorded.end, max(int(20 * recorded.end), 2))
     planned, driven = recorded.planned(times), recorded.driven(times)
     motion = np.gradient(planned, times, axis=0)[:, :2]
-    # At rest, or straight up, the direction is that from the start of the plan to its end.
+    # At rest, or straight up, the direction is from the start of the plan to its end.
     motion += 1e-3 * (planned[-1] - planned[0])[:2] + [1e-9, 0.0]
     direction = _smooth(motion, times, TURN_SECONDS)
     azimuth = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))

@@ -1,4 +1,4 @@
-"""Text on pictures: a caption of each run, with title, disturbances and readings, and the legend of all.
+"""Text on pictures: a caption of each run, with title, disturbances and readings, and one legend for all runs.
 
 Tiles of text are drawn with Pillow and blended into images (height, width, 3).
 """
@@ -21,8 +21,8 @@ from lqrsim.view.recorded_trial import RecordedTrial
 Pixels = npt.NDArray[np.uint8]
 
 INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
-HEADER_SHARES = 0.4, 0.75  # of the height of a picture, for the header: above the picture, and over it
-LETTER_HEIGHTS = 44, 54  # lines of text in the height of a picture, and in the width of a narrow one
+HEADER_SHARES = 0.4, 0.75  # largest fraction of a picture's height for the header: above the picture, and over it
+LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, and in the width of a narrow one
 
 
 class Caption:
@@ -40,11 +40,11 @@ class Caption:
         self.recorded, self.overlays, self.speed, self.over = recorded, overlays, speed, over
         self.letter_height = _letter_height(box.width, box.height)
         which = f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else ""
-        where = "" if run.scene == run.robot else f" in {run.scene}"  # an MJCF with a robot is both
+        where = "" if run.scene == run.robot else f" in {run.scene}"  # an MJCF with a robot is both robot and scene
         title = title or f"{run.robot}{where}{which}".replace("_", " ")
         self.width = box.width // 4 if over else box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
-        # Readings keep their place: beside the title in a strip that is wide enough, otherwise in lines of their own.
+        # Readings keep their place: next to the title in a strip that is wide enough, otherwise in separate lines.
         longest = self._readings_width(1)
         bare_title = text_tile((title,), self.letter_height, width=0)
         beside = not over and bare_title.shape[1] + longest < self.width
@@ -54,7 +54,7 @@ class Caption:
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
     def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
-        """The title, as many disturbances as leave most of the picture free, and the number of the others."""
+        """The title, as many disturbances as leave most of the picture free, and the number of the remaining ones."""
         tile = np.empty((0, 0, 4), dtype=np.uint8)
         for count in range(len(what), -1, -1):
             left = len(what) - count

@@ -1,4 +1,4 @@
-"""Ellipsoids along a plan: of a predicted tube, or of a total cost near its minimum."""
+"""Ellipsoids along a plan, from a predicted tube, or from a total cost near its minimum."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ COST_ABOVE_LEAST = SIGMAS**2 / 2  # total cost above its minimum, on an ellipsoi
 PREDICTED = f"predicted: {SIGMAS:g} sigma, 95 % in each direction"
 OF_COST = f"{SIGMAS:g} sigma of the cost: total ≤ least + {COST_ABOVE_LEAST:g}"
 
-WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the plan: a larger one hides the picture
+WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the plan; larger ones hide the picture
 APART = 0.8  # distance between neighbours, in half axes
 
 
@@ -24,8 +24,8 @@ class Ellipsoids:
     Attributes:
       centres: (k, d).
       covariances: (k, d, d).
-      end: largest half axis in metres that is drawn; ellipsoids from the first larger one on are left out. None if all
-        are there.
+      end: largest half axis in metres that is drawn; from the first larger ellipsoid on, they are left out. None if all
+        are kept.
     """
 
     centres: Array

@@ -1,4 +1,4 @@
-"""What figures have in common: obstacles, a plan, predicted tubes, and chances of collision."""
+"""Common parts of figures: obstacles, a plan, predicted tubes, and chances of collision."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.style import MARGIN, PLAN, SOLID
 
 EDGE = "#5b6470"
-OUTLINES = 24  # ellipses whose outlines are drawn
+OUTLINES = 24  # number of ellipses whose outlines are drawn
 BEADS = 0.2  # mean half axis, relative to the distance between neighbours, below which outlines look like beads
 LEAST = 1e-6  # smallest chance that is drawn
 
@@ -57,7 +57,7 @@ def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Arr
 
 
 def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: float, *, plane: str = "xy") -> None:
-    """Draw obstacles between two corners (2,), and paler the places closer to them than the robot's radius.
+    """Draw obstacles between two corners (2,), and in a paler colour the places closer to them than the robot's radius.
 
     Args:
       flat: the world in the plane of the robot.
@@ -87,7 +87,7 @@ def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
             axes.plot_surface(x, y, z, color=SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.zaxis.set_rotate_label(False)  # it would be upside down
+    axes.zaxis.set_rotate_label(False)  # otherwise it would be upside down
     axes.set_zlabel("z (m)", rotation=90)
     axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
     axes.view_init(elev=27, azim=-110)
@@ -106,13 +106,13 @@ def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: in
 
 
 def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
-    """Points (3, i, j) on an obstacle's surface; an infinite one ends at the box from `low` to `high`."""
+    """Points (3, i, j) on an obstacle's surface; an infinite obstacle ends at the box from `low` to `high`."""
     around, (radius, half, _) = np.linspace(0, 2 * np.pi, 25)[:, None], obstacle.size
     if obstacle.kind == "sphere":
         up = np.linspace(0, np.pi, 13)
         local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
         local = radius * np.stack(local)
-    elif obstacle.kind not in ("capsule", "cylinder"):  # a box, or the one that it is in
+    elif obstacle.kind not in ("capsule", "cylinder"):  # a box, or the bounding box
         ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
         ends = obstacle.size[2] * np.array([-1, 1])
         local = np.stack(np.broadcast_arrays(ring[0][:, None], ring[1][:, None], ends))
@@ -147,11 +147,11 @@ def draw_tube_in_space(axes: Axes3D, ellipsoids: Ellipsoids, label: str, *, face
     around_centres = flat.outlines()[chosen] - flat.centres[chosen, None, :]
     discs = ellipsoids.centres[chosen, None, :] + around_centres @ onto
     axes.add_collection3d(Poly3DCollection(list(discs), facecolors=to_rgba(edge, 0.15), edgecolors="none"))
-    axes.plot([], [], [], color=face, linewidth=7, label=label)  # for the legend
+    axes.plot([], [], [], color=face, linewidth=7, label=label)  # only for the legend
 
 
 def draw_chances(axes: Axes, curves: Sequence[tuple[Array, Array, str]]) -> None:
-    """Draw chances of being in collision at each knot: times (T+1,), chances (T+1,) and colour of each curve."""
+    """Draw chances of being in collision at each knot: curves with times (T+1,), chances (T+1,) and a colour."""
     most = LEAST
     for times, chances, colour in curves:
         axes.plot(times, np.where(chances > 0, chances, np.nan), color=colour)

@@ -1,8 +1,8 @@
 """An OpenGL context that needs no display, bound when the first picture is drawn.
 
-On Linux MuJoCo chooses its OpenGL on import: the one that needs a display, unless MUJOCO_GL names another. With
-MUJOCO_GL=egl and no EGL library even the import fails. Therefore nothing is chosen in advance: EGL, or otherwise
-OSMesa, is put in place after the import, if its library is found. macOS and Windows have their own OpenGL.
+On Linux MuJoCo chooses its OpenGL on import: a version that needs a display, unless MUJOCO_GL names another. With
+MUJOCO_GL=egl and no EGL library even the import fails. Therefore nothing is chosen in advance. After the import, EGL,
+or otherwise OSMesa, is put in place if its library is found. macOS and Windows have their own OpenGL.
 """
 
 import functools

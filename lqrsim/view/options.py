@@ -1,6 +1,6 @@
-"""What a picture shows, and where: overlays, qualities and views by name; parts of runs, and panes in a part.
+"""The contents and layout of a picture: overlays, qualities and views by name; parts of runs, and panes in a part.
 
-Light, for the command line.
+This module imports nothing heavy, so that the command line starts fast.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)
 
 
-INSETS_SHARE = 0.4  # of a run's part, for its insets
+INSETS_SHARE = 0.4  # fraction of a run's part for its insets
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def side_by_side(count: int, size: tuple[int, int]) -> list[Box]:
 
 
 def split_into_panes(box: Box, insets: int) -> list[Box]:
-    """The first pane and the insets: in a column on its right, or in a row below it if the box is higher than wide."""
+    """The first pane and the insets, in a column on its right, or in a row below it if the box is higher than wide."""
     wide = box.width >= box.height
     length, across = (box.width, box.height) if wide else (box.height, box.width)
     edge = 2 * round(length * (1 - INSETS_SHARE) / 2) if insets else length

@@ -1,4 +1,4 @@
-"""Overlays of pictures, drawn as geoms of MuJoCo beside those of the model: lines, forces, tubes, funnels, the mark."""
+"""Overlays of pictures, drawn as MuJoCo geoms in addition to the model's: lines, forces, tubes, funnels, the mark."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from lqrsim.view.recorded_trial import RecordedTrial
 Colour = tuple[float, float, float]
 
 # The mark by which a robot's position is read from a video: a green ball at the origin of its body, in front of a black
-# one. Nothing else is pure green. All of its light is its own, so that it looks the same in the sun and in the shade.
+# ball. Nothing else is pure green. The mark emits all of its light, so it looks the same in the sun and in the shade.
 MARK_RGB = (0.0, 1.0, 0.0)
 RIM = (
     # Radius of the black ball, in radii of the green one: a video then blurs the same colour into the mark all around.
     1.8
 )
-PLAN_RGB = (0.78, 0.08, 0.42)  # of the plan; neither the error map nor a robot has it
+PLAN_RGB = (0.78, 0.08, 0.42)  # colour of the plan; neither the error map nor a robot has it
 
-# Opacity, for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a certified
-# ellipsoid.
+# Opacities for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a
+# certified ellipsoid.
 OPACITY = {True: 0.43, False: 0.2}
 BETWEEN_OPACITY = {True: 0.4, False: 0.18}
 CERTIFIED_OPACITY = {True: 0.4, False: 0.16}
-MOST_ELLIPSOIDS = 80  # more take too long to draw
-LIFT = 0.006  # metres between the floor and the lines on it
+MOST_ELLIPSOIDS = 80  # largest number of ellipsoids; more take too long to draw
+LIFT = 0.006  # m, height of lines above the floor
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class DrawnTube:
     """Ellipsoids in the world.
 
     Attributes:
-      knots: (k,) of the plan.
+      knots: (k,), knots of the plan.
       in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
-      label: in the legend.
+      label: label in the legend.
       opacity: opacity of each ellipsoid.
     """
 
@@ -59,8 +59,8 @@ class DrawnFunnel:
     """A funnel in the world.
 
     Attributes:
-      certified: its ellipsoids at knots that have a level, if there are any.
-      between: some ellipsoids of interpolated levels, if there are any.
+      certified: its ellipsoids at knots with a level, or None.
+      between: some ellipsoids of interpolated levels, or None.
       said: (T+1) whether the run was in the funnel at each step, as text.
     """
 
@@ -86,13 +86,13 @@ def of_cost(recorded: RecordedTrial, solution: Solution | None) -> DrawnTube:
     if not run.state_coordinates.position:
         raise InputError("overlays: got cost_tube for a robot without a position, want other overlays")
     if not np.array_equal(solution.trajectory.states, run.plan.states):
-        raise InputError("solution: got one with another plan than the run's, want the Solution that was run")
+        raise InputError("solution: got a plan other than the run's, want the Solution that was run")
     ellipsoids = Ellipsoids.of_cost(solution, run.state_coordinates.position)
     return _tube(recorded, ellipsoids, np.arange(len(ellipsoids.centres)), OF_COST)
 
 
 def of_funnel(recorded: RecordedTrial, funnel: Funnel | None) -> DrawnFunnel:
-    """The projection of a funnel onto the position, from its first knot to its last, where it has a level.
+    """The projection of a funnel onto the position, from its first knot to its last, wherever it has a level.
 
     Raises:
       InputError: there is no funnel, it has another plan, or the position is not among its states.
@@ -101,8 +101,8 @@ def of_funnel(recorded: RecordedTrial, funnel: Funnel | None) -> DrawnFunnel:
     if funnel is None:
         raise InputError("funnel: got None with the overlay funnel, want the Funnel about the plan of the run")
     if not np.array_equal(funnel.plan.states, run.plan.states):
-        raise InputError("funnel: got one with another plan, want a funnel about the plan of the run")
-    covariances = funnel.position_covariance / SIGMAS**2  # so that half axes are those of the level
+        raise InputError("funnel: got a funnel about another plan, want a funnel about the plan of the run")
+    covariances = funnel.position_covariance / SIGMAS**2  # gives the half axes at the level
     every = Ellipsoids(run.plan.states[:, list(run.state_coordinates.position)], covariances)
     levels, knots = np.array([funnel.level(t) for t in run.times]), np.arange(len(run.times))
     drawn = (levels > 0) & (knots >= funnel.knots[0]) & (knots <= funnel.knots[-1])
@@ -128,7 +128,7 @@ def _tube(
     label: str,
     opaque: Mapping[bool, float] = OPACITY,
 ) -> DrawnTube:
-    """Some of the ellipsoids at these knots; where they overlap, the opacity is about the given one."""
+    """Some of the ellipsoids at these knots. If they overlap, their joint opacity is about the given one."""
     one = Ellipsoids(every.centres[among], every.covariances[among])
     chosen = one.spread(MOST_ELLIPSOIDS)
     apart = np.linalg.norm(np.diff(one.centres[chosen], axis=0), axis=1).sum() / max(len(chosen) - 1, 1)
@@ -153,7 +153,7 @@ def _in_world(recorded: RecordedTrial, every: Ellipsoids, knots: npt.NDArray[np.
 
 
 def _some_of(knots: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """At most as many knots as can be drawn, evenly spread."""
+    """Evenly spread knots, at most as many as can be drawn."""
     return knots[np.linspace(0, len(knots) - 1, min(MOST_ELLIPSOIDS, len(knots))).astype(np.int64)]
 
 
@@ -163,10 +163,10 @@ MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
 FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; not green, as the mark is
-SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than they are
-SEGMENTS = 120  # of a line, at most
-DOTS = 30  # latest measured states that are drawn
-END_ON = 0.9  # cosine of the angle to the line of sight; an arrow above it is not drawn
+SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than the lines
+SEGMENTS = 120  # largest number of segments of a line
+DOTS = 30  # number of latest measured states that are drawn
+END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Scale:
     """The meaning of colours and lengths, the same for all runs in a picture.
 
     Attributes:
-      error: at the end of the trace's colours, in metres.
+      error: error at the end of the trace's colours, in metres.
       force: force of the longest arrow, in N.
     """
 
@@ -194,8 +194,8 @@ class Overlays:
 
     Args:
       solution: the solution that was run, for the tube of its cost.
-      show: names of overlays; those with nothing to show are left out, as a tube that was not predicted.
-      funnel: about the plan of the run.
+      show: names of overlays; overlays without content, such as a tube that was not predicted, are left out.
+      funnel: a funnel about the plan of the run.
 
     Raises:
       InputError: the solution or the funnel is missing or does not belong to the run; the solution has no total cost,
@@ -299,7 +299,7 @@ class Overlays:
 
 
 class _Pen:
-    """Appends geoms to a scene; with `flat` lines lie on a floor in the light, otherwise they hang in space."""
+    """Appends geoms to a scene. With `flat`, lines are lit and lie on a floor; otherwise they hang in space."""
 
     def __init__(self, scene: mujoco.MjvScene, *, flat: bool) -> None:
         self.scene, self.flat = scene, flat
@@ -347,7 +347,7 @@ def decorate(
     rgba: npt.ArrayLike,
     rotation: Array | None = None,
 ) -> mujoco.MjvGeom:
-    """Give a geom this kind, size (3,), place (3,) and colour (4,), without a shadow; returns the geom."""
+    """Give a geom this kind, size (3,), position (3,) and colour (4,), without a shadow; returns the geom."""
     mujoco.mjv_initGeom(
         geom,
         kind,
@@ -368,7 +368,8 @@ def mark_radius(rollout: Rollout) -> float:
 def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:
     """Add the mark of a robot whose body is at `centre` (3,) to a scene that is seen through the camera.
 
-    It is drawn close to the camera, where nothing hides it. In an orthographic picture its place is the same.
+    It is drawn close to the camera, where nothing hides it. In an orthographic picture this does not change its
+    position.
     """
     forward = np.array(camera.forward)
     centre = centre - (forward @ (centre - camera.position)) * forward

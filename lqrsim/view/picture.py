@@ -22,8 +22,8 @@ from lqrsim.view.overlays import Overlays, common_scale, draw_mark, mark_radius
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.video_metadata import Pane
 
-FADED_OPACITY = 0.10  # of a geom that hides the robot
-MOST_ROBOTS = 50  # in one picture; more cannot be told apart
+FADED_OPACITY = 0.10  # opacity of a geom that hides the robot
+MOST_ROBOTS = 50  # largest number of robots in a picture; more cannot be told apart
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
 
 
@@ -50,7 +50,7 @@ def open_renderer(
 
 
 class SceneRenderer:
-    """Draws a trial into an OpenGL context of its own; made by `open_renderer`.
+    """Draws a trial into its own OpenGL context; made by `open_renderer`.
 
     MuJoCo's `Renderer` does the same for one view, with one more copy of the picture.
     """
@@ -79,7 +79,7 @@ class SceneRenderer:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times; the next call overwrites it.
 
         Args:
-          fade: largest change of an opacity since the picture before.
+          fade: largest change of an opacity since the previous picture.
         """
         model, data, scene = self.model, self.data, self.scene
         self.recorded.pose(data, time)
@@ -116,7 +116,7 @@ class SceneRenderer:
                 light.pos, light.dir = self.scene.camera[0].pos, self.scene.camera[0].forward
 
     def _occluders(self) -> npt.NDArray[np.bool_]:
-        """Which geoms (ngeom,) are between the camera and the robot's centre or outline."""
+        """Flags (ngeom,) of the geoms between the camera and the robot's centre or outline."""
         view = self.scene.camera[0]
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
@@ -127,7 +127,7 @@ class SceneRenderer:
             target = centre + radius * offset
             # The rays of an orthographic camera are parallel.
             start = target + forward * (forward @ (eye - target)) if view.orthographic else eye
-            for _ in range(100):  # surfaces behind each other, at most
+            for _ in range(100):  # largest number of surfaces behind each other
                 ray = target - start
                 hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN_GROUPS, True, -1, geom)
                 if not 0 <= hit < 1:
@@ -138,7 +138,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _fade(self, faded: Array, own: int) -> Iterator[None]:
-        """A block in which geoms of the scene are faded by these shares (ngeom,)."""
+        """A block in which geoms of the scene are faded by these fractions (ngeom,)."""
         before: list[tuple[int, float, int]] = []
         for number in range(own if faded.any() else 0):
             geom = self.scene.geoms[number]
@@ -152,17 +152,17 @@ class SceneRenderer:
             geom.rgba[3], geom.transparent = alpha, transparent
 
 
-LARGEST = 8192  # pixels of a side, which every OpenGL can draw
-MOST_RUNS = 6  # side by side; more are too small
+LARGEST = 8192  # pixels, a side length that every OpenGL can draw
+MOST_RUNS = 6  # largest number of runs side by side; more are too small
 MOST_INSETS = 3
 READABLE = 300  # pixels; captions may cover a part of a picture that is at least this high
-LEAST_HEIGHT = 16  # pixels that a caption must leave
-LINE, BLANK = (120, 128, 140), (255, 255, 255)  # between panes, and behind captions
+LEAST_HEIGHT = 16  # pixels of height that a caption must leave
+LINE, BLANK = (120, 128, 140), (255, 255, 255)  # colours between panes, and behind captions
 
 
 @dataclass(frozen=True)
 class QualitySettings:
-    """Settings of a quality: size, samples for smooth edges, resolution of shadows (0: none), and those of x264."""
+    """Settings of a quality: size, samples for smooth edges, resolution of shadows (0: none), and settings of x264."""
 
     size: tuple[int, int]
     samples: int
@@ -180,10 +180,10 @@ QUALITIES: dict[Quality, QualitySettings] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions:
-    """The arguments of `render` and `render_still` of these names, which explain them.
+    """The arguments of these names of `render` and `render_still`, which explain them.
 
     Raises:
-      InputError: a text, a name or a size is wrong. `open_picture` checks what depends on the runs.
+      InputError: a text, a name or a size is wrong. `open_picture` checks everything that depends on the runs.
     """
 
     trial: int | Sequence[int] = 0
@@ -220,7 +220,7 @@ class PictureOptions:
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """Width and height of the picture: `size`, or that of the quality."""
+        """Width and height of the picture: `size`, or the size of the quality."""
         return self.settings.size if self.size is None else self.size
 
 
@@ -237,7 +237,7 @@ class RunPart:
 
 @contextlib.contextmanager
 def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> Iterator["Picture"]:
-    """Open a picture of runs, to be used with `with`, for it holds OpenGL contexts.
+    """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts.
 
     Raises:
       InputError: an option does not fit the runs, captions fill the picture, or there is no OpenGL.
@@ -318,7 +318,7 @@ class Picture:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times.
 
         Args:
-          fade: largest change of an opacity since the picture before.
+          fade: largest change of an opacity since the previous picture.
         """
         earlier = list(earlier)
         image = np.empty((self.size[1], self.size[0], 3), dtype=np.uint8)
@@ -416,12 +416,12 @@ def _one_each(field: str, values: Any, of: Sequence[object]) -> list[Any]:
 def _set_quality(recorded: RecordedTrial, settings: QualitySettings) -> None:
     quality = recorded.model.vis.quality
     quality.shadowsize, quality.offsamples = settings.shadows, settings.samples
-    # Lines are boxes under a distant sun, for which one quadrilateral a side suffices; MuJoCo's default is 16.
+    # Lines are boxes under a distant sun, for which one quadrilateral per side suffices; MuJoCo's default is 16.
     quality.numquads = 1
 
 
 def _draw_edge(image: Pixels, box: Box) -> None:
-    """Draw the left and the upper edge of a box, unless they are the picture's."""
+    """Draw the left and the upper edge of a box, except edges of the picture."""
     if box.left:
         image[box.top : box.top + box.height, box.left] = LINE
     if box.top:

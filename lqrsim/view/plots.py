@@ -27,8 +27,8 @@ from lqrsim.view import figure_parts, style
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
-MOMENTS = 7  # times at which the balls of a robot are drawn
-AREA = "area: "  # begins the label of a tube
+MOMENTS = 7  # number of times at which the balls of a robot are drawn
+AREA = "area: "  # prefix of the label of a tube
 
 
 def plot_run(
@@ -38,11 +38,11 @@ def plot_run(
 
     For a robot without a position it shows the balls at several times.
 
-    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown; below
-    is the chance of collision at each step.
+    A predicted tube is drawn about the plan, 2 standard deviations wide, up to where it is too wide to be shown. The
+    chance of collision at each step is drawn below.
 
     Args:
-      solution: its plan is the one that the rollouts follow.
+      solution: the solution with the plan that the rollouts follow.
       rollouts: by their labels, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
@@ -175,7 +175,7 @@ def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Roll
 def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> None:
     errors = {name: run.tracking_error[trial] for name, run in rollouts.items()}
     worst = np.array([np.nanmax(error) for error in errors.values()])
-    # Runs that differ by decades need a logarithmic axis, where the zero at the start is left out.
+    # Runs that differ by decades need a logarithmic axis, from which the zero at the start is left out.
     decades = bool(worst.max() > 30 * worst.min())
     of = next(iter(rollouts.values())).tracking_unit
     factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
@@ -224,7 +224,7 @@ def _convergence(axes: Axes, solution: Solution) -> None:
         other.spines["right"].set_visible(True)
 
 
-# Face and edge, as in videos.
+# Colours of faces and edges, as in videos.
 TUBE = {"face": "#8ad7d5", "edge": "#008f91"}
 COST_TUBE = {"face": "#d5c8ec", "edge": "#7a4dc7"}
 LINES = ("-", "--", "-.", ":")
@@ -238,10 +238,11 @@ def plot_policy(
     With a tube it shows the predicted region of 2 standard deviations about the plan, up to where it is too wide to be
     shown, and the chance of collision at each step. Without a tube it shows the positions whose total cost is near its
     least, which does not depend on disturbances; solutions of `ilqr` have no total cost, and show the plan alone. A
-    robot in space is seen from above and from the side. A robot without a position has the plan's states instead.
+    robot in space is seen from above and from the side. For a robot without a position, the plan's states are shown
+    instead.
 
     Args:
-      solution: with a policy.
+      solution: a solution with a policy.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
@@ -255,14 +256,12 @@ def plot_policy(
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
-        raise InputError(
-            f"solution: got one without a cost-to-go ({solution.status.name}), want one of a completed solve"
-        )
+        raise InputError(f"solution: got no cost-to-go ({solution.status.name}), want a solution of a completed solve")
     check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
-        raise InputError("tube: got one of another plan, want one of the solution's plan")
+        raise InputError("tube: got a tube of another plan, want one of the solution's plan")
     if tube is not None and not solution.policy.state_coordinates.position:
-        raise InputError("tube: got one of a robot without a position, want None")
+        raise InputError("tube: got a tube of a robot without a position, want None")
     with style.figure(path, size=(11, 7.5)) as figure:
         draw_policy(figure, solution, world, radius, tube)
     return Path(path)
@@ -399,7 +398,7 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
     in space is seen from above and from the side.
 
     Args:
-      funnel: with the position among its states.
+      funnel: a funnel with the position among its states.
       path: FILE.png, .pdf or .svg.
       world: the obstacles, such as `scene.world`.
       radius: radius of the robot, in metres.
@@ -431,7 +430,7 @@ def _shadow(
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
     onto = _begin_projection(axes, space, world, plan, radius, plane, "funnel", "pale grey: within a radius")
-    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # so that outlines are those of the level
+    every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
     last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)

@@ -11,22 +11,22 @@ FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period wou
 
 
 class RecordedTrial:
-    """A trial; one that diverged stands still from its last finite state on.
+    """A trial. A diverged trial stands still from its last finite state on.
 
     Attributes:
-      model: to draw.
+      model: the model to draw.
       robot: number of the robot's body in the model.
       planar: whether the robot is seen from above, with its overlays on the floor.
       floor: height of the ground below the robot in the first frame, in metres.
       end: end of the plan, in seconds.
-      times: (k,) of the finite states.
+      times: (k,) times of the finite states.
       states, measured: (k, n).
       error, clearance: (k,) in metres.
       force: (T, 3) in N, averaged over FORCE_WINDOW.
     """
 
     def __init__(self, rollout: Rollout, trial: int) -> None:
-        """Raises InputError if there is no such trial, or nothing of it can be drawn."""
+        """Raises InputError if there is no such trial, or it cannot be drawn."""
         self.rollout, self.trial = rollout, trial
         self.model = model_of(rollout, trial)
         whole = np.isfinite(rollout.frames[trial]).all(axis=1)
@@ -102,11 +102,11 @@ class RecordedTrial:
         return min(int(time / self.rollout.plan.dt + 1e-9), self.rollout.plan.steps)
 
     def interpolate(self, values: Array, time: float) -> float:
-        """`error` or `clearance` at a time."""
+        """The value of `error` or `clearance` at a time."""
         return float(np.interp(time, self.times, values))
 
     def ending(self, time: float) -> str:
-        """What ended the trial before this time, as text; empty if nothing did."""
+        """The event that ended the trial before this time, as text; empty if there was none."""
         run, k = self.rollout, self.trial
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
             return ""
@@ -129,7 +129,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         wanted = "the 2 or 3 states that are the position, or a run of a robot with balls that has frames"
         raise InputError(f"state_coordinates.position: got none, want {wanted}")
     if rollout.balls is not None and not rollout.state_coordinates.position:
-        _ = rollout.balls.tracked  # which raises if no site is named
+        _ = rollout.balls.tracked  # raises an exception if no site is named
     model = model_from_xml(with_sky(rollout.model), "rollout.model")
     hide_hulls(model)
     robot_body(model, rollout.body)
@@ -145,7 +145,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
 
 
 def with_sky(xml: str) -> str:
-    """The MJCF with a light sky where it has none, in place of a black one."""
+    """The MJCF, with a light sky if it has none: MuJoCo would draw a black one."""
     if "skybox" in xml or "</mujoco>" not in xml:
         return xml
     sky = (
@@ -156,7 +156,7 @@ def with_sky(xml: str) -> str:
 
 
 def hide_hulls(model: mujoco.MjModel) -> None:
-    """Do not draw colliding meshes of bodies that have others, for drawing alone: they are at the same place."""
+    """Do not draw colliding meshes of bodies that have other meshes, only for drawing, in the same place."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     drawn = set(model.geom_bodyid[is_mesh & ~collides & (model.geom_group < 3)].tolist())
@@ -179,7 +179,7 @@ def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
 
 
 def place_of(data: mujoco.MjData, robot: int, balls: BallRecord | None) -> Array:
-    """The origin (3,) of a body, or the place of the last ball, by its site."""
+    """The origin (3,) of a body, or the position of the last ball, by its site."""
     if balls is None:
         return data.xpos[robot]
     body, place = balls.tracked
@@ -187,7 +187,7 @@ def place_of(data: mujoco.MjData, robot: int, balls: BallRecord | None) -> Array
 
 
 def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float:
-    """The height of the ground below a body, in metres; the body's own height if there is none."""
+    """The height of the ground below a body, in metres; the body's own height without ground."""
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))

@@ -29,8 +29,8 @@ from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import MOST_ROBOTS, QUALITIES, Picture, PictureOptions, open_picture
 from lqrsim.view.video_metadata import VideoMetadata
 
-QUEUE_LENGTH = 3  # frames that wait to be encoded, at most
-COLOURS = 192  # of a GIF
+QUEUE_LENGTH = 3  # largest number of frames that wait to be encoded
+COLOURS = 192  # number of colours of a GIF
 
 
 @contextlib.contextmanager
@@ -41,16 +41,16 @@ def encoder(
 
     Args:
       size: width and height.
-      rate: frames a second.
+      rate: frames per second.
       crf, preset: x264's settings of quality and compression.
-      metadata: embedded in the file.
+      metadata: text that is embedded in the file.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         if metadata is not None:
             metadata.embed(container)
         stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        # Without a stated colour matrix players guess differently.
+        # If the file states no colour matrix, players guess one, and not all guess the same.
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = 1
 
         def encode(pixels: Pixels) -> None:
@@ -64,8 +64,8 @@ def encoder(
 
 @contextlib.contextmanager
 def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Callable[[Pixels], None]]:
-    """As `encoder`, for a GIF, with one palette from the samples, so that colours do not flicker."""
-    # Maximum coverage keeps rare colours, such as those of lines.
+    """Like `encoder`, for a GIF, with one palette from the samples, so that colours do not flicker."""
+    # Maximum coverage keeps rare colours, such as the colours of lines.
     palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
     frames: list[Image.Image] = []
 
@@ -87,7 +87,7 @@ def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pix
 
     def put(pixels: Pixels) -> None:
         if len(waiting) == QUEUE_LENGTH:
-            waiting.popleft().result()  # raises what `work` did
+            waiting.popleft().result()  # raises the exception of `work`, if any
         waiting.append(executor.submit(work, pixels))
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="encoder") as executor:
@@ -97,10 +97,10 @@ def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pix
 
 
 FADE_SECONDS = 0.25
-MOST_FRAMES = 1_000_000  # frames of a video
-SMALLEST_GIF = 480, 270  # pixels, by default, so that captions can be read
-PALETTE_SAMPLES = 12  # frames from which the palette of a GIF is made
-LARGEST_SHOWN = 30_000_000  # bytes of a file that is embedded in a notebook; a larger one makes it slow
+MOST_FRAMES = 1_000_000  # largest number of frames of a video
+SMALLEST_GIF = 480, 270  # pixels, smallest default size, so that captions can be read
+PALETTE_SAMPLES = 12  # number of frames from which the palette of a GIF is made
+LARGEST_SHOWN = 30_000_000  # bytes of a file that is embedded in a notebook; larger files make it slow
 MEDIA_TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".png": "image/png"}
 
 
@@ -136,32 +136,33 @@ def render(
     speed: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> PictureFile:
-    """Write a video of a run, or of several side by side: mp4 (h264) or GIF, by the suffix.
+    """Write a video of a run, or of several runs side by side: mp4 (h264) or GIF, by the suffix.
 
     Obstacles between a camera and the robot fade. A trial that diverged stands still from then on. The file is complete
-    or absent, also after an error or Ctrl-C, and the same runs give the same frames, bit for bit. The metadata of an
+    or absent, even after an error or Ctrl-C. The same runs give bit-identical frames. The metadata of an
     mp4 describes its content, so that `lqrsim verify` can measure it.
 
     Args:
-      runs: one rollout, or several to be shown side by side.
+      runs: one rollout, or several rollouts to be shown side by side.
       path: FILE.mp4 or FILE.gif.
-      trial: row of the rollout; several are shown side by side. With several rollouts, one for all or one for each.
-      camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another of the model's.
-      insets: more cameras, in panes beside the first. In panes of `top` and `side` robots have a green mark.
+      trial: row of the rollout; several rows are shown side by side. With several rollouts, one row for all or one for
+        each.
+      camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another camera of the model.
+      insets: more cameras, in panes next to the first. In panes of `top` and `side` robots have a green mark.
       titles: titles of the runs, in the place of robot and scene.
-      overlays: what is drawn over the scene. plan. ghost: the planned path, and a disc or ball where it should be
-        now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
-        fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
-        predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
-        too wide. cost_tube: ellipsoids of low total cost. funnel: its shadow on the position, pale between
+      overlays: drawings over the scene. plan: the planned path. ghost: a disc or ball at the robot's planned position.
+        trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, averaged over the last
+        fifth of a second. measured: the last measured states, if they differ from the true states. tube: the states
+        predicted under the disturbances, within 2 standard deviations, if there is a `rollout.tube` and as far as it is
+        not too wide. cost_tube: ellipsoids of low total cost. funnel: its projection onto the position, pale between
         its knots. caption: time, tracking error, clearance, disturbances, whether the run is in the funnel.
-      solution: the solution that was run, for `cost_tube`; one for all runs, or one each.
-      funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one each.
-      quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
+      solution: the solution that was run, for `cost_tube`; one for all runs, or one for each.
+      funnel: a funnel about the plan of the run, for the overlay `funnel`; one for all runs, or one for each.
+      quality: `draft`, `standard` or `publication`: size, edges, shadows, and compression of the video.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
-      fps: frames a second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
-      speed: seconds of the run in a second of the video.
-      progress: called after each frame with the number of frames done and of all frames.
+      fps: frames per second, independent of the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
+      speed: seconds of the run per second of the video.
+      progress: called after each frame with the number of finished frames and the number of all frames.
 
     Returns:
       The path. A notebook shows the video if the call is a cell's last expression.
@@ -218,11 +219,11 @@ def render_still(
 ) -> PictureFile:
     """Write a picture (png) of one moment.
 
-    With `every`, the robot is drawn also where it was at each multiple of that many seconds, as in the paper's figures.
-    The rest, and what is raised, is as in `render`.
+    With `every`, the robot is also drawn at each multiple of that many seconds, as in the paper's figures. Everything
+    else, including exceptions, is as in `render`.
 
     Args:
-      runs: one rollout, or several to be shown side by side.
+      runs: one rollout, or several rollouts to be shown side by side.
       path: FILE.png.
       time: seconds after the start; by default the end.
       every: seconds; the robot is also drawn at each multiple of it.

@@ -25,7 +25,7 @@ TIMELINE = "time"
 DRIVEN = (0.0, 0.45, 0.7)
 SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FLAT = 1e-4  # m, half thickness of flat shapes
-ARROW = 0.2  # length of the longest force, relative to the extent of the scene
+ARROW = 0.2  # length of the largest force's arrow, relative to the extent of the scene
 
 
 def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> list[str]:
@@ -35,7 +35,7 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
       rollout: the result of `simulate`, with frames.
       path: path of the file.
       trial: row of the rollout.
-      funnel: about the plan of the run.
+      funnel: a funnel about the plan of the run.
 
     Returns:
       The names of the geoms that are left out, because Rerun has no shape for them.
@@ -100,7 +100,7 @@ def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> list[str]:
 
 
 def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
-    """Rerun's shape of a geom, in the geom's own axes; None if it has none."""
+    """Rerun's shape for a geom, in the geom's own axes; None if Rerun has no such shape."""
     size, kind, colours = model.geom_size[geom], Geom(int(model.geom_type[geom])), [_bytes(colour)]
     solid = {"colors": colours, "fill_mode": "solid"}
     if kind == Geom.mjGEOM_PLANE:
@@ -124,7 +124,7 @@ def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
 
 
 def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
-    """Draw plan and path as lines; and over time the planned place, the tube and the force."""
+    """Draw plan and path as lines; and over time the planned position, the tube and the force."""
     run = recorded.rollout
     plan, driven = recorded.planned(run.times), recorded.driven(recorded.times)
     thin = 0.002 * recorded.model.stat.extent

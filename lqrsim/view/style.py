@@ -1,4 +1,4 @@
-"""The style of figures, and how they are written: the same data gives the same bytes."""
+"""The style and the writing of figures: the same data gives the same bytes."""
 
 import contextlib
 import os
@@ -57,7 +57,7 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
         yield drawn
         for axes in drawn.axes:
             for axis in (axes.xaxis, axes.yaxis):
-                if isinstance(axis.get_major_formatter(), LogFormatter):  # it writes powers as mathematics
+                if isinstance(axis.get_major_formatter(), LogFormatter):  # this formatter writes powers as mathematics
                     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
                     axis.set_minor_formatter(NullFormatter())
         for suffix, file in unfinished:

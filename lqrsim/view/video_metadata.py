@@ -29,9 +29,9 @@ class Pane:
     """A part of the picture that shows one trial, in pixels from the upper left corner.
 
     Attributes:
-      run: number of the rollout among those of the metadata.
+      run: number of the rollout among the rollouts of the metadata.
       trial: row of the rollout.
-      camera: the calibrated camera; None for any other.
+      camera: the calibrated camera; None for other cameras.
     """
 
     left: int
@@ -53,8 +53,8 @@ class VideoMetadata:
     Attributes:
       runs: digests of the rollouts.
       markers: radius in metres of each robot's mark in panes with a camera; see `overlays.py`.
-      rate: frames a second.
-      speed: seconds of the run in a second of the video.
+      rate: frames per second.
+      speed: seconds of the run per second of the video.
       frames: number of frames.
 
     Raises:
@@ -103,14 +103,14 @@ class VideoMetadata:
         return np.arange(self.frames) * (self.speed / float(self.rate))
 
     def embed(self, container: "OutputContainer") -> None:
-        """Write it into a video, before its first frame."""
+        """Write the metadata into a video, before its first frame."""
         container.metadata["comment"] = self.as_json()
 
 
 def read(path: str | os.PathLike[str]) -> VideoMetadata:
     """The metadata of a video. Raises InputError if lqrsim did not write it."""
     path = check_path("video", path)
-    if not os.path.isfile(path):  # not the method, which raises where a folder cannot be read
+    if not os.path.isfile(path):  # not the method of Path, which raises if a folder cannot be read
         raise InputError(f"video: got {path}, want a file that exists")
     try:
         with av.open(str(path)) as container:
@@ -121,7 +121,7 @@ def read(path: str | os.PathLike[str]) -> VideoMetadata:
 
 
 def digest(rollout: Rollout) -> str:
-    """Hash of a rollout: of its plan, states, controls, seed and first trial."""
+    """Hash of a rollout, from its plan, states, controls, seed and first trial."""
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     parts: list[str | Array] = [f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}"]
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):

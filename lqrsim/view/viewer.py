@@ -1,4 +1,4 @@
-"""Runs in MuJoCo's own viewer: recorded ones, and live ones in which a person pushes the robot or moves its goal."""
+"""Runs in MuJoCo's own viewer: recorded runs, and live runs in which a person pushes the robot or moves its goal."""
 
 import contextlib
 import os
@@ -32,9 +32,9 @@ from lqrsim.view.browser import Browser
 from lqrsim.view.recorded_trial import model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
-LONGEST_RUN = 600.0  # s, after which a run restarts: all of it is kept in memory
+LONGEST_RUN = 600.0  # s, after which a run restarts, because the whole run is kept in memory
 RECENT = 100  # number of solves in the median of the caption
-GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # neither the colour of the plan nor that of the trace
+GOAL_RGBA = (1.0, 0.72, 0.05, 0.65)  # differs from the colours of plan and trace
 GOAL_SIZE = 0.5  # relative to the robot's radius: a robot at the goal can still be seen and clicked
 
 
@@ -113,7 +113,7 @@ class ViewedReplanner(Controller):
 
     @property
     def digest(self) -> str:
-        """Hash of its problem; its decisions also depend on the clock."""
+        """Hash of the problem; the decisions also depend on the clock."""
         return sha256(f"live {self.live.problem.digest}")[:16]
 
     @property
@@ -126,7 +126,7 @@ class _ViewedRun(ControllerRun):
 
     def __init__(self, of: ViewedReplanner) -> None:
         self._live, self._plant, self._viewer, self._goal = of.live, of.plant, of.viewer, of.goal
-        self._place = np.zeros(0) if of.goal is None else of.goal.place  # of the goal that is planned for
+        self._place = np.zeros(0) if of.goal is None else of.goal.place  # place of the goal in the present plan
         if of.goal is not None:
             of.viewer.move_goal(of.goal.place)
         self._show(of.live.active)
@@ -145,7 +145,7 @@ class _ViewedRun(ControllerRun):
         return self._live.summary()
 
     def _take_goal(self) -> None:
-        """Plan for the goal where the person has moved it."""
+        """Plan for the goal at the place to which the person has moved it."""
         if self._goal is None or np.array_equal(self._viewer.goal, self._place):
             return
         self._place = self._viewer.goal
@@ -234,13 +234,13 @@ class Window(Viewer):
 
     def __exit__(self, *_: object) -> None:
         self._viewer.close()
-        for thread in self._threads:  # the process would crash if it ended before these threads
+        for thread in self._threads:  # if the process ended before these threads, it would crash
             thread.join(timeout=5.0)
 
     def refresh(self) -> bool:
         if not self._viewer.is_running():
             return False
-        self._viewer.sync()  # which moves the dragged goal
+        self._viewer.sync()  # this moves the dragged goal
         with self._viewer.lock():
             self._viewer.perturb.select = self.hold(self._viewer.perturb.select)
         self.drag(self.data.xfrc_applied)
@@ -285,7 +285,7 @@ def arguments_for_plant(plant: Plant, solution: Solution, goal: MovableGoal | No
 
 
 class _UserForces(Disturbance):
-    """Forces of the person at the viewer on the robot."""
+    """Forces on the robot from the person at the viewer."""
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
@@ -326,8 +326,8 @@ def live(
 ) -> None:
     """Simulate in step with the viewer, under the forces of the person, until the viewer is closed.
 
-    A run restarts at the end of the horizon, and when the robot is lost: if its distance from the plan exceeds the size
-    of the scene, or the simulation becomes unstable. Run k has the random numbers of trial k of the seed.
+    A run restarts at the end of the horizon, and when the robot is lost: when its distance from the plan exceeds the
+    size of the scene, or the simulation becomes unstable. Run k has the random numbers of trial k of the seed.
 
     Args:
       planner: makes a live re-planner for each run, in place of a controller: `replanner.live`. A run then continues
@@ -343,7 +343,7 @@ def live(
             raise RestartRequested
 
     def once() -> str:
-        """One run to its end, and a line on it."""
+        """Run once to the end; return a line on the run."""
         options = {"disturbances": everything, "seed": seed, "first_trial": run, "watch": watch}
         if planner is None:
             rollout = simulate(plant, solution, controller=controller, **options)

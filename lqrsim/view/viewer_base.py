@@ -1,4 +1,4 @@
-"""Viewers: a moving model with its plan and trace, and a person who interferes."""
+"""The common part of the viewers: a moving model with its plan and trace, and interaction by a person."""
 
 import abc
 import copy
@@ -19,11 +19,11 @@ from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
-SEGMENTS = 60  # of the plan; the trace has twice as many
-LIFT = 0.008  # m, between the floor and the lines on it
+SEGMENTS = 60  # number of segments of the plan; the trace has twice as many
+LIFT = 0.008  # m, height of lines above the floor
 STRONGEST_DRAG = 2.0  # largest force of a drag, relative to the robot's weight
 GOAL_STEP = 0.1  # m, step of the goal for each key press
-MOST_DELAY = 0.2  # s of delay that a slow machine makes up for, at most
+MOST_DELAY = 0.2  # s, largest delay that is caught up on a slow machine
 # The direction of each key, seen from the camera: right, away, up.
 PUSHES = {
     "LeftArrow": (-1.0, 0.0, 0.0),
@@ -40,7 +40,7 @@ class ViewerClosed(Exception):
 
 
 class RestartRequested(Exception):
-    """The person asks to start again."""
+    """The person asks for a restart."""
 
 
 class Viewer(abc.ABC):
@@ -52,11 +52,11 @@ class Viewer(abc.ABC):
       space: coordinates of the plan's states.
       body: name of the robot's body in the model.
       radius: radius of the robot, in metres.
-      balls: with the planned places, for a robot without a position.
+      balls: the balls with their planned positions, for a robot without a position.
       goal: name of the mocap body of a goal that can be moved; see `MovableGoal`.
       push: velocity that a key adds, in m/s.
       speed: speed of the time shown; 1 is real time.
-      seconds: after which the viewer closes; never by default.
+      seconds: time after which the viewer closes; never by default.
 
     Attributes:
       data: the state that is shown.
@@ -83,7 +83,7 @@ class Viewer(abc.ABC):
         if not space.position and balls is None:
             wanted = "the 2 or 3 states that are the position, or balls"
             raise InputError(f"state_coordinates.position: got none, want {wanted}")
-        # A copy, for a viewer has sliders for gravity and the like.
+        # A copy, because a viewer has sliders for gravity and other settings.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.space, self.robot = space, robot_body(model, body)
@@ -94,7 +94,7 @@ class Viewer(abc.ABC):
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
         if self._balls is not None:
-            _ = self._balls.tracked  # which raises if no site is named
+            _ = self._balls.tracked  # raises an exception if no site is named
         self.follow(plan, self._balls)
         self._apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS  # of points of the trace
         self._time, self._ahead, self._restart = 0.0, 0.0, False
@@ -128,7 +128,7 @@ class Viewer(abc.ABC):
         if self.remark:
             self.caption += f"\n{self.remark}"
         if self.goal_body:
-            self.move_goal(self.goal)  # a goal that was dragged off the floor, or turned, is put back
+            self.move_goal(self.goal)  # puts back a goal that was dragged off the floor, or turned
         return place
 
     def follow(self, plan: Trajectory, balls: BallRecord | None, *, begins: float = 0.0) -> None:
@@ -139,7 +139,7 @@ class Viewer(abc.ABC):
 
     @property
     def goal(self) -> Array:
-        """Place of the movable goal, in the coordinates of the plan's position, (2 or 3,)."""
+        """The position of the movable goal, in the coordinates of the plan's position, (2 or 3,)."""
         return self.space.of_world(self.data.mocap_pos[self.model.body_mocapid[self.goal_body]])
 
     def move_goal(self, place: Array) -> None:
@@ -152,17 +152,17 @@ class Viewer(abc.ABC):
         return self.space.of_world(points) if self._balls is None else points
 
     def wait(self, seconds: float) -> None:
-        """Stand still for a while. Raises as `show`."""
+        """Stand still for a while. Raises exceptions as `show` does."""
         self._wait(seconds * self.speed)
 
     def hold(self, selected: int) -> int:
-        """Note which body the person selected (0: none); returns the one to select: the goal or the robot."""
+        """Note which body the person selected (0: none); returns the body to select: the goal or the robot."""
         if selected:
             self.holds_goal = selected == self.goal_body
         return selected or (self.goal_body if self.holds_goal else self.robot)
 
     def other(self) -> int:
-        """The body that Enter selects: the one of robot and goal that is not held."""
+        """The body that Enter selects: the robot or the goal, whichever is not held."""
         return self.robot if self.holds_goal or not self.goal_body else self.goal_body
 
     def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
@@ -247,7 +247,7 @@ class Viewer(abc.ABC):
 
 
 def _seen_from(azimuth: float, right_away_up: tuple[float, float, float]) -> Array:
-    """A direction (3,) in the world, of one relative to a camera that looks along `azimuth`, in degrees."""
+    """Convert a direction relative to a camera that looks along `azimuth`, in degrees, to the world's axes, (3,)."""
     along, (right, away, up) = np.radians(azimuth), right_away_up
     x = right * np.sin(along) + away * np.cos(along)
     y = away * np.sin(along) - right * np.cos(along)

@@ -32,7 +32,7 @@ class MotorLag(Disturbance):
     """Actuators follow their commands, within the limits, with a first-order lag. They begin at the plan's first
     control.
 
-    The control that is applied in a control period is the exact mean over it.
+    The control that is applied in a control period is the exact mean over the period.
 
     Args:
       time_constant: in s.
@@ -71,9 +71,10 @@ class Saturation(Disturbance):
     """Control limits that are narrower than the robot's own.
 
     Args:
-      lowest: in the control's unit, within the robot's limits: a number, or one per control; None keeps the robot's.
-      highest: likewise.
-      share: instead of these, the share of the robot's own limits that is left, 0 to 1.
+      lowest: lower limits in the control's unit, within the robot's limits: one number, or one per control. None keeps
+        the robot's lower limits.
+      highest: the upper limits, in the same form.
+      share: in place of lowest and highest, the remaining fraction of the robot's own limits, 0 to 1.
       strength: interpolates from the robot's own limits (0) to these (1), and beyond, until they meet.
     """
 
@@ -161,12 +162,12 @@ class Saturation(Disturbance):
 
 @dataclass(frozen=True)
 class ActuatorLoss(Disturbance):
-    """An actuator fails for good: its force in MuJoCo drops to a share. A wheel that loses its drive turns freely.
+    """An actuator fails for good: its force in MuJoCo drops to a fraction. A wheel that loses its drive turns freely.
 
     Args:
       actuator: one of the robot's `actuators`; None draws one for each trial.
       at: seconds after the start; the loss begins with the next control period.
-      remaining: share of the force that is left, 0 to 1.
+      remaining: fraction of the force that remains, 0 to 1.
     """
 
     actuator: str | None = None

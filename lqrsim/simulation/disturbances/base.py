@@ -2,8 +2,8 @@
 
 To add one, subclass `Disturbance` and implement `start`. It is called once per run, and returns an `Effect`: functions
 that the closed loop calls in every control period for all trials at once. They may use the state (wind that depends on
-the position) or remember the past (a delay). `scaled` returns a stronger or weaker one, for sweeps; `check` refuses a
-plant that cannot have it; `uncertainty` describes it to filters, tracking laws and tubes.
+the position) or remember the past (a delay). `scaled` returns a stronger or weaker disturbance, for sweeps. `check`
+refuses plants that cannot have the disturbance. `uncertainty` describes it to filters, tracking laws and tubes.
 """
 
 import abc
@@ -41,15 +41,15 @@ Numbers = float | Sequence[float]
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """The effect of a disturbance on one run of K trials; None has no effect. A step is the number of a control period.
+    """The effect of a disturbance on a run of K trials. A field of None has no effect. Steps count control periods.
 
-    Each function must give a trial the same bits, independent of the trials beside it: no sums over trials.
+    Each function must give a trial the same bits whatever other trials run with it. It must not sum over trials.
 
     Attributes:
       initial_states: (first states of the plan (K, n)) -> first states of the trials, (K, n).
-      factors: "mass", "inertia" -> (K, 1) or "thrust" -> (K, actuators), factors of these parameters of the robot.
-      alter: called once, before the first step, with MuJoCo's simulations; gives each trial its own values of fields of
-        the model with `simulations.expand(field)`, whose first axis is the trial. Refused for other simulators.
+      factors: "mass" or "inertia" -> (K, 1), or "thrust" -> (K, actuators): factors of these parameters of the robot.
+      alter: called once, before the first step, with MuJoCo's simulations; `simulations.expand(field)` gives each trial
+        its own values of a field of the model; the first axis is the trial. Refused for other simulators.
       measure: (step, states (K, n)) -> measured states, (K, n); step runs to T inclusive.
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
@@ -98,15 +98,15 @@ class Disturbance(abc.ABC):
     _scales: ClassVar[str] = ""  # the field of a dataclass that is proportional to the effect
 
     def describe(self, plant: Plant) -> str:
-        """The disturbance in words and units, for records. By default its repr.
+        """The disturbance in words and units, for records. By default this is its repr.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
         """
         return repr(self)
 
     def scaled(self, strength: float) -> "Disturbance":
-        """The same disturbance with `strength` times its effect, for a sweep over strengths.
+        """The disturbance with `strength` times the effect, for a sweep over strengths.
 
         Args:
           strength: factor; 0 has no effect, 1 is the disturbance itself.
@@ -125,17 +125,17 @@ class Disturbance(abc.ABC):
         """Check that the plant can have this disturbance.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
 
         Raises:
           InputError: it cannot.
         """
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with the reason.
+        """Describe the disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
 
         Returns:
           An Uncertainty.
@@ -147,7 +147,7 @@ class Disturbance(abc.ABC):
         """Start a run with one trial per generator. A trial's random numbers must come from its own generator.
 
         Args:
-          plant: what is run.
+          plant: the plant that is run.
           plan: the plan that the policy follows.
           generators: K of them, one per trial.
 
@@ -176,12 +176,12 @@ class GaussianDisturbance(Disturbance):
 
 
 def left_out(disturbance: Disturbance, plant: Plant, why: str, *, acts: bool = True) -> Uncertainty:
-    """The Uncertainty of a disturbance that linear models cannot have: description and reason, if it acts at all."""
+    """The Uncertainty of a disturbance that no linear model represents: its description and the reason, if it acts."""
     return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",) if acts else ())
 
 
 def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
-    """The unknowns that are not zero; those that the robot's dynamics do not have are left out by name."""
+    """The unknowns that are not zero. Unknowns that the robot's dynamics lack are listed as left out, by name."""
     known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
     kept = list[Unknown]()
     for one in wanted:
@@ -196,20 +196,20 @@ def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown
 
 
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
-    """Standard normal numbers (K, steps, size), each trial's from its own generator."""
-    numbers = np.empty((steps, len(generators), size))  # in memory all trials of a step together, as they are read
+    """Standard normal numbers (K, steps, size). Each trial draws from its own generator."""
+    numbers = np.empty((steps, len(generators), size))  # in memory, all trials of a step are adjacent, as they are read
     for trial, generator in enumerate(generators):
         numbers[:, trial] = generator.standard_normal((steps, size))
     return numbers.transpose(1, 0, 2)
 
 
 def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
-    """Uniform numbers (K, steps, size) in [0, 1), each trial's from its own generator."""
+    """Uniform numbers (K, steps, size) in [0, 1). Each trial draws from its own generator."""
     return np.stack([generator.random((steps, size)) for generator in generators])
 
 
 def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
-    """A field as a number or a tuple. Raises InputError for no numbers, and for small or infinite ones."""
+    """A field as a number or a tuple. Raises InputError for no numbers, and for too small or infinite numbers."""
     field = f"{type(disturbance).__name__}: {name}"
     if real(field, numbers).ndim == 0:
         return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
@@ -227,7 +227,7 @@ def check_strength(disturbance: Disturbance, strength: float) -> float:
 
 
 def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
-    """A number or a tuple of numbers times the strength. Raises InputError if that is negative or too large."""
+    """A number or a tuple of numbers times the strength. Raises InputError if the strength is negative or too large."""
     with np.errstate(over="ignore"):
         product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
     if not np.isfinite(product).all():
@@ -236,7 +236,7 @@ def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
 
 
 def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], field: str = "std") -> Array:
-    """A field as one number for each of `names`. Raises InputError unless it has one number, or one for each name."""
+    """A field as one number for each of `names`. Raises InputError unless it has one number, or one per name."""
     values = np.asarray(numbers, dtype=np.float64)
     if values.ndim and len(values) != len(names):
         raise InputError(

@@ -26,7 +26,7 @@ class Late(Disturbance):
     periods: int
 
     what: ClassVar[str]
-    known_as: ClassVar[str]  # to an Uncertainty
+    known_as: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:
         keep(self, periods=check_count(f"{type(self).__name__}: periods", self.periods, at_least=0))
@@ -39,7 +39,7 @@ class Late(Disturbance):
         return Uncertainty(**told)
 
     def scaled(self, strength: float) -> Self:
-        """The same with `strength` times the periods, rounded to whole ones.
+        """The delay with `strength` times the periods, rounded to whole periods.
 
         Args:
           strength: factor, 0 or more.
@@ -94,8 +94,8 @@ class GilbertElliott:
     Args:
       to_bad: probability per control period of turning bad while good.
       to_good: probability per control period of turning good while bad.
-      lost_when_good: share that is lost while good.
-      lost_when_bad: share that is lost while bad.
+      lost_when_good: fraction that is lost while good.
+      lost_when_bad: fraction that is lost while bad.
     """
 
     to_bad: Annotated[float, SHARE]
@@ -108,12 +108,12 @@ class GilbertElliott:
 
     @property
     def bad(self) -> float:
-        """Share of the time in which the link is bad."""
+        """The fraction of the time in which the link is bad."""
         return self.to_bad / (self.to_bad + self.to_good)
 
     @property
     def lost(self) -> float:
-        """Share that is lost in the long run."""
+        """The fraction that is lost in the long run."""
         return (1 - self.bad) * self.lost_when_good + self.bad * self.lost_when_bad
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> npt.NDArray[np.bool_]:
@@ -146,7 +146,7 @@ class Dropouts(Disturbance):
     loss: float | GilbertElliott
 
     what: ClassVar[str]
-    known_as: ClassVar[str]  # to an Uncertainty
+    known_as: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:
         if not isinstance(self.loss, GilbertElliott):
@@ -161,11 +161,11 @@ class Dropouts(Disturbance):
 
     @property
     def share(self) -> float:
-        """Share that is lost in the long run."""
+        """The fraction that is lost in the long run."""
         return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
 
     def scaled(self, strength: float) -> Self:
-        """The same with `strength` times as many losses or bad spells, at most all.
+        """The link with `strength` times as many losses or bad spells; at most everything is lost.
 
         Args:
           strength: factor, 0 or more.
@@ -177,7 +177,7 @@ class Dropouts(Disturbance):
         return replace(self, loss=replace(loss, to_bad=to_bad, lost_when_good=lost))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The share that is lost, as if losses were independent.
+        """The fraction that is lost, as if losses were independent.
 
         Args:
           plant: as in `uncertainty_of`.
@@ -196,7 +196,7 @@ class Dropouts(Disturbance):
 
 
 class MeasurementDropouts(Dropouts):
-    """Measurements are lost: the last one that arrived is repeated, at first the plan's first state.
+    """Measurements are lost. The last measurement that arrived is repeated; at first, the plan's first state.
 
     Args:
       loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.
@@ -210,7 +210,7 @@ class MeasurementDropouts(Dropouts):
 
 
 class CommandDropouts(Dropouts):
-    """Commands are lost: the actuators keep the last one that arrived, at first the plan's first control.
+    """Commands are lost. The actuators keep the last command that arrived; at first, the plan's first control.
 
     Args:
       loss: probability of each loss, independently; or `GilbertElliott`, for losses in bursts.

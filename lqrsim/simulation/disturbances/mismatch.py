@@ -1,8 +1,8 @@
 """Robots that differ from the model for which the policy was designed.
 
 Each class multiplies a parameter in the model of each trial by a factor: 1 plus a normal number, truncated at
-three standard deviations and drawn for each trial; or a fixed factor. For filters and tubes a fixed factor is unknown,
-too, with mean 1 and its distance from 1 as standard deviation.
+three standard deviations and drawn for each trial; or a fixed factor. Filters and tubes also treat a fixed factor as
+unknown: its mean is 1, and its standard deviation is its distance from 1.
 """
 
 import abc
@@ -45,14 +45,14 @@ class Mismatch(Disturbance):
 
     Args:
       std: relative standard deviation of the factor about 1, below 1/3, so that the factor is positive.
-      factor: instead, the factor itself, > 0; one number, or one for each of `parts`.
+      factor: the factor itself, > 0, in place of `std`: one number, or one for each of `parts`.
     """
 
     std: float | None = None
     factor: Numbers | None = None
 
     what: ClassVar[str]
-    parameter: ClassVar[str]  # of a simulator
+    parameter: ClassVar[str]  # name of the simulator's parameter
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -68,7 +68,7 @@ class Mismatch(Disturbance):
             keep(self, factor=factor)
 
     def parts(self, plant: Plant) -> Sequence[str]:
-        """The parts that have a factor each."""
+        """The parts, each of which has its own factor."""
         return (self.what,)
 
     def check(self, plant: Plant) -> None:
@@ -84,7 +84,7 @@ class Mismatch(Disturbance):
         return f"{self.what} off by {100 * (self.std or 0.0):.3g} % (std, cut at {CUT:g} std)"
 
     def scaled(self, strength: float) -> "Mismatch":
-        """The same with `strength` times the standard deviation, or with that power of a fixed factor."""
+        """The mismatch with `strength` times the standard deviation, or with a fixed factor raised to that power."""
         strength = check_strength(self, strength)
         if self.factor is None:
             return replace(self, std=strength * (self.std or 0.0))
@@ -92,7 +92,7 @@ class Mismatch(Disturbance):
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
     def spread(self, plant: Plant) -> Array:
-        """Standard deviation of each part's factor, (parts,); the distance of a fixed factor from 1."""
+        """The standard deviation of each part's factor, (parts,). For a fixed factor, its distance from 1."""
         parts = self.parts(plant)
         if self.factor is None:
             return np.full(len(parts), CUT_STD * (self.std or 0.0))
@@ -119,19 +119,19 @@ class MassMismatch(Mismatch):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         dynamics, masses = plant.robot.dynamics, plant.model.body_mass
         loads = {load_of(plant, number): float(masses[number]) for number in bodies(plant) if masses[number] > 0}
-        if loads.keys() <= dynamics.disturbances.keys():  # of a robot from an MJCF
+        if loads.keys() <= dynamics.disturbances.keys():  # true for a robot from an MJCF
             return unknowns_of(self, plant, [Unknown(loads, float(self.spread(plant)[0]))])
         return parameter_unknown(self, plant, "mass")
 
 
 @dataclass(frozen=True)
 class Payload(Disturbance):
-    """A load that the plan does not know of, at the centre of mass of one body, such as a gripper that holds something.
+    """A load at the centre of mass of one body, unknown to the plan. For example, a gripper holds something.
 
-    The same in all trials. The body's inertia about its centre of mass does not change.
+    The load is the same in all trials. The body's inertia about its centre of mass does not change.
 
     Args:
-      mass: of the load, in kg.
+      mass: mass of the load in kg.
       body: name of the body that carries it.
     """
 
@@ -172,7 +172,7 @@ class Payload(Disturbance):
 
 
 class InertiaMismatch(Mismatch):
-    """Another inertia of the robot's bodies about their centres of mass, the same factor for all axes.
+    """Another inertia of the robot's bodies about their centres of mass, with the same factor for all axes.
 
     The mass does not change. Drawn for each trial from a truncated normal distribution, or a fixed factor.
     """
@@ -290,7 +290,7 @@ def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertaint
 
 
 def load_of(plant: Plant, body: int) -> str:
-    """The name that robots from an MJCF have for a load on that body."""
+    """The name of a load on that body, as robots from an MJCF use it."""
     return f"{plant.model.body(body).name}_load"
 
 
@@ -309,7 +309,7 @@ def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | No
 
 
 def controls_of(plant: Plant) -> dict[str | None, str]:
-    """Actuator -> the control that it is proportional to, if no other actuator depends on that control."""
+    """Map each actuator to the control that it is proportional to, if no other actuator depends on that control."""
     names = plant.robot.dynamics.control_coordinates.names
     each = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
     none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in each)
@@ -338,7 +338,7 @@ def driven_by(plant: Plant, body: int) -> str | None:
 
 
 def cut_normal(generator: np.random.Generator) -> float:
-    """A truncated standard normal number, from a single uniform one."""
+    """A truncated standard normal number, from a single uniform number."""
     from scipy.special import ndtr, ndtri  # takes a fifth of a second to import
 
     low, high = ndtr((-CUT, CUT))

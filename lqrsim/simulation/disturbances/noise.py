@@ -27,10 +27,10 @@ from lqrsim.simulation.plant import Plant
 
 
 class AddedError(GaussianDisturbance):
-    """Base class of Gaussian errors that are added to states or controls: anew at each step, or one for a whole run."""
+    """Base class of Gaussian errors on states or controls: drawn anew at each step, or once for a whole run."""
 
     what: ClassVar[str]
-    hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # of an `Effect`
+    hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
     lasts: ClassVar[bool] = True
 
     def _coordinates(self, plant: Plant) -> Coordinates:
@@ -46,7 +46,7 @@ class AddedError(GaussianDisturbance):
         return fit(self, self.std, self._coordinates(plant).names)
 
     def _std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
-        """The standard deviations as an Uncertainty has them: 0 for none."""
+        """The standard deviations in the form of an Uncertainty: 0 for none."""
         std = self._deviations(plant)
         return tuple(std.tolist()) if std.any() else 0.0
 
@@ -113,7 +113,7 @@ class MeasurementBias(AddedError):
 
 
 class InitialStateError(AddedError):
-    """The robot begins off the first state of the plan.
+    """The robot begins in a state that differs from the first state of the plan.
 
     Args:
       std: standard deviation in the state's unit; one number, or one per state.
@@ -166,7 +166,7 @@ class TorqueNoise(WrenchNoise):
 
 
 class DisplacedObstacles(GaussianDisturbance):
-    """Obstacles are displaced from where the plan has them. Planes stay, and heights for a robot seen from above.
+    """Obstacles are displaced from the plan's; planes are not. Heights stay if the robot is seen from above.
 
     Args:
       std: standard deviation in m; one number, or three along the world's axes.
@@ -193,7 +193,7 @@ class DisplacedObstacles(GaussianDisturbance):
         return Effect(displaced=displaced)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """One standard deviation for all axes: the root mean square of those that matter.
+        """One standard deviation for all axes: the root mean square over the axes that matter.
 
         Args:
           plant: as in `uncertainty_of`.
@@ -232,7 +232,7 @@ class StateNoise(Disturbance):
 
         def kick(step: int, states: Array, controls: Array) -> Array:
             matrices = self.noise.matrices(plant.robot.dynamics, states, controls)
-            return sum(  # in an order that does not depend on the number of trials
+            return sum(  # the order must not depend on the number of trials
                 (matrices[:, :, k] * draws[:, step, k, None] for k in range(1, self.noise.size)),
                 start=matrices[:, :, 0] * draws[:, step, 0, None],
             )
@@ -244,7 +244,7 @@ class StateNoise(Disturbance):
 
 
 def as_disturbances(given: object, wanted: str) -> tuple[Disturbance, ...]:
-    """Disturbances, with each `Noise` among them as StateNoise. Raises InputError for anything else."""
+    """The disturbances, with each `Noise` converted to StateNoise. Raises InputError for anything else."""
     items = check_items("disturbances", given, (Disturbance, Noise), wanted)
     return tuple(StateNoise(one) if isinstance(one, Noise) else one for one in items)
 
@@ -254,7 +254,7 @@ class Push(Disturbance):
     """A single push at the robot's centre of mass, spread over the control period in which it comes.
 
     Args:
-      impulse: in N s along the world's axes, (3,).
+      impulse: the impulse in N s along the world's axes, (3,).
       at: seconds after the start.
     """
 
@@ -271,7 +271,7 @@ class Push(Disturbance):
         return f"push of {words(self.impulse)} N s at {self.at:g} s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        period = int(self.at / plan.dt + 1e-9)  # a time that is a knot up to rounding belongs to the period after it
+        period = int(self.at / plan.dt + 1e-9)  # a time that is a knot, up to rounding, belongs to the next period
         if period >= plan.steps:
             raise InputError(f"Push: at: got {self.at:g} s, want a time before the plan ends at {plan.horizon:g} s")
         forces = np.zeros((plan.steps, 3))

@@ -1,4 +1,4 @@
-"""Presets: named sets of disturbances, from calm to severe, as far as a plant can have them."""
+"""Presets: named sets of disturbances, from calm to severe. A plant gets only those that it supports."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 
 
 def preset(name: str, plant: Plant) -> list[Disturbance]:
-    """The disturbances of a preset that the plant can have, in the order in which they act. Each can be scaled by 2.
+    """The disturbances of a preset that the plant supports, in the order in which they act. Each can be scaled by 2.
 
     Left out are disturbances whose strength depends on the robot or the plan: latency and delay, which come in whole
     control periods, while the 6 to 7 ms of motion capture are less than half of one; pushes, whose time and direction

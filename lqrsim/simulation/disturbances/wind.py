@@ -1,6 +1,6 @@
 """Constant wind, gusts, and Dryden turbulence.
 
-They act through the robot's linear drag, F = drag * wind, or as the wind of a simulator that has one.
+They act through the robot's linear drag, F = drag * wind, or as the wind of a simulator that simulates wind.
 """
 
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ class Wind(Disturbance):
     def check(self, plant: Plant) -> None:
         if not plant.robot.drag > 0 and not (plant.simulator and plant.simulator.wind):
             raise InputError(
-                f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag for wind to act through, want"
-                " one with a `drag` in N s/m"
+                f"{type(self).__name__}: got robot {plant.robot.name}, which wind cannot push without drag, want one"
+                " with a `drag` in N s/m"
             )
 
     def blow(self, plant: Plant, wind: Array) -> Effect:
@@ -50,7 +50,7 @@ class MeanWind(Wind):
     """A constant wind.
 
     Args:
-      velocity: in m/s along the world's axes, (3,).
+      velocity: velocity of the wind in m/s along the world's axes, (3,).
     """
 
     velocity: Sequence[float]
@@ -68,7 +68,7 @@ class MeanWind(Wind):
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """An unknown constant of mean zero whose standard deviation is this wind, as if the direction were unknown.
+        """The wind as an unknown constant with mean zero and this wind as standard deviation: its direction is unknown.
 
         Args:
           plant: as in `uncertainty_of`.
@@ -120,7 +120,7 @@ class Dryden(Wind):
 
     Args:
       wind: mean wind at 20 ft in m/s, or "light", "moderate" or "severe": 15, 30 or 45 knots.
-      altitude: above the ground in m; below 10 ft it counts as 10 ft.
+      altitude: altitude above the ground in m; below 10 ft it counts as 10 ft.
       direction: direction towards which the mean wind blows, in rad from the world's x axis towards its y axis.
     """
 
@@ -208,11 +208,11 @@ def first_order(noise: Array, step: float) -> Array:
 def second_order(noise: Array, step: float) -> Array:
     """White noise (K, T, 2) through (1 + sqrt(3) s) / (1 + s)^2: (K, T), stationary with variance 1.
 
-    The state is p with p'' + 2 p' + p = 2 w, and p'. Both have variance 1 in the stationary state, uncorrelated.
+    The state is (p, p'), with p'' + 2 p' + p = 2 w. In the stationary state both have variance 1 and are uncorrelated.
     """
     decay = np.exp(-step)
     a, b, c, d = decay * (1 + step), decay * step, -decay * step, decay * (1 - step)
-    # The noise of a step has the covariance that preserves the stationary one, I: I - F F'.
+    # The covariance of a step's noise, I - F F', preserves the stationary covariance I.
 
     covariance = np.eye(2) - np.array([[a * a + b * b, a * c + b * d], [a * c + b * d, c * c + d * d]])
     variances, axes = np.linalg.eigh(covariance)

@@ -45,7 +45,7 @@ class MyRobot(ls.Robot):
             states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
             controls={"push_x": "N", "push_y": "N"},
             parameters={"mass": self.mass, "damping": self.damping},
-            disturbances={"force_x": 0.0, "force_y": 0.0},  # what ForceNoise does, for predictions and estimates
+            disturbances={"force_x": 0.0, "force_y": 0.0},  # the forces of ForceNoise, for predictions and estimates
             position=("x", "y"),
             control_limits=(-2.0, 2.0),
         )
