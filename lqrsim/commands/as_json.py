@@ -93,7 +93,7 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
 
 
 def of_verification(found: "Verification") -> Object:
-    """All fields of a verification, the positions in every frame included."""
+    """All fields of a verification, including the positions in every frame."""
     return {**{one.name: getattr(found, one.name) for one in dataclasses.fields(found)}, "passed": found.passed}
 
 

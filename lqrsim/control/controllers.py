@@ -120,7 +120,7 @@ class Controller(abc.ABC):
     @property
     @abc.abstractmethod
     def coordinates(self) -> Spaces:
-        """Coordinates of the states that it needs, and of its controls."""
+        """Coordinates of the states that the controller needs, and of its controls."""
 
     @property
     def plan(self) -> Plan | None:

@@ -72,7 +72,7 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
 
 
 def check_observable(model: PlanModel) -> None:
-    """Raise InputError, which names it, for an unknown that moves the robot but changes no measurement."""
+    """Raise InputError, with the name, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
     effect = np.eye(model.size)[:, first:]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)

@@ -48,9 +48,10 @@ class OffsetFree(Controller):
     """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
-    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
-    `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
-    winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
+    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
+    is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
+    so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
+    and predicted
     states by at least 2 % of what that effort moves them in two periods. Where a robot would leave its plan without a
     lag that is stated, filter and law are milder, and do about as well with it: see `lag_margin.py`.
     `model.uncertainty` is the uncertainty that the filter assumes.
@@ -229,12 +230,12 @@ def _told_of(model: PlanModel, share: float) -> PlanModel:
 
 
 def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.0) -> PlanModel:
-    """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
+    """The model that a filter assumes: see `Uncertainty.steady`. It includes the least errors that a filter assumes.
 
     Args:
       model: the model with the uncertainty as stated.
-      memory: seconds, or infinity, as of an `OffsetFree`.
-      effort: effort of the controls, (m,).
+      memory: seconds, or infinity, as for an `OffsetFree`.
+      effort: tolerated effort of the controls, (m,).
       doubt: of the lag; see `lag_margin.py`.
     """
     stated, space, controls = model.uncertainty, model.dynamics.state_coordinates, model.dynamics.control_coordinates

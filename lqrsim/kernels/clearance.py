@@ -15,8 +15,8 @@ AT = 0
 # From there on: numbers of steps with margins, of margins at a step, of obstacles, and of steps with a table of these;
 # then the radius of each ball, or of the point.
 STEPS, EACH, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
-BALLS = 0  # 0 for a point
-AXES = (0, 1, 2)  # of a point, the states that are its position; two in a plane, whose third coordinate is 0
+BALLS = 0  # number of balls; 0 for a point
+AXES = (0, 1, 2)  # states that are the position of a point; two in a plane, with third coordinate 0
 
 
 def value(x, u, t, row, data):

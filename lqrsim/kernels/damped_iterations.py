@@ -63,7 +63,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, negligible)
             shorten_step(settings.steps, fraction, work.best, work.x_hats)
-            # At reach 0, as in iLQR, the models are those about a rollout, which has no gap.
+            # At reach 0, as in iLQR, the models are about a rollout, which has no gap.
             gap = largest_gap(settings.steps, work.x_hats, work.last.states) if reach > 0 else 0.0
             copy_plan(settings.steps, work.last, work.best)
             memory.plan_cost, memory.merit = cost, merit

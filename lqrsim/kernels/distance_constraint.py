@@ -9,7 +9,7 @@ from lqrsim.kernels.declarations import N
 AT = 0
 # From there on: numbers of steps with margins, and of margins at a step; then the number of each row's obstacle.
 STEPS, EACH, OBSTACLES = 0, 1, 2
-ROWS = 1  # how many there are
+ROWS = 1  # number of distances
 
 
 def value(at, u, t, row, data):

@@ -1,7 +1,7 @@
 """The cost of obstacles at distances from a model. Written in the kernels' subset.
 
-It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
-from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has the data of the
+The cost is `weight * sum of exp(-sharpness * distance)` for distances below a cutoff D, and 0 beyond it. The tangent at
+D is subtracted, so that neither the cost nor its slope jumps there. `data` has the data of the
 distances, and from AT on the numbers below. `places` and `places_jacobian` are the distances here.
 """
 
@@ -11,8 +11,8 @@ from lqrsim.kernels.linear_algebra import clear
 
 AT = 0
 SHARPNESS, WEIGHT, FARTHEST = 0, 1, 2  # from there on; the last is D
-ROWS = 1  # how many there are
-MOVED = 1  # states that the distances depend on: the first ones
+ROWS = 1  # number of distances
+MOVED = 1  # number of states, from the first on, that the distances depend on
 
 
 def value(x, u, t, data):

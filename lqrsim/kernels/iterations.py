@@ -101,7 +101,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         failed, good, negligible = backward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), True, failed
-        if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was not known
+        if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was unknown
             memory.plan_cost, _ = plan_cost(steps, work.best, model, work.to_go)
         cost = roll_out_and_keep(steps, x_hat, model, work, memory)
         improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, negligible)
@@ -127,7 +127,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 
 
 def roll_out_and_keep(steps, start, model, work, memory):
-    """Run the policy, and keep it with its rollout; the rollout of lowest cost is the plan. Returns the cost."""
+    """Run the policy, and keep it with its rollout. The rollout of lowest cost is the plan. Returns the cost."""
     cost = rollout(steps, start, work.policy, model, work.last)
     if NOISY:
         cost += noise_cost(steps, work.last, model, work.to_go)
@@ -230,9 +230,9 @@ def ilqr_iterations(first, last, settings, model, work, log):
 
     Args:
       settings: IterationSettings. model: ProblemModel.
-      work: IlqrArrays. The policy makes the first trajectory; afterwards the plan is the best trajectory, and policy
-        (relative to it) and cost-to-go are about it.
-      log: rows of LOG; the last one has the cost that the first iteration improves on.
+      work: IlqrArrays. The policy makes the first trajectory. Afterwards the plan is the best trajectory, with the
+        policy relative to it and the cost-to-go about it.
+      log: rows of LOG; the last row has the cost that the first iteration improves on.
     """
     steps, policy, plan, to_go, damping = settings.steps, work.policy, work.best, work.to_go, work.damping
     no_shift = zeros(N)
@@ -271,7 +271,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:
-            if isnan(left):  # policy and cost-to-go are not yet about the trajectory that was found
+            if isnan(left):  # policy and cost-to-go are not yet computed about the trajectory that was found
                 failed, _, _ = ilqr_pass(steps, plan, model, 0.0, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

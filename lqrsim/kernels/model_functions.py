@@ -1,6 +1,6 @@
 """Calls of a problem's functions by address: dynamics, costs, constraints, noise. Written in the kernels' subset.
 
-Passes and iterations are thereby compiled once for a size, and serve all problems of that size. See
+Passes and iterations are therefore compiled once per size, and serve all problems of that size. See
 `records.ProblemModel`.
 """
 

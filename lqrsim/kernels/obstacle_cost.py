@@ -12,9 +12,9 @@ AT = 0
 # From there on: sharpness, weight, numbers of obstacles and of steps with a table of these; then the radius of each
 # ball, or of the point.
 SHARPNESS, WEIGHT, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
-BALLS = 0  # 0 for a point
-AXES = (0, 1, 2)  # states that are the position, two in a plane, whose third coordinate is 0; or that move the balls
-BLOCK = 8  # obstacles whose exponentials are computed together, as vectors
+BALLS = 0  # number of balls; 0 for a point
+AXES = (0, 1, 2)  # states that are the position, two in a plane with third coordinate 0; or states that move the balls
+BLOCK = 8  # number of obstacles whose exponentials are computed together, as vectors
 
 
 def value(x, u, t, data):
@@ -71,7 +71,7 @@ def derivatives(x, u, t, data, hessian, gradient):
 
 
 def tables_at(t, data):
-    """Where the table of obstacles at step t begins."""
+    """The index at which the table of obstacles at step t begins."""
     return AT + RADII + max(BALLS, 1) + ROW * int(data[AT + OBSTACLES]) * min(t, int(data[AT + TABLES]) - 1)
 
 

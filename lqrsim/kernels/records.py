@@ -235,7 +235,7 @@ class ActiveRows(NamedTuple):
 
     Attributes:
       table: (size, 6) properties of each row; see `stages.py`.
-      live, held: ((T+1) size,) 1 for rows that act, and for those in the active set, else 0.
+      live, held: ((T+1) size,) 1 for rows that act, and for rows in the active set, else 0.
       numbers: their values. force: their multipliers. pressing: their multipliers after a step.
       wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
     """

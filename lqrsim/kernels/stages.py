@@ -33,10 +33,10 @@ from lqrsim.kernels.records import LinearStep, QuadraticStage
 from lqrsim.kernels.rollouts import larger
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
-STEP = 6e-6  # of differences of gradients, relative to a number and at least to 1: the cube root of the precision
+STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
 
-# Columns of `ActiveRows.table`: the kind of a row; its typical size; its target value in the active set; and of a limit
-# the control, 1 for the lower one and -1 for the upper one, and its value.
+# Columns of `ActiveRows.table`: the kind of a row; its typical size; its target value in the active set; and for a
+# limit, the control, 1 for a lower or -1 for an upper limit, and its value.
 KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
 ROUNDING = 1e-10  # allowed violation by a model, relative to a row's size
@@ -47,7 +47,7 @@ def stage_models(t, steps, plan, costates, model, rows, out):
 
     Args:
       costates: (T+1, N). rows: ConstraintRows.
-      out: StageModels; the constraints' gradients are those that `constraint_slopes` wrote.
+      out: StageModels; it contains the constraints' gradients from `constraint_slopes`.
     """
     none = zeros(M)
     x, u = plan.states[t], plan.controls[min(t, steps - 1)]
@@ -107,7 +107,7 @@ def acts_at(k, t, steps, constraints):
 
 
 def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
-    """Subtract from a Hessian (W, W) those of all constraints at a step, times their multipliers."""
+    """Subtract from a Hessian (W, W) the Hessians of all constraints at a step, times their multipliers."""
     for k in range(constraints.size):
         if not acts_at(k, t, steps, constraints):
             continue
@@ -142,7 +142,7 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
 
 
 def trial_cost(steps, soft, plan, model, arrived):
-    """Write where each step of a plan leads, (T, N), and return the plan's cost."""
+    """Write the state after each step of a plan, (T, N), and return the plan's cost."""
     for t in range(steps):
         advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
     return cost_of_plan(steps, soft, plan, model)
@@ -234,7 +234,7 @@ def start_change(free, to_go, change):
 
 
 def control_block_definite(stage, least):
-    """Whether the control block of a stage (W, W) less a diagonal (M,) is positive definite."""
+    """Whether the control block of a stage (W, W) minus a diagonal (M,) is positive definite."""
     block = stack(M, M)
     for i in range(M):
         for j in range(M):

@@ -193,7 +193,7 @@ def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
 
 
 def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) -> None:
-    """Raises InputError unless a shape fits these letters and the sizes so far; new letters get theirs."""
+    """Raises InputError unless a shape fits these letters and the known sizes; new letters get sizes."""
     wanted, before, alike = letters.split(), dict(sizes), True
     if wanted[0] == "...":
         leading = len(shape) - len(wanted) + 1

@@ -250,7 +250,7 @@ class MjcfMemory(UserFunction):
         return memory
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """That of the dynamics in the other process."""
+        """The address for the dynamics in the other process."""
         return MjcfMemory.of, (vars(self)["of_what"],)
 
 

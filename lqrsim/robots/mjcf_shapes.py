@@ -144,7 +144,7 @@ class MjcfBalls(CollisionSpheres):
     """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
 
     Args:
-      outline: bodies, places and radii. place: where they are, plainly, at a state (n,): (K, 3).
+      outline: bodies, positions on them, and radii. place: the centres (K, 3) at a state (n,), in plain Python.
     """
 
     def __init__(self, outline: Outline, place: Callable[[Array], Array]) -> None:
@@ -158,7 +158,7 @@ class MjcfBalls(CollisionSpheres):
 
     def bind(self, dynamics: Dynamics) -> SphereCenters:
         if not isinstance(dynamics, MjcfDynamics):
-            raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+            raise InputError(f"balls: got an MJCF's balls for {dynamics.name}, want its own dynamics, robot.dynamics")
         memory = MjcfMemory.of(dynamics)
         positions = tuple(range(dynamics.physics.model.nv))
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])

@@ -122,7 +122,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
 
 
 def _check_fits(field: str, what: object, scenario: Scenario, spaces: Spaces, steps: int) -> None:
-    """Raise InputError unless states, controls and number of steps are those of the scenario's problem."""
+    """Raise InputError unless states, controls and number of steps agree with the scenario's problem."""
     problem = scenario.problem
     check_same_system(field, what, spaces, spaces_of(problem.dynamics), scenario.name)
     if steps != problem.steps:

@@ -20,7 +20,7 @@ _SMALLER = 1.0, 1e-2, 1e-4  # steps of differences, relative to the first; tried
 _KIND = mujoco.mjtConstraint
 _LIMITS = np.array([int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON)])
 _CONTACTS = np.array([int(_KIND.mjCNSTR_CONTACT_FRICTIONLESS), int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)])
-# A switch's name, as a number: its stage, whether it is a force, what of, and which of those.
+# The name of a switch as a number: its stage, whether it is a force, the kind of element, and the element.
 _STAGE, _FORCE, _CONTACT, _GEOM, _NUMBER, _EDGE = 1 << 48, 1 << 47, 1 << 46, 1 << 14, 1 << 16, 1 << 4
 
 Names = npt.NDArray[np.int64]
@@ -155,7 +155,7 @@ class ContactModes:
         if data.nefc == 0:
             return
         limits, contacts = _among(data.efc_type, _LIMITS), _among(data.efc_type, _CONTACTS)
-        excess = np.empty(data.nefc)  # of acceleration, above what the constraint wants; it pushes if this is negative
+        excess = np.empty(data.nefc)  # acceleration minus the constraint's reference; it pushes if this is negative
         mujoco.mj_mulJacVec(model, data, excess, data.qacc)
         excess -= data.efc_aref
         if limits.any():

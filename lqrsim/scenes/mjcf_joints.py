@@ -69,7 +69,7 @@ class Coupling:
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
 _STRIDE = 0.05  # m or rad, of joints that others follow
-UNNAMED = "unnamed_"  # begins the names of bodies, joints, geoms and actuators without one in the MJCF
+UNNAMED = "unnamed_"  # prefix of the names of bodies, joints, geoms and actuators without a name in the MJCF
 
 
 def named(xml: str) -> str:

@@ -122,11 +122,11 @@ class MjcfPhysics:
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:
-    """Raises InputError for features with states of their own, or that make states depend on each other."""
+    """Raises InputError for features that have their own states, or make states depend on each other."""
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
         "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
-        "plugins": (model.npluginstate > 0, "got some with states of their own", "none"),
+        "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
         "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),
     }
     for what, (found, got, wanted) in refused.items():

@@ -28,10 +28,10 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess
 
 INITIAL = 8.0  # initial penalty, relative to the cost of changing the constraint's value
-GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and in all before it is given up
-STUCK = 3  # how often in a row the penalty may grow to no avail
-ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
-# When a run has converged enough to update the multipliers, and the iterations after which they are updated anyway.
+GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and largest total factor
+STUCK = 3  # number of times in a row that the penalty may grow without effect
+ITERATIONS, ROUNDS = 100, 30  # total number of undamped iterations; rounds of damped iterations
+# Tolerances at which the multipliers are updated, and the number of iterations after which they are updated anyway.
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15
 ROUGHEST_GAP = 3e-2  # the same gap for damped iterations, which approach their minimum slowly
 STALE, CLOSER = 40, 0.9  # number of undamped iterations without progress that ends them; factor that counts as progress
@@ -39,7 +39,7 @@ REFINED = 5  # damped iterations from a plan of the search before Newton's metho
 
 
 def by_multipliers(run: SolveRun) -> RunResult:
-    """Run to the end, with the method, its safeguard and these iterations; certified."""
+    """The certified result of a full run: smoothing, its safeguard, and these iterations."""
     if run.initial_guess.multipliers and run.run_opening_pass():
         found = meet_constraints(run, None)
         if found.success or run.budget.over:
@@ -211,7 +211,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
     rounds, rough = 0, True
     while True:
         rounds += 1
-        # Until the multipliers are about right, there is no point in a minimum to all its digits.
+        # Until the multipliers are approximately right, an accurate minimum is not worth its time.
         ending = run.damped(added=lagrangian.added(), least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
         lagrangian.evaluate(*work.best)
         if ending.success and lagrangian.solved:
@@ -307,7 +307,7 @@ class AugmentedLagrangian:
         for which, (own, values) in enumerate(self._each()):
             own.values[...] = 0.0
             if not self._first[which] > 0:
-                # Only now: once there is a penalty, the passes' curvature contains it.
+                # This comes last: once a penalty is set, the curvature of the passes contains it.
                 self._first[which] = INITIAL * self._curvature(which) if len(values) else 1.0
             own.penalty = self._first[which]
 

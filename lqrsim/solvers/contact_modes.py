@@ -35,8 +35,8 @@ from lqrsim.solvers.budget import Budget, Laps
 from lqrsim.solvers.certify import faults
 from lqrsim.solvers.engine import RunResult, SolveRun
 
-MARGIN = 1e-9  # m, rad or m/s^2, by which a plan stays on its side of a switch
-ENOUGH = 0.1  # share of the predicted decrease that a step must bring
+MARGIN = 1e-9  # m, rad or m/s^2, distance that a plan keeps from a switch
+ENOUGH = 0.1  # fraction of the predicted decrease that a step must achieve
 PUSHES = 10  # times that a step is pushed back to its side
 HALVINGS = 8  # of a step that are tried before it is damped more
 FLAT = 0.05  # least curvature of the second step, relative to that of the first
@@ -61,8 +61,9 @@ class ModeModel:
 
     Attributes:
       gain: (T, m, n). hessian, gradient: of the cost, (T m, T m) and (T m,). slopes, values: of K switches, (K, T m)
-        and (K,). sides: +1 or -1. first: (T+1,) where those of each period begin. known: whether their slopes are.
-      responses: (T m, T m) of the controls. low, high: (T, m) room of the controls. periods: the linearised periods.
+        and (K,). sides: +1 or -1. first: (T+1,) index of each period's first switch. known: whether the slopes are
+        known. responses: (T m, T m) responses of the controls. low, high: (T, m) distances of the controls from their
+        limits. periods: the linearised periods.
       points: (T, n+m) states and controls where they begin. motions: (T, n+m, T m) how these respond.
     """
 
@@ -351,7 +352,7 @@ class Descent:
         return pulls, np.zeros_like(self.model.low) if step is None else step.limits
 
     def _go_to(self, plan: CostedPlan) -> None:
-        """Take a plan, and linearise about it."""
+        """Adopt a plan, and linearise about it."""
         kept = self.model.points.shape[1] - 1
         self._earlier = [*self._earlier[-kept:], (self.model.points, self.model.periods)]
         self.plan, self.model = plan, ModeModel(self._problem, self._modes, plan)

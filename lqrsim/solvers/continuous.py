@@ -51,13 +51,13 @@ from lqrsim.solvers.riccati_ode import (
 class ContinuousSolution:
     """A policy and the value functions as functions of time, in seconds from 0 to the horizon.
 
-    Wherever a time is asked for, an array of times does as well: what comes back has their axes in front.
+    An array of times may be given in place of a time. The axes of the times then come first in the result.
 
     Attributes:
       status: how the solve ended; only CONVERGED is success.
-      detail: in which pass, at what time and why, if it is not.
+      detail: the pass, the time and the reason if the solve failed.
       horizon: the paper's l, in seconds.
-      iterations: the log of the iterations; empty for a linear-quadratic problem, which takes none.
+      iterations: the log of the iterations; empty for a linear-quadratic problem, which needs none.
     """
 
     status: Status
@@ -109,7 +109,7 @@ class ContinuousSolution:
         return self._law("inverse_policy", self._forward, x, t)
 
     def cost_to_go(self, t: npt.ArrayLike) -> Quadratic:
-        """v: the least cost from time t on, of the state then. Paper: Eqs. (8)-(11).
+        """v: the least cost from time t on, as a function of the state at t. Paper: Eqs. (8)-(11).
 
         Args:
           t: seconds, from 0 to the horizon.
@@ -120,7 +120,7 @@ class ContinuousSolution:
         return self._value("cost_to_go", self._backward, t)
 
     def cost_to_come(self, t: npt.ArrayLike) -> Quadratic:
-        """vbar: the least cost up to time t, of the state then. Paper: Eqs. (14)-(17).
+        """vbar: the least cost up to time t, as a function of the state at t. Paper: Eqs. (14)-(17).
 
         Args:
           t: seconds, from 0 to the horizon.
@@ -153,7 +153,7 @@ class ContinuousSolution:
         return self.total_cost(t).minimizer()
 
     def u_hat(self, t: npt.ArrayLike) -> Array:
-        """The control (..., m) of the policy there; once converged also that of the inverse policy. Paper: Eq. (22).
+        """The policy's control (..., m) there; at convergence also the inverse policy's. Paper: Eq. (22).
 
         Args:
           t: seconds, from 0 to the horizon.
@@ -164,7 +164,7 @@ class ContinuousSolution:
         return self.policy(self.x_hat(t), t)
 
     def summary(self) -> str:
-        """The status with its remedy, and what came out, in a few lines."""
+        """The status with its remedy, and the results, in a few lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations: {self.status.meaning}"]
         if not self.iterations and self.success:
             lines = [f"{self.status.name}: a linear-quadratic problem is solved by one pass each way"]
@@ -184,7 +184,7 @@ class ContinuousSolution:
     def _at(self, what: str, found: Pass | None, t: npt.ArrayLike) -> tuple[Pass, Array]:
         if found is None:
             raise InputError(f"{what}: got a solution that is {self.status.value} before a pass ended, want a success")
-        times, slack = real("t", t), 1e-9 * self.horizon  # a time may be out by rounding
+        times, slack = real("t", t), 1e-9 * self.horizon  # rounding may put a time slightly outside
         outside = ~((times >= -slack) & (times <= self.horizon + slack))
         if outside.any():
             raise InputError(f"t: got {times[outside].flat[0]:g}, want seconds from 0 to {self.horizon:g}")

@@ -293,8 +293,8 @@ class SolveRun:
 
     def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
         self.initial_guess, self.budget = initial_guess, budget
-        self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # of smoothing, and which comes next
-        self._last: Iteration | None = None  # of smoothing
+        self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
+        self._last: Iteration | None = None  # the last iteration of smoothing
         self.ending = Ending(declarations.RUNNING)
         settings, problem = self.settings, self.problem
         self.second_order = settings.second_order(problem)
@@ -379,7 +379,7 @@ class SolveRun:
         )
 
     def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
-        """Newton's method from the best plan so far; `added` is the constraints' share of its cost."""
+        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints."""
         self.work.begin_newton(added)
         ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
         if ending.outcome == declarations.STALLED:
@@ -399,7 +399,7 @@ class SolveRun:
                 return found
         assert damped is not None
         if not np.isfinite(work.cost):
-            # Nothing leads anywhere: report how it failed.
+            # Nothing helps: report the failure.
             given_up = found.status in (Status.MAX_ITERATIONS, Status.STALLED)
             return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
         if self.second_order and damped.success:
@@ -609,7 +609,7 @@ class Workspace:
       multipliers: those of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations.
-      fixed: whether the start is given exactly. dual: which form it is.
+      fixed: whether the start is given exactly. dual: whether the form is the dual form.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:

@@ -172,7 +172,7 @@ def _solve(
     done = len(budget.log)
     ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
     whole = done > 0 and ending.failed < 0
-    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was about the previous trajectory
+    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
         if not done:
             loop(declarations.ITERATE, 0, 0, options, model, work, rows)  # only the first rollout
         *_, failed = loop(declarations.LINEARIZE, 0, 0, options, model, work, rows)

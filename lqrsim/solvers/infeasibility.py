@@ -21,7 +21,7 @@ from lqrsim.solvers.engine import RunResult, Workspace
 STARTS, ALIKE = 2, 0.05  # starts that must lead to equal violations, and relative difference up to which they are equal
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
 NEAR_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
-NAMED = 3  # most constraints that a message names beside the one that is violated most
+NAMED = 3  # largest number of constraints that a message names in addition to the most violated constraint
 
 
 @dataclass(frozen=True, eq=False)

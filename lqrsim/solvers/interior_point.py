@@ -29,10 +29,10 @@ from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import MIXES, Sizes, Stages, joined
 
 INTERIOR = "interior point"  # name of its iterations in the log
-WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, relative to the cost, if not even that has a minimum
-REGULARISATION = 1e-8  # of equalities, relative
-# Regularisation of active rows in the first step without a barrier. Where a row couples controls, curvature across it
-# must exceed 1e-9 of its weight, below which the kernel takes it for rounding.
+WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # weights on control changes, relative to the cost, if all these fail
+REGULARISATION = 1e-8  # relative regularisation of equalities
+# Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
+# must exceed 1e-9 of its weight; the kernel treats less as rounding.
 CROSSING = 1e-6
 LONG = 0.3  # fraction of a step above which the next step uses Mehrotra's rule
 LATELY = 4  # number of iterations with that rule; to continue, the measures must be below the worst of these
@@ -182,7 +182,7 @@ class Rows:
         return point.numbers - self.total(point.slack)
 
     def largest_miss(self, point: Iterate) -> float:
-        """The largest of these, relative to the rows' sizes."""
+        """The largest difference of row values and slacks, relative to the rows' sizes."""
         return float((np.abs(self.missed(point)) / self.size).max(initial=0.0))
 
     def duals(self, force: Array) -> Array:
@@ -616,7 +616,7 @@ class InteriorPoint:
         return None
 
     def _corrected(self, tried: Iterate, system: System, part: float, corrections: Array) -> Iterate | None:
-        """The point of a step that also reduces the residuals at a trial point; None where these have fallen."""
+        """The point of a step that also reduces the residuals at a trial point; None if these have fallen."""
         now, missed = self.point, self._rows.missed
         if not self._off(tried) >= self._off(now):
             return None
@@ -628,7 +628,7 @@ class InteriorPoint:
         return self._at(other, self._longest(now.slack, other.slack))
 
     def _closed(self, tried: Iterate, system: System, part: float, slope: float) -> Iterate:
-        """The point nearer to a motion that keeps its rows, by the least changes, as far as the filter takes them.
+        """The point moved towards feasibility by the smallest changes, as far as the filter accepts them.
 
         The changes use the models of the step, so each change costs a Riccati pass and an evaluation of the steps. A
         good plan is then feasible long before it is optimal.
@@ -649,7 +649,7 @@ class InteriorPoint:
         return tried
 
     def _force_step(self, system: System) -> tuple[Iterate, float, Step] | None:
-        """A step where the filter rejects every part of the last one; None if there is none, or there were too many.
+        """A step for when the filter rejects every fraction of the last step; None if there is none, or were too many.
 
         It is the step of the projected Hessian; or, if the filter rejects that, a small fraction of it, better or not.
         """
@@ -668,7 +668,7 @@ class InteriorPoint:
         return None if tried is None else (tried, part, step)
 
     def _take(self, new: Iterate, part: float, step: Step, duals: Array) -> None:
-        """Go to a point with that part of a step in multipliers and costates."""
+        """Go to a point, with that fraction of a step in multipliers and costates."""
         off, rows = self._off(self.point), self._rows
         self._filter.append(((1 - MARGIN) * off, self._merit(self.point) - MARGIN * off))
         self._part = part
@@ -677,14 +677,14 @@ class InteriorPoint:
         dual_part = self._longest(duals, rows.sign * step.multipliers[rows.row])
         costates = self.point.costates
         force = self.point.force + np.where(rows.regularised > 0, part, dual_part) * step.multipliers
-        # The products of slacks and multipliers stay within reach of the barrier's parameter, where rows are hard.
+        # For hard rows, the products of slacks and multipliers stay within a factor of the barrier parameter.
         hard, middle = rows.row[rows.hard], self.parameter / new.slack[rows.hard]
         force[hard] = np.clip(force[hard], middle / WIDE, WIDE * middle)
         costates = costates + part * (step.costates - costates)
         self._go_to(new._replace(force=force, costates=costates), 1e-10 * self._scale)
 
     def _at(self, step: Step, part: float, *, about: Iterate | None = None) -> Iterate | None:
-        """The point a part of a step further than this one, or another; None where it is not finite."""
+        """The point at a fraction of a step from this point, or from another; None if it is not finite."""
         about, rows = self.point if about is None else about, self._rows
         plan = Motion(
             in_c_order(about.plan.states + part * step.plan.states),
@@ -703,7 +703,7 @@ class InteriorPoint:
         return self._gap(point) + float((np.abs(self._rows.missed(point)) / self._rows.size).sum())
 
     def _gap(self, point: Iterate) -> float:
-        """The dynamics' share of it."""
+        """The part of the violation that is due to the dynamics."""
         return float((np.abs(point.arrived - point.plan.states[1:]) / self.sizes.states).sum())
 
     def _merit(self, point: Iterate) -> float:

@@ -40,7 +40,7 @@ def solve_all(
             start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
             check_functions(problem, start, resolve(settings.start, problem).offset[0])
             compiled.core(problem, getattr(settings, "form", "dual"))
-            compiled.arguments(problem)  # compiles numba functions
+            compiled.arguments(problem)  # this compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
     functions = [function for problem in problems for function in functions_of(problem)]

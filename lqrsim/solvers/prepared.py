@@ -28,8 +28,8 @@ from lqrsim.solvers.interior_run import LITTLE, copied
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.stages import Stages
 
-SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
-BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
+SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
+BEGINNING = 15.0  # duration of the interior point's first iteration, relative to the time for the models about a plan
 
 
 def prepare(

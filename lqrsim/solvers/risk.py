@@ -15,9 +15,9 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 
-DIGITS = 1e-12  # relative accuracy
+DIGITS = 1e-12  # relative accuracy of the bisection
 MOST_TRIALS = 10_000_000
-Fails = Callable[[float], int]  # the step at which a backward pass fails with a risk, or -1
+Fails = Callable[[float], int]  # maps a risk to the step at which a backward pass fails, or -1
 
 
 def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, seed: int = 0) -> Array:
@@ -28,8 +28,8 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     trial.
 
     Args:
-      problem: with noise.
-      solution: solution of that problem, or of another one with as many states, controls and steps.
+      problem: a problem with noise.
+      solution: a solution of that problem, or of another with as many states, controls and steps.
       trials: number of runs K.
       seed: seed of the noise.
 
@@ -41,7 +41,7 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     """
     check_problem(problem)
     if problem.noise_term is None:
-        raise InputError("problem: got one without noise, want Problem(noise=...), or problem.driven_by(noise)")
+        raise InputError("problem: got a problem without noise, want Problem(noise=...), or problem.driven_by(noise)")
     check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
     shape = problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates)
     if solution.policy.gain.shape != shape:

@@ -268,7 +268,7 @@ class Stages:
         return failed == -1, wrong
 
     def change(self, *, worst: bool) -> None:
-        """Change which rows are held; see the kernel."""
+        """Change which rows are fixed; see the kernel."""
         self._call("update_active_set", self.steps, int(worst), self.active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:

@@ -137,7 +137,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
     found = by_multipliers(run)
-    # It begins with the optimum without the constraints, which is often the same from all starts: they count as one.
+    # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
     if found.stuck and not known.evidence:
         known.evidence.append(Evidence(found, found.violation))
     return found

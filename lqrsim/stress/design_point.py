@@ -80,10 +80,10 @@ def smallest_failure(
     Args:
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
-      failures: (k, size) to begin with; by default those of a small splitting.
+      failures: (k, size), failures to begin with; by default the failures of a small splitting.
       rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than 1 % of the
         distance, and five rounds together gain less than a tenth of that.
-      pairs: number of pairs in each round; by default half the size, and at least 250. With fewer the gradient is
+      pairs: number of pairs in each round; by default half the size, and at least 250. With fewer pairs the gradient is
         mostly noise.
       seed: seed of all random numbers.
       progress: called with the number of finished rounds, the number of all rounds, and the distance so far as text.
@@ -99,7 +99,7 @@ def smallest_failure(
     rounds = check_count("rounds", rounds, at_most=MOST)
     pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs, at_least=2)
     check_memory("pairs", pairs, 8 * 5 * size, "whose vectors")
-    check_memory("size", size, 8 * 16 * 12, "whose vectors")  # along the rays
+    check_memory("size", size, 8 * 16 * 12, "whose vectors")  # the vectors along the rays
     rng, counted = np.random.default_rng(check_seed("seed", seed)), CountedScore(score)
     if failures is None:
         failures = failure_probability(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures

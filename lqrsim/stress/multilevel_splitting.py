@@ -145,7 +145,7 @@ def failure_probability(
 
 
 def _estimate(shares: Array, particles: int) -> Estimate:
-    """The mean of the estimates with its interval, from the shares (R, levels) above each level."""
+    """The mean of the estimates with its interval, from the fractions (R, levels) above each level."""
     count, levels = shares.shape
     if levels == 1:
         return rate(round(float(shares.sum()) * particles), count * particles)

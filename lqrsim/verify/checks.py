@@ -110,7 +110,7 @@ SIZE = (640, 480)
 # Pixels: what is thinner is thin, and drawn finer, up to FINEST times, until it is FILLED. Along a rod that is THINNEST
 # every column or row of pixels has one of its own; along a thinner one some have none, and its ends can be missing.
 THIN, FILLED, THINNEST, FINEST = 16.0, 2.0, 1.0, 4
-DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged ones
+DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged robots
 # Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
 SYMMETRIC_KINDS = (
     Geom.mjGEOM_SPHERE,
