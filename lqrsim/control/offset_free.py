@@ -66,7 +66,7 @@ class OffsetFree(Controller):
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
-      memory: in s, by default 5 s, or the plan's horizon where that is shorter. np.inf takes the uncertainty as it is
+      memory: time in s; by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as
         stated: constants do not change, what varies has the mean zero, so that a steady disturbance leaves an error,
         and a lag is there.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.

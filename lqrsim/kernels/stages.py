@@ -1,6 +1,6 @@
 """Models of all stages of a plan, and the step to their minimum, with or without an active set. The kernels' subset.
 
-The plan need not satisfy the dynamics: between where a step leads and the next state there is a gap, which the
+The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
 iterations close. Rows are those of all constraints, then the limits of the controls; an active set holds some of them
 at zero. The methods are `solvers/interior_point.py`, `solvers/active_set.py` and `solvers/restoration.py`.
 """

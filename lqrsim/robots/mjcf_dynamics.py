@@ -240,7 +240,7 @@ class MjcfMemory(UserFunction):
 
     @classmethod
     def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":
-        """That of these dynamics."""
+        """The address for these dynamics."""
         memory = cls(
             function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
             offset=1, values=1, with_control=False, is_memory=True,

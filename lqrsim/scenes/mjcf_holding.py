@@ -10,10 +10,10 @@ import numpy.typing as npt
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import Equalities, couplings_of, loops_of
 
-_HELD = 1e-6  # share of the largest force that may be missing for a robot that counts as held
-_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # steps at most, their halves, and m or rad of difference quotients
+_HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
+_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
-_LIGHT = 1e-9  # of the forces, the weight of the controls themselves: of several that hold, the least
+_LIGHT = 1e-9  # weight of the controls relative to the forces: selects the smallest controls that hold
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Holding:
 
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
-      activations: (na,), the states of actuators with which they do: a filter's is its control, an integrator's what it
+      activations: (na,), the states of actuators at which they do so: a filter's state is its control, an integrator's
         has come to.
-      missed: N or N m, (nv,), the force that each joint is short of; 0 for joints that follow others.
+      missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
       drifting: (nu,), the actuators whose activation never rests: integrators whose control cannot be 0.
-      held: whether they hold it.
+      held: whether the controls hold the robot.
     """
 
     controls: Array

@@ -46,7 +46,7 @@ class RunSettings:
       law: the controller; by default the plan's policy.
       whole: the plan's trajectory from its own first knot on.
       followed: the plan of the run: the given one, or else the controller's own; from the knot on.
-      states, controls: coordinates of the controller, with limits that are within the robot's.
+      states, controls: coordinates of the controller, with limits within the robot's limits.
       radius: distance from the goal within which it counts as reached, in `Target.unit`.
       substeps: physics steps per control period.
 

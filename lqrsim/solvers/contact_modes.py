@@ -38,13 +38,13 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 MARGIN = 1e-9  # m, rad or m/s^2, distance that a plan keeps from a switch
 ENOUGH = 0.1  # fraction of the predicted decrease that a step must achieve
 PUSHES = 10  # times that a step is pushed back to its side
-HALVINGS = 8  # of a step that are tried before it is damped more
+HALVINGS = 8  # number of halvings of a step before the damping grows
 FLAT = 0.05  # least curvature of the second step, relative to that of the first
 SHORT, SKEW = 1e-6, 1e-6  # steps of a period, and cosines between what they mend and themselves, that say nothing
-DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature where steps fail, at first and at most
-ROUNDS = 50  # of adding switches to a quadratic program
-SMALL = 1e-3  # how far plans beside a plan change a control, as a part of its range
-SAMPLES, RAY = 50, 8  # plans beside a plan; how often the way across a switch doubles
+DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature if steps fail: the first and the largest
+ROUNDS = 50  # largest number of rounds in which switches are added to a quadratic program
+SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its range
+SAMPLES, RAY = 50, 8  # number of sampled neighbouring plans; number of doublings of a ray across a switch
 
 
 @dataclass(frozen=True)

@@ -418,7 +418,7 @@ class SolveRun:
         return self._iterate(partial(self._plan_arguments, declarations.DAMP, least=least), self.work.best)
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
-        """More iterations, in rows of their own; a prior acts no longer."""
+        """Run more iterations, in separate rows. A prior no longer acts."""
         self.work.disregard_costs()
         begin, again = len(self.budget.log), partial(self._arguments, again=True)
         ending = self._iterate(again, self.work.arrays.last, rows, first, last)
@@ -606,7 +606,7 @@ class Workspace:
     Attributes:
       arrays: the arrays of `records.SmootherArrays`. model: the problem's numbers.
       memory: what the iterations remember, a row of `MEMORY`; memory_rows: (1,) that row.
-      multipliers: those of each constraint; changes act at once.
+      multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations.
       fixed: whether the start is given exactly. dual: whether the form is the dual form.

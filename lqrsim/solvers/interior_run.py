@@ -22,8 +22,8 @@ from lqrsim.solvers.interior_point import AT_LIMIT, INTERIOR, Found, InteriorPoi
 from lqrsim.solvers.stages import FIRMNESS, Stages
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
-MOST = 300  # iterations from one plan
-UPDATES = 5  # of multipliers, if Newton's steps at the end violate constraints
+MOST = 300  # largest number of iterations from one plan
+UPDATES = 5  # largest number of updates of the multipliers, if Newton's last steps violate constraints
 
 
 class Barrier(NamedTuple):

@@ -34,12 +34,12 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.stress.multilevel_splitting import MOST, CountedScore, Progress, Score, failure_probability
 from lqrsim.stress.trial_score import normal_tail
 
-MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # share of the best failure in the direction of a ray, from 0 to 98 %
-DISCOUNT = 0.95  # factor of the gradient of earlier rounds, after each round that comes nearer by more than MOVED
-MOVED = 0.01  # share of the distance
+MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # fraction of the best failure in the direction of a ray, from 0 to 98 %
+DISCOUNT = 0.95  # factor of earlier rounds' gradients, after each round that comes nearer by more than MOVED
+MOVED = 0.01  # fraction of the distance
 SPREAD = 0.5  # the length s of the steps of the pairs; each number of e is standard normal, over the root of the size
 TOLERANCE = 0.01  # share of the distance that may be left to gain
-GRID, REFINED = 16, 3  # points on a ray, and how often the grid is refined
+GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,8 @@ PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 def preset(name: str, plant: Plant) -> list[Disturbance]:
     """The disturbances of a preset that the plant supports, in the order in which they act. Each can be scaled by 2.
 
-    Left out are disturbances whose strength depends on the robot or the plan: latency and delay, which come in whole
-    control periods, while the 6 to 7 ms of motion capture are less than half of one; pushes, whose time and direction
+    Presets leave out disturbances whose strength depends on the robot or the plan. Latency and delay come in whole
+    control periods, and the 6 to 7 ms of motion capture are less than half a period. For pushes, time and direction
     matter; and the loss of an actuator, which a quadrotor does not survive. There is no `MotorLag` on a robot whose
     actuators have states of their own: its MJCF has their lag, and a second one is not theirs.
 
