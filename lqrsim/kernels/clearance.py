@@ -4,8 +4,9 @@ The robot is a point at its position, or a set of balls. For balls, `value` and 
 Jacobian in place of state and control; see `augmented_lagrangian.py`.
 
 From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
-table hold from their step on. A row is an obstacle, for the first ball, then for the next; it has margin number `row`
-modulo the margins per step. AT is 0 for a point, and for balls what `places` reads comes before.
+table hold from their step on. There is a row for each obstacle, first for the first ball, then for the next. Its margin
+has the index `row` modulo the number of margins per step. AT is 0 for a point. For balls, the entries before AT are
+those that `places` reads.
 """
 
 from lqrsim.kernels.declarations import ROW, N, stack

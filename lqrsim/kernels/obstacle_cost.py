@@ -1,7 +1,8 @@
 """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. Written in the kernels' subset.
 
-The robot is a point at its position, or balls, over which the cost is summed, too. From AT on, `data` has the numbers
-below, and the tables of obstacles, of which the last holds from its step on. What `places` reads comes before AT.
+The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on, `data` has the
+numbers below, and the tables of obstacles. The last table holds for all later steps. The data for `places` comes before
+AT.
 """
 
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros

@@ -1,8 +1,8 @@
 """Models of all stages of a plan, and the step to their minimum, with or without an active set. The kernels' subset.
 
 The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
-iterations close. Rows are those of all constraints, then the limits of the controls; an active set holds some of them
-at zero. The methods are `solvers/interior_point.py`, `solvers/active_set.py` and `solvers/restoration.py`.
+iterations. The rows are those of all constraints, then the limits of the controls. An active set fixes some of them at
+zero. `solvers/interior_point.py`, `solvers/active_set.py` and `solvers/restoration.py` describe the methods.
 """
 
 from math import inf

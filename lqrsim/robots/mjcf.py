@@ -221,8 +221,9 @@ class MjcfRobot(Robot):
           state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
 
         Returns:
-          (m,), within their limits; where nothing holds it, those with the least sum of squared forces left. Nothing
-          does where an actuator integrates its control, which cannot be 0, and has no actrange: `print(robot)` says so.
+          (m,), within the limits. If no controls hold the robot, those with the least sum of squared remaining forces.
+          An actuator without an actrange that integrates its control, which cannot be 0, is never at rest:
+          `print(robot)` says so.
 
         Raises:
           InputError: the state is not (n,) finite numbers.

@@ -23,7 +23,7 @@ class Holding:
     Attributes:
       controls: (m,), within their limits, that come nearest to holding the robot still.
       activations: (na,), the states of actuators at which they do so: a filter's state is its control, an integrator's
-        has come to.
+        state is the value that it has reached.
       missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
       drifting: (nu,), the actuators whose activation never rests: integrators whose control cannot be 0.
       held: whether the controls hold the robot.

@@ -38,8 +38,8 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
 
     Presets leave out disturbances whose strength depends on the robot or the plan. Latency and delay come in whole
     control periods, and the 6 to 7 ms of motion capture are less than half a period. For pushes, time and direction
-    matter; and the loss of an actuator, which a quadrotor does not survive. There is no `MotorLag` on a robot whose
-    actuators have states of their own: its MJCF has their lag, and a second one is not theirs.
+    matter. A quadrotor does not survive the loss of an actuator. There is no `MotorLag` for a robot whose actuators
+    have their own states, because its MJCF describes their lag.
 
     Args:
       name: calm, light, moderate, strong or severe.
