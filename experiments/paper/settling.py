@@ -37,12 +37,12 @@ class Watched(InteriorPoint):
 
         It keeps its multipliers, and to begin with what it knows of the rows: which of them press.
         """
-        kept = self.point, self._force, self._costates
+        kept = self.point
         cost, arrived = self.stages.trial(plan)
         self.point = self.point._replace(plan=plan, cost=cost, arrived=arrived)
         self._plans.clear()
         self._cross(0.0, 0.0)
-        self.point, self._force, self._costates = kept
+        self.point = kept
         return self._plans[:-1]  # the last is where it goes back to
 
     def _measure(self) -> None:
