@@ -35,8 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Args:
       arguments: the words after `lqrsim` on the command line. By default the arguments of this process, which then
-        handles
-        signals as a command does: it removes unfinished files and ends.
+        handles signals as a command does: it removes unfinished files and ends.
 
     Returns:
       The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or standard output cannot be written;

@@ -2,8 +2,7 @@
 
 An item's name is a hash of everything that it depends on, so it cannot be stale. Its first line contains a checksum, so
 a damaged item counts as missing. A cache that cannot be read or written costs time, never an error. When the items
-exceed
-`LIMIT`, the least recently used are removed.
+exceed `LIMIT`, the least recently used are removed.
 
 Items are programs: compiled functions are run, and sources are executed. The checksum protects against damage, not
 against people: anyone who can write to the folder can run code in the name of its readers.

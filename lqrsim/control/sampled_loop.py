@@ -21,8 +21,7 @@ from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array
 
 # The weight of a predicted chance, as a number of collisions that is combined with the collisions of the trials. If the
-# trials
-# have fewer, the prediction is the more precise of the two.
+# trials have fewer, the prediction is the more precise of the two.
 PRIOR = 4.0
 REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions has a tail probability below this
 

@@ -35,23 +35,20 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
 
     An observation is the measured state, (n,), angles in the representative nearest the plan, followed by the time as a
     fraction of the horizon. An action is a control; it is clipped to the limits, as in `simulate`. The reward is minus
-    the
-    stage cost of the scenario's problem, for the true state and the applied control; the last reward includes minus the
-    final cost. An episode is truncated at the horizon, and terminates with a collision or an unstable simulation.
+    the stage cost of the scenario's problem, for the true state and the applied control; the last reward includes minus
+    the final cost. An episode is truncated at the horizon, and terminates with a collision or an unstable simulation.
 
     Episodes are trials: `reset(seed=s)` begins trial 0 of seed s, and each following `reset()` begins the next trial.
     Each episode is bit-identical to that trial in `simulate` with the same commands.
 
     Options of `reset`, for that episode only: `disturbances` and `strength` as below; `preset`, a name as in
     `lqrsim.disturbances.preset`; `trial`, the number of the trial. The info has `seed`, `trial`, `time` in s, the true
-    `state` (n,)
-    and the `clearance` in m; at the end also `outcome`, as in `Rollout.outcome`, and `is_success`.
+    `state` (n,) and the `clearance` in m; at the end also `outcome`, as in `Rollout.outcome`, and `is_success`.
 
     Args:
       scenario: a reference as on the command line, such as "quadrotor,query=3", or a Scenario.
       solution: a Solution, or the path of a saved solution. Its plan gives the first state, the duration and the
-        reference of
-        disturbances. By default the scenario's problem is solved at the first `reset`.
+        reference of disturbances. By default the scenario's problem is solved at the first `reset`.
       disturbances: a name as in `lqrsim simulate --disturbances`, or a tuple of names and disturbances. strength:
         factor by which the disturbances are scaled.
       actions: "normalized": from -1 to 1, between the limits of each control; "controls": the controls themselves in

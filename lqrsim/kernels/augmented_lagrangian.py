@@ -7,9 +7,9 @@ For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 and for equalities d = 0, with multipliers of either sign, the same without the max: sum -lambda d + mu/2 d^2. At the
 optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is the value
 minus the tolerance to which the constraint is solved. A plan within the tolerance therefore satisfies the constraint
-itself. A
-constraint may have a price, in cost per unit of violation. No force exceeds the price; where it would, the Lagrangian
-is linear. Of the curvature only the part `mu n n'` is used, with n the gradient of d: the rest can be negative.
+itself. A constraint may have a price, in cost per unit of violation. No force exceeds the price; where it would, the
+Lagrangian is linear. Of the curvature only the part `mu n n'` is used, with n the gradient of d: the rest can be
+negative.
 
 `multipliers` is one array per constraint: the penalty mu (0 where the constraint does not act yet), the number of rows
 at a step, the first step at which they act, the margin, which is the tolerance, the price (infinite if there is none),

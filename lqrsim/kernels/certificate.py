@@ -18,9 +18,9 @@ def certify(settings, own, plan, policy, to_go, model, found):
 
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
     later controls respond with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the
-    prediction
-    of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their limits. Cost and
-    decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
+    prediction of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their
+    limits. Cost and decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the
+    cost does not.
 
     Args:
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write

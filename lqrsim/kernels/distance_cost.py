@@ -1,8 +1,8 @@
 """The cost of obstacles at distances from a model. Written in the kernels' subset.
 
 The cost is `weight * sum of exp(-sharpness * distance)` for distances below a cutoff D, and 0 beyond it. The tangent at
-D is subtracted, so that neither the cost nor its slope jumps there. `data` has the data of the
-distances, and from AT on the numbers below. `places` and `places_jacobian` are the distances here.
+D is subtracted, so that neither the cost nor its slope jumps there. `data` has the data of the distances, and from AT
+on the numbers below. `places` and `places_jacobian` are the distances here.
 """
 
 from lqrsim.kernels.declarations import N, places, places_jacobian, stack

@@ -2,8 +2,8 @@
 
 Each function runs the iterations `first` to `last` - 1, and can be called again to continue, because its state is in
 its arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the
-outcome
-(a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or -1.
+outcome (a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or
+-1.
 """
 
 from math import inf, isnan, nan

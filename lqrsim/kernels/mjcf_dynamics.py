@@ -35,12 +35,11 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # mj_step, mj_forwardSkip and the integrator; the last is 0 if parts of a step cannot be called separately. TIMESTEP:
 # timestep of the physics, in s. NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of
 # joints; ACTUATORS: address of the list of actuators that the controls drive. TEAM, JOB: addresses at which helper
-# threads find their work, 0 without helpers; YIELD: the address of the
-# function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics,
-# mj_resetData, mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of
-# bodies that may carry a load, and address of the loads, in kg; the numbers of these bodies and their own masses
-# follow. TABLE: the
-# joints' kind and places in qpos and qvel, three numbers each.
+# threads find their work, 0 without helpers; YIELD: the address of the function that yields to other threads;
+# KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
+# mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of bodies that may carry a load, and
+# address of the loads, in kg; the numbers of these bodies and their own masses follow. TABLE: the joints' kind and
+# places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
 RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29
@@ -185,9 +184,8 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
     """Write the k-th column of the Jacobian. Controls come first: they do not change the stage of velocities.
 
     A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
-    reused.
-    MuJoCo's solver starts at the solution of the unperturbed step. Both sides then end equally near to their solutions,
-    so that the solver's tolerance is not divided by the difference.
+    reused. MuJoCo's solver starts at the solution of the unperturbed step. Both sides then end equally near to their
+    solutions, so that the solver's tolerance is not divided by the difference.
     """
     one, two, nv = at(address), at(address + 8 * SIZE), int(p[NV])
     moved, ahead, behind = stack(W), stack(N), stack(N)

@@ -39,11 +39,9 @@ def newton_iterations(first, last, settings, model, work, memory, log):
     """Newton steps from the plan, each of which lowers its merit.
 
     If no fraction of a step lowers the merit, the step is repeated without second-order terms. If that also fails, the
-    method has stalled.
-    At the end, the value functions are computed as in smoothing, without second-order terms. They are convex, so that
-    the
-    minimum of their sum is at the plan. If it is not, up to MORE further steps follow: in flat directions a plan may be
-    far off although the predicted decrease is small.
+    method has stalled. At the end, the value functions are computed as in smoothing, without second-order terms. They
+    are convex, so that the minimum of their sum is at the plan. If it is not, up to MORE further steps follow: in flat
+    directions a plan may be far off although the predicted decrease is small.
 
     Args:
       settings: IterationSettings. model: ProblemModel. work: SmootherArrays, with the plan.

@@ -20,10 +20,9 @@ class Clearance(KeepsClear, Constraint):
 
         ls.Clearance(scene.world, radius=robot.radius, margin=0.05)
 
-    The constraint does not act at a start that is given exactly. Between two steps a plan can come nearer: by
-    `v^2 dt^2 / 8 r` at the speed v, where r is the sum of the radii of robot and obstacle. It can also step over
-    obstacles thinner than a step. Add an ObstacleCost, even one with a small weight: it guides the
-    search around the obstacles.
+    The constraint does not act at a start that is given exactly. Between two steps a plan can come nearer: by `v^2 dt^2
+    / 8 r` at the speed v, where r is the sum of the radii of robot and obstacle. It can also step over obstacles
+    thinner than a step. Add an ObstacleCost, even one with a small weight: it guides the search around the obstacles.
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.

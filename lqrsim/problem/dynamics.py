@@ -63,9 +63,8 @@ class Dynamics:
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: quantities unknown when planning, such as a wind or the remaining fraction of a motor's force: name
         -> the value that the plan assumes, usually 0 or 1. To f they are parameters. For planning they are constants,
-        so
-        they cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows the
-        names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
+        so they cost no time. `disturbed` makes them parameters, so that they can be estimated. `uncertainty_of` knows
+        the names wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in world axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
       plane: plane of a position of 2 states, such as "xz"; see `Coordinates`. By default the plane that the names of

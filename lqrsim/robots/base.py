@@ -31,8 +31,7 @@ class Robot(abc.ABC):
         default. With balls, the radius is the size of the robot in pictures, and the distance from the goal within
         which the robot has reached it.
       geoms: the colliding geoms, in place of both, for a robot from an MJCF, for which the simulator computes
-        distances.
-        None by default.
+        distances. None by default.
     """
 
     name: str

@@ -2,9 +2,8 @@
 
 The robot touches an obstacle if MuJoCo detects a contact, or if a signed distance minus the radius is negative. The
 distance is measured from the robot's position, or from one of its balls or geoms. Detection uses states without
-obstacle
-contacts, so its result is bit-identical whether or not an obstacle then stops the robot. It checks the knots, the parts
-of a control period that `Physics` has, and straight lines between them.
+obstacle contacts, so its result is bit-identical whether or not an obstacle then stops the robot. It checks the knots,
+the parts of a control period that `Physics` has, and straight lines between them.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """The compiled passes of a problem, and their arguments: addresses of the problem's functions, and its numbers.
 
 Passes and iterations are compiled once per size. Dynamics, each cost term, each constraint and the noise are compiled
-separately, behind the C signatures of `codegen/compiled_module.py`, and called by address.
-Everything that is a number (goal, weights, masses, obstacles, horizon) is an argument.
+separately, behind the C signatures of `codegen/compiled_module.py`, and called by address. Everything that is a number
+(goal, weights, masses, obstacles, horizon) is an argument.
 """
 
 import functools

@@ -390,8 +390,7 @@ class InteriorPoint:
         """Cross over from the barrier to the active set: active rows become equalities. Return whether they were right.
 
         Controls then end exactly at their limits, and multipliers lose the barrier's contribution. Constraints keep a
-        margin for
-        rounding.
+        margin for rounding.
         """
         rows, kept, size, highest = self._rows, self.point, self._rows.size, self._rows.highest
         aim = np.where(rows.equality | rows.limit, 0.0, INSIDE * violation)

@@ -95,13 +95,12 @@ def smooth(
       elastic: the price of violating a constraint, in cost per unit, summed over rows and steps. Constraints whose
         multipliers would exceed the price are violated, and the detail says by how much. None: they must hold.
       noise: replaces the problem's own noise; see `Noise`. The cost is then an expectation, in the log, line searches
-        and
-        the choice among starts.
+        and the choice among starts.
       risk: replaces the problem's own risk; see `Problem`.
       threads: number of starts to run at once; by default the number of processors.
       callback: called with each `Iteration` as it ends; in a search, with iterations of starts that are run to their
-        end.
-        An exception in it ends the solve, as Ctrl-C does; it is raised again, with the best plan so far as `solution`.
+        end. An exception in it ends the solve, as Ctrl-C does; it is raised again, with the best plan so far as
+        `solution`.
 
     Returns:
       A Solution. A hard problem raises no exception: the status says how the solve ended and what to try.
@@ -134,9 +133,8 @@ def smooth_many(
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
     The solutions are identical to the solutions of `smooth`, to the last bit, with any number of threads; only the
-    seconds of an iteration
-    are an average. Constraints are checked after each iteration. Dynamics and costs in plain Python run one at a time,
-    and gain nothing from threads.
+    seconds of an iteration are an average. Constraints are checked after each iteration. Dynamics and costs in plain
+    Python run one at a time, and gain nothing from threads.
 
     Args:
       problems: problems of one structure or of many; each structure is compiled once.

@@ -140,8 +140,7 @@ def comparisons(table: Table) -> list[Comparison]:
     """Compare the first policy of the table with each other policy, for every sweep and strength that both have.
 
     Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
-    Student's. If
-    all trials of both policies are the same run, there is nothing to test.
+    Student's. If all trials of both policies are the same run, there is nothing to test.
 
     Raises:
       InputError: two policies have different trials.

@@ -82,8 +82,7 @@ def run_campaign(
       batch: number of trials that a worker simulates together; affects only time and memory.
       solution: a Solution, or the path of one, to run instead of solving the scenario. A solution of `ilqr` replaces
         the solution of the policy "ilqr"; any other solution replaces the solutions of all other policies. It is stored
-        in the
-        folder.
+        in the folder.
       scheduler: address of a dask cluster that does the work instead of processes on this machine.
       progress: called with the number of finished trials and the number of all trials, at the start and after each
         shard.

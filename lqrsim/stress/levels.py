@@ -4,10 +4,9 @@ A pilot search finds a candidate by steps and bisection, with the same random nu
 test fixed fractions of that level, from the smallest up, each with the whole confidence, until a test fails; the last
 level that passed is the result. The order is fixed before the fresh trials run, and a level is tested only if all
 smaller levels passed. A result is therefore wrong only if the first level with too low a rate passes its test, which is
-as improbable as
-that test allows. The confidence need not be divided among the levels (the fixed-sequence procedure; Maurer, Hothorn &
-Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided bound of Clopper and
-Pearson is at least the rate.
+as improbable as that test allows. The confidence need not be divided among the levels (the fixed-sequence procedure;
+Maurer, Hothorn & Lehmacher, 1995). The tests may share their trials. They are exact: a level passes if the one-sided
+bound of Clopper and Pearson is at least the rate.
 """
 
 from collections.abc import Callable

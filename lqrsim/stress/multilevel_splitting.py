@@ -3,20 +3,18 @@
 A trial is a function of a vector z of standard normal numbers (trial_score.py), and fails if its score is positive. A
 pilot run finds levels of the score, each exceeded by a fraction of about `keep` of the vectors above the previous
 level, and a step size for each level. Each repetition uses these levels and step sizes: it begins with N vectors; those
-above the level
-replace the others; then all are moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi. A step is
-rejected if the score falls below the level, so that the steps preserve the distribution above the level. The estimate
-is the product of the fractions above each level. With levels and step sizes fixed beforehand it is unbiased, for any
-number of particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2). Levels taken from the particles
-themselves, as in subset simulation, would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics
-and Computing 22, 2012).
+above the level replace the others; then all are moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b
+xi. A step is rejected if the score falls below the level, so that the steps preserve the distribution above the level.
+The estimate is the product of the fractions above each level. With levels and step sizes fixed beforehand it is
+unbiased, for any number of particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2). Levels taken
+from the particles themselves, as in subset simulation, would bias it by the order of 1/N (Cerou, Del Moral, Furon &
+Guyader, Statistics and Computing 22, 2012).
 
 The interval uses the relative error. The standard deviation of a product grows with its mean, so repetitions that
 happen to be low also vary too little, and Student's interval about them misses the probability. The ratio of standard
 deviation and mean does not depend on the mean. The interval therefore contains each probability p from which the mean
-is at most
-t standard errors away, with the standard error that belongs to p. It is not symmetric. If the repetitions vary so much
-that they give no upper bound, it ends at 1.
+is at most t standard errors away, with the standard error that belongs to p. It is not symmetric. If the repetitions
+vary so much that they give no upper bound, it ends at 1.
 """
 
 from collections.abc import Callable

@@ -169,8 +169,8 @@ def bootstrap(
     """A statistic of paired samples, (K,) each, with its percentile bootstrap interval.
 
     Args:
-      statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example
-        `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
+      statistic: a function of the samples and `axis`, as in `scipy.stats.bootstrap`; for example `lambda a, b, axis:
+        a.mean(axis) / b.mean(axis)`.
       samples: numbers (K,); row i of each belongs to the same trial.
       confidence: confidence of the interval.
       resamples: number of bootstrap samples.

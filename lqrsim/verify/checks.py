@@ -250,8 +250,7 @@ def _silhouettes(
 FEWEST_PIXELS = 20  # of the tracked object; with fewer, the centre is too uncertain
 LEAST_SHARE = 0.5  # fraction of the mark that must be visible; the rest may be outside the picture
 # Green minus the larger of red and blue: a pixel below EMPTY does not count, a pixel above FULL counts fully. Video
-# blurs
-# the edge of the mark, and mixes the colours of overlays into its surroundings.
+# blurs the edge of the mark, and mixes the colours of overlays into its surroundings.
 EMPTY, FULL = 0.2, 0.9
 
 
