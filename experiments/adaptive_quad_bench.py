@@ -1,7 +1,7 @@
 """AdaptiveQuadBench (arXiv 2510.03471) on RotorPy's wheel: our laws beside RotorPy's, on the same trials.
 
     pip install 'lqrsim[rotorpy]'
-    python experiments/adaptive_quad_bench.py                        # some forty minutes
+    python experiments/adaptive_quad_bench.py                        # a quarter of an hour
     python experiments/adaptive_quad_bench.py --sections when2fail --kinds wind torque    # some of it
     python experiments/adaptive_quad_bench.py --quick
 

@@ -1,7 +1,7 @@
 """Plans from our model, run in simulators that we did not write: RotorPy's Hummingbird, crazyflow's Crazyflie.
 
     pip install 'lqrsim[rotorpy,crazyflow]'
-    python experiments/other_simulators.py                         # some forty minutes
+    python experiments/other_simulators.py                         # a quarter of an hour
     python experiments/other_simulators.py --simulators rotorpy    # one of them
     python experiments/other_simulators.py --quick
 

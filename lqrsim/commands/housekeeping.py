@@ -44,7 +44,7 @@ class Reproduce:
     """Reproduce the paper's results and check its statements.
 
     Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes some hours,
-    the longest being robust_policies and adaptive_quad_bench. Includes other solvers and controllers with the extra
+    the longest being robust_policies and solver_league. Includes other solvers and controllers with the extra
     bench, other simulators with rotorpy and crazyflow, and an emulated board with arm-none-eabi-gcc and
     qemu-system-arm. Programs that are not installed are skipped, and named.
 

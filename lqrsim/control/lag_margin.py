@@ -1,15 +1,16 @@
-"""A margin against a lag that is stated and is not there.
+"""A margin against a stated lag that does not exist.
 
-A filter and a law that are told of a lag make up for it: the law asks for more, and the filter takes what it did not
-expect for actuators that run ahead of their commands. Without the lag, both are too much. Such a loop may be unstable
-with any tolerances, and the robot leaves its plan even undisturbed. So a design is predicted without the lag, too. If
-that is much worse, milder designs compete with it: the filter assumes noise on the controls that does not pass through
-the actuators, which is what an unknown lag looks like, and it may be told of a part of the lag only. Chosen is the
-least chance of failure if the lag may be there, or not, among those that stay about as near to the plan where it is
-there. A lag of several control periods leaves little choice: then a robot without it keeps near its plan, but may miss
-a goal that asks for more.
+A filter and a law that are told of a lag compensate for it: the law commands more, and the filter explains unexpected
+motion by actuators that run ahead of their commands. Without the lag, both overcompensate. Such a loop may be unstable
+with any tolerances, and the robot then leaves its plan even undisturbed.
 
-Where a design does well without its lag, as those of the quadrotor do, nothing is changed.
+Each design is therefore also predicted without the lag. If that is much worse, milder designs compete with it: the
+filter assumes noise on the controls that bypasses the actuators, which is the effect of an unknown lag, and it may be
+told of only a part of the lag. Among the designs that stay about as near to the plan if the lag exists, the one with
+the least chance of failure with and without the lag is chosen. A lag of several control periods leaves little choice:
+without it the robot stays near its plan, but may miss its goal.
+
+Designs that do well without their lag, such as those for the quadrotor, stay as they are.
 """
 
 from collections.abc import Callable
@@ -28,18 +29,18 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 
-# What a failure without the lag counts, relative to one with it. A choice of ours: with more, designs give up what they
-# have with the lag.
+# Weight of a failure without the lag, relative to a failure with it. The value is our choice: with a larger one, designs
+# lose performance with the lag.
 ABSENT = 0.3
-# How much worse a design may be without the lag before others compete with it, as a chance of failure; a tube of six
-# times the width is as bad.
+# The increase in the chance of failure without the lag from which other designs compete; a tube of six times the width
+# counts as much.
 CLIFF = 0.1
-# What milder filters are told: a share of the stated lag; and noise that does not pass through the actuators, relative
-# to the tolerated effort and to the lag's share of it.
+# What milder filters are told: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
+# tolerated effort and to the lag's share of it.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
-# How much wider the tube may be where the lag is there, relative to the narrowest.
+# The largest width of the tube with the lag, relative to the narrowest.
 WIDER = 1.25
-GONE = Prediction(chance=1.0, width=1e30, saturation=1.0)  # of a loop whose moments are not finite
+GONE = Prediction(chance=1.0, width=1e30, saturation=1.0)  # for a loop whose moments are not finite
 
 
 class Design(NamedTuple):
