@@ -132,7 +132,7 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
         ({"frames": 0}, "metadata: VideoMetadata: frames: got 0"),
         ({"rate": "30/0"}, "damaged"),
         ({"markers": []}, "whose parts do not fit together"),
-        ({"panes": [{"left": 0}]}, r"metadata\.panes\.0\.top: got none"),
+        ({"panes": [{"left": 0}]}, r"metadata\.panes\.0\.top: got nothing, want this field"),
     ]:
         with pytest.raises(ls.InputError, match=message):
             VideoMetadata.from_json(json.dumps(good | change))

@@ -99,7 +99,7 @@ def test_derivatives_beside_a_jump_are_those_of_free_flight(kind: str, mass: flo
 
 
 @settings(max_examples=8)
-@given(mass=MASSES, speed=SPEEDS, number=st.integers(0, 3), part=st.floats(0.1, 0.9))
+@given(mass=MASSES, speed=st.floats(0.2, 1.2), number=st.integers(0, 3), part=st.floats(0.1, 0.9))  # in sight
 def test_what_is_before_a_jump_is_free_flight(mass: float, speed: float, number: int, part: float) -> None:
     begin = 1 - (number - part) * H * speed  # it is beyond its limit from this physics step on
     switches = modes_of(robot_of("slide", mass)).step(np.array([begin, speed]), np.array([0.0]))[1]

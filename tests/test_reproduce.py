@@ -75,7 +75,7 @@ def test_other_results_are_kept_on_request(scripts: Path, tmp_path: Path, capsys
     assert "--keep: got" in capsys.readouterr().err  # there is nothing to keep yet
     assert main(["reproduce", "table_1", "--out", str(out)]) == 0
     assert main(["reproduce", "figure_2", "--quick", "--keep", "--out", str(out)]) == 2
-    assert "got results without --quick" in capsys.readouterr().err
+    assert "written without --quick, want the same option" in capsys.readouterr().err
     before = json.loads((out / "results.json").read_text())
     (out / "results.json").write_text(json.dumps(before | {"machine": "another machine"}))
     assert main(["reproduce", "figure_2", "--keep", "--out", str(out)]) == 0

@@ -60,7 +60,7 @@ def test_sizes_are_those_of_numpy() -> None:
 
 
 def test_what_can_not_be_given_is_named() -> None:
-    with pytest.raises(ls.InputError, match="draws with poisson"):
+    with pytest.raises(ls.InputError, match="draws by poisson"):
         PrescribedDraws(np.zeros(3)).poisson(2.0)
     with pytest.raises(ls.InputError, match="numbers: got 3"):
         PrescribedDraws(np.zeros(3)).standard_normal(4)
