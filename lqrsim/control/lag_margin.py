@@ -29,8 +29,8 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 
-# Weight of a failure without the lag, relative to a failure with it. The value is our choice: with a larger one, designs
-# lose performance with the lag.
+# Weight of a failure without the lag, relative to a failure with it. The value is our choice: with a larger one,
+# designs lose performance with the lag.
 ABSENT = 0.3
 # The increase in the chance of failure without the lag from which other designs compete; a tube of six times the width
 # counts as much.
