@@ -396,7 +396,7 @@ def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
 
 
 def test_a_policy_for_another_robot_is_refused(cage):
-    with pytest.raises(InputError, match=r"^controller: got one with the states x, y, heading, want .*, as robot"):
+    with pytest.raises(InputError, match=r"^controller: got a policy with the states x, y, heading, want .*, as robot"):
         simulate(cage, weave(5))
 
 

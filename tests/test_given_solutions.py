@@ -270,12 +270,12 @@ def test_what_does_not_fit_is_refused_by_name(
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
             _ = ls.stress.ReliabilityProblem(DRIVE, solution=solution).score
     assert not (tmp_path / "out").exists()
-    with pytest.raises(ls.InputError, match=r"^solution: got a solution of smooth with ilqr, want one of smooth"):
+    with pytest.raises(ls.InputError, match=r"^solution: got a solution of smooth with ilqr, want it with smooth"):
         ls.stress.run_campaign(
             dataclasses.replace(campaign, policies=("ilqr",)), tmp_path / "out", workers=0, solution=stored
         )
     baseline = ls.ilqr(problem, max_iterations=1)
-    with pytest.raises(ls.InputError, match=r"^solution: got a solution of ilqr with smooth, want one of ilqr"):
+    with pytest.raises(ls.InputError, match=r"^solution: got a solution of ilqr with smooth, want it with ilqr"):
         _ = ls.stress.ReliabilityProblem(DRIVE, solution=baseline).score
     assert not (tmp_path / "out").exists()
 

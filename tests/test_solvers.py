@@ -345,6 +345,8 @@ class TestProgress:
         solution = solver(slow)
         told = 0
         for record in caplog.records:
+            if record.getMessage().startswith("compiling "):  # if nothing is cached
+                continue
             line = re.fullmatch(rf"{name}: \d+ s, (.*)", record.getMessage())
             assert line
             if line[1] != "in the first iteration":
@@ -357,9 +359,9 @@ class TestProgress:
 
     def test_it_says_what_is_left_of_the_time(self, slow: ls.Problem, caplog: pytest.LogCaptureFixture) -> None:
         ls.smooth(slow, time_limit=5000.2)
-        assert re.fullmatch(
-            r"smooth: \d+ s, in the first iteration; at most 5000 s left", caplog.records[0].getMessage()
-        )
+        told = [record.getMessage() for record in caplog.records]
+        first = next(line for line in told if not line.startswith("compiling "))  # if nothing is cached
+        assert re.fullmatch(r"smooth: \d+ s, in the first iteration; at most 5000 s left", first)
 
     def test_whoever_hears_of_iterations_is_not_told(
         self, slow: ls.Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture

@@ -389,7 +389,7 @@ def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:
 def test_a_solution_of_another_system_is_refused() -> None:
     system, _ = drawn(0, 1, unstable=False)
     other, _ = drawn(2, 1, unstable=False)
-    with pytest.raises(ls.InputError, match="track: solution: got one with the states"):
+    with pytest.raises(ls.InputError, match="track: solution: got a plan with the states"):
         ls.track(system.problem, other.solution, tolerate=1.0, effort=1.0)
     lost = ls.Trajectory(np.full_like(system.plan.states, np.nan), system.plan.controls, DT)
     ended = dataclasses.replace(system.solution, status=ls.Status.NOT_FINITE, trajectory=lost)

@@ -449,7 +449,7 @@ def raise_again(functions: Sequence[UserFunction]) -> None:
 
 
 def interrupt_of(functions: Sequence[UserFunction]) -> BaseException | None:
-    """Ctrl-C, or the like, if one of the functions that compiled code called got it."""
+    """The KeyboardInterrupt, or other exception that is no error, of a function that compiled code called; or None."""
     raised = (function.raised for function in functions)
     return next((error for error in raised if error is not None and not isinstance(error, Exception)), None)
 

@@ -36,7 +36,7 @@ ABSENT = 0.3
 # counts as much.
 CLIFF = 0.1
 # What milder filters are told: a fraction of the stated lag, and noise that bypasses the actuators, relative to the
-# tolerated effort and to the lag's share of it.
+# tolerated effort times `Lag.mean`.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
 # The largest width of the tube with the lag, relative to the narrowest.
 WIDER = 1.25

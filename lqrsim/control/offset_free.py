@@ -51,10 +51,9 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
     is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
     so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
-    and predicted
-    states by at least 2 % of what that effort moves them in two periods. Where a robot would leave its plan without a
-    lag that is stated, filter and law are milder, and do about as well with it: see `lag_margin.py`.
-    `model.uncertainty` is the uncertainty that the filter assumes.
+    and predicted states by at least 2 % of what that effort moves them in two periods. If the robot would leave its
+    plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
+    `lag_margin.py`. `model.uncertainty` is the uncertainty that the filter assumes.
 
     Args:
       problem: the problem that was solved.
@@ -67,8 +66,8 @@ class OffsetFree(Controller):
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: time in s; by default 5 s, or the plan's horizon if that is shorter. np.inf takes the uncertainty as
-        stated: constants do not change, what varies has the mean zero, so that a steady disturbance leaves an error,
-        and a lag is there.
+        stated: constants do not change, what varies has the mean zero, and a stated lag exists. A steady disturbance
+        then leaves an error.
       record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
       replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
         simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the

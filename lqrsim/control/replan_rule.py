@@ -226,7 +226,7 @@ class ReplanRule:
         check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
         check_kind(f"{who}: solution", solution, Plan, "its Solution, or another Plan")
         plan, want = solution.trajectory, spaces_of(problem.dynamics)
-        check_same_system(f"{who}: solution", "one", spaces_of(solution.policy), want, "the problem")
+        check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
             raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")

@@ -161,7 +161,7 @@ def check_plan(who: str, problem: Problem, solution: Solution) -> None:
     check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
     check_kind(f"{who}: solution", solution, Solution, "a Solution of it")
     plan, want = solution.trajectory, spaces_of(problem.dynamics)
-    check_same_system(f"{who}: solution", "one", spaces_of(solution.policy), want, "the problem")
+    check_same_system(f"{who}: solution", "a plan", spaces_of(solution.policy), want, "the problem")
     if plan.dt != problem.dt:
         raise InputError(
             f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"

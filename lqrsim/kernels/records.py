@@ -396,9 +396,8 @@ def _row(*names: str) -> np.dtype[np.void]:
 # many remain, how many there will be the next time, and how many others there were since; final_gap: gap between
 # smoothed states and plan at the end.
 # For Newton's method: fraction of second-order terms in the next pass; the step at which the last pass failed; its
-# predicted
-# slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible cost; and
-# the damping without which the pass has no minimum.
+# predicted slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible
+# cost; and the damping without which the pass has no minimum.
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "idle", "ilqr_left", "ilqr_next", "since_ilqr",
     "final_gap", "started", "watched", "share", "failed", "decrease", "promised", "negligible", "damping",

@@ -1,4 +1,6 @@
-"""Models of all stages of a plan, and the step to their minimum, with or without an active set. The kernels' subset.
+"""Models of all stages of a plan, and the step to their minimum, with or without an active set.
+
+Written in the kernels' subset.
 
 The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
 iterations. The rows are those of all constraints, then the limits of the controls. An active set fixes some of them at

@@ -346,10 +346,11 @@ def check_same_system(field: str, what: object, got: Spaces, want: Spaces, whose
     """Check that states and controls have the same names.
 
     Args:
-      field: for messages. what: it was given. whose: the wanted coordinates are.
+      field: field in messages. what: description of the given object, such as "a policy". got, want: its coordinates,
+        and the required ones. whose: name of the owner of the required coordinates.
 
     Raises:
-      InputError: they have not.
+      InputError: names differ.
     """
     for kind, one, other in zip(("states", "controls"), got, want, strict=True):
         if one.names != other.names:

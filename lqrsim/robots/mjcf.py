@@ -403,9 +403,9 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        Joints that an equality constraint couples to others follow these, unless they are named; those of a closed loop
-        follow from the MJCF's rest, and as little as they must. Activations of actuators are those that hold the robot
-        there, unless they are named or the keyframe's.
+        A joint that an equality constraint couples to another follows it, unless it is named. The joints of a closed
+        loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of actuators are
+        those that hold the robot, unless they are named or given by the keyframe.
 
         Args:
           keyframe: its name; None for the MJCF's rest.

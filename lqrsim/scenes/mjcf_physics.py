@@ -122,7 +122,7 @@ class MjcfPhysics:
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:
-    """Raises InputError for features that have their own states, or make states depend on each other."""
+    """Raises InputError if there is no actuator, or for features that have their own states."""
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
         "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),

@@ -194,7 +194,7 @@ class _Sample(NamedTuple):
 def _checked(problem: Problem, robot: Robot) -> Problem:
     """The problem. Raises InputError unless it has the robot's states and controls."""
     check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
-    check_same_system("problem", "one", spaces_of(problem.dynamics), spaces_of(robot.dynamics), "the robot")
+    check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces_of(robot.dynamics), "the robot")
     return problem
 
 

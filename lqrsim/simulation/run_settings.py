@@ -131,7 +131,9 @@ def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinate
     spaces = check_items(f"{kind}.coordinates", controller.coordinates, Coordinates, wanted_kind)
     if len(spaces) != 2:
         raise InputError(f"{kind}.coordinates: got {len(spaces)}, want two: of the states, of the controls")
-    check_same_system("controller", "one", (spaces[0], spaces[1]), spaces_of(dynamics), f"robot {plant.robot.name}")
+    check_same_system(
+        "controller", "a policy", (spaces[0], spaces[1]), spaces_of(dynamics), f"robot {plant.robot.name}"
+    )
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
         raise InputError(

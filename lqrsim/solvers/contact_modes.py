@@ -40,7 +40,7 @@ ENOUGH = 0.1  # fraction of the predicted decrease that a step must achieve
 PUSHES = 10  # times that a step is pushed back to its side
 HALVINGS = 8  # number of halvings of a step before the damping grows
 FLAT = 0.05  # least curvature of the second step, relative to that of the first
-SHORT, SKEW = 1e-6, 1e-6  # steps of a period, and cosines between what they mend and themselves, that say nothing
+SHORT, SKEW = 1e-6, 1e-6  # least change of a point, and least cosine of it with its correction, that count
 DAMPING, MOST = 1e-3, 1e6  # weight of the model's own curvature if steps fail: the first and the largest
 ROUNDS = 50  # largest number of rounds in which switches are added to a quadratic program
 SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its range
@@ -275,9 +275,10 @@ class Descent:
     def _descended(self, lacking: Array | None) -> CostedPlan | None:
         """A step that lowers the cost in the plan's mode; None if none was found with this damping, which grows."""
         damped = self.model.hessian + self._damping * np.diag(np.diag(self.model.hessian))
-        plans = [self._stepped(damped)]
-        if lacking is not None and lacking.any():
-            with contextlib.suppress(np.linalg.LinAlgError):  # without damping it need not be positive definite
+        plans = list[CostedPlan | None]()
+        with contextlib.suppress(np.linalg.LinAlgError):  # without damping they need not be positive definite
+            plans.append(self._stepped(damped))
+            if lacking is not None and lacking.any():
                 plans.append(self._stepped(bent(damped, lacking)))
         best = min((one for one in plans if one is not None), key=lambda one: one.cost, default=None)
         if best is None:

@@ -340,7 +340,9 @@ def smooth_continuous(
     if problem.noise is not None:
         raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
     if problem.dynamics.discrete:
-        raise InputError(f"dynamics: got {problem.dynamics.name}, which has no rate xdot; use `smooth`")
+        raise InputError(
+            f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
+        )
     limits = _Limits(
         check_number("tolerance", tolerance, above=0.0),
         check_number("gap_tolerance", gap_tolerance, above=0.0),

@@ -1,9 +1,8 @@
 """The stages of a problem as quadratic models about a plan, and the step to the minimum of these models.
 
 All constraints and control limits are rows of numbers, which must be >= 0 for an inequality and = 0 for an equality.
-The
-plan need not satisfy the dynamics; a step closes the gaps between its states. The users of the stages decide what to do
-with the rows: the interior point, the active set, and the restoration.
+The plan need not satisfy the dynamics; a step closes the gaps between its states. The users of the stages decide what
+to do with the rows: the interior point, the active set, and the restoration.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -26,6 +26,7 @@ The budget of each start is `max_iterations`; all starts share one deadline (`bu
 (`certify.py`).
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -357,7 +358,9 @@ class Search:
         best = self.best[1]
         run = self._another(policy_of(best, "the best plan"))
         run.budget.report_to(self._callback)
-        with self._problem.dynamics.solving(self._threads):
+        found = None
+        # A cost that is not curved in all controls has no descent of this kind.
+        with self._problem.dynamics.solving(self._threads), contextlib.suppress(np.linalg.LinAlgError):
             found = keep_modes(run, best)
         if found is not None:
             self._named.append(("the best plan, within its contact modes", run))

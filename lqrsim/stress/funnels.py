@@ -69,10 +69,9 @@ def funnel(
     """Find the largest ellipsoids about a plan from which runs reach the goal with a given success rate.
 
     The trials are simulated, so limits, obstacles and everything else that ends a trial are taken into account. The
-    rate is over
-    states drawn uniformly in the ellipsoid, and over the disturbances; see `Funnel`. With the given confidence all
-    levels are right at once: the error probability is divided among the knots. A level of 0, with its reason, means
-    that no level was certified.
+    rate is over states drawn uniformly in the ellipsoid, and over the disturbances; see `Funnel`. With the given
+    confidence all levels are right at once: the error probability is divided among the knots. A level of 0, with its
+    reason, means that no level was certified.
 
     A run that begins at a later knot is assumed to have followed the plan until then; see `simulate_from`.
 

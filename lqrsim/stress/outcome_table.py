@@ -95,7 +95,7 @@ def outcomes(
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
     if problem is not None:
-        check_same_system("problem", "one", spaces_of(problem.dynamics), spaces_of(rollout), "the rollout")
+        check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces_of(rollout), "the rollout")
     if goal_radius is not None or goal_tolerance is not None:
         rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))
     plan, ended, counts = rollout.plan, rollout.ended, rollout.counts

@@ -126,7 +126,7 @@ def check_used(given: Solution | None, policies: Sequence[str]) -> None:
     users = [policy for policy, kind in POLICY_KINDS.items() if kind.solver == solver_of(given)]
     if not {*users} & {*policies}:
         raise InputError(
-            f"solution: got a solution of {given.solver} with {', '.join(policies)}, want one of {', '.join(users)}"
+            f"solution: got a solution of {given.solver} with {', '.join(policies)}, want it with {', '.join(users)}"
         )
 
 

@@ -255,7 +255,7 @@ EMPTY, FULL = 0.2, 0.9
 
 
 def mask_centre(mask: npt.NDArray[np.bool_]) -> Array:
-    """The mean pixel (2,) of a mask (height, width), column and row; NaN if it has too few"""
+    """The mean pixel (2,) of a mask (height, width), column and row; NaN if it has too few pixels."""
     rows, columns = np.nonzero(mask)
     return np.array([columns.mean(), rows.mean()]) + 0.5 if len(rows) >= FEWEST_PIXELS else np.full(2, np.nan)
 
@@ -407,7 +407,7 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
     Args:
       frames: number of frames that were decoded.
       off: largest error of the time of a frame, in seconds.
-      area: area in pixels of the smallest mark, in
+      area: area of the smallest mark, in pixels.
     """
     return (
         Criterion(
