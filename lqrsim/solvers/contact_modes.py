@@ -7,8 +7,8 @@ control:
 
 - The model of the cost is that of iLQR, in the offsets of the policy with its gains held, and derivatives are those of
   the plan's own mode. The step minimises it with all switches on their sides, linearised: a quadratic program.
-- A second step knows of curvature, too. MuJoCo has no second derivatives, but how a period's Jacobian differs between
-  the last plans, times the multipliers, says what they are along the way: secants. The better of both steps counts.
+- A second step includes curvature. MuJoCo has no second derivatives. Secants replace them: the changes of a period's
+  Jacobian between the last plans, times the multipliers. The better of both steps counts.
 - A step that crosses a switch after all, because it is curved, is pushed back to its own side.
 - Where no such step lowers the cost, each switch that the plan is pressed against is crossed on its own. If the cost is
   lower there, the descent goes on from there.
@@ -194,12 +194,13 @@ Linearized = tuple[Array, list[Period]]  # points and periods of a plan
 
 
 def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: ModeStep) -> Array:
-    """What the model's Hessian lacks of that of the Lagrangian, (T m, T m): second derivatives of periods and switches.
+    """The part of the Lagrangian's Hessian that the model lacks, (T m, T m): second derivatives of periods, switches.
 
-    For each period by symmetric updates of rank one (SR1), from zero, over the earlier plans in whose mode it was.
+    Each period's matrix is built by symmetric updates of rank one (SR1), from zero, over the earlier plans in which the
+    period had the same mode.
 
     Args:
-      earlier: linearised plans, the last one last. step: has the multipliers.
+      earlier: linearised plans, the latest last. step: the step whose multipliers are used.
     """
     n = len(model.last[1])
     lacking, costate, pulls = np.zeros_like(model.hessian), model.last[1], model.sides * step.multipliers
@@ -231,7 +232,7 @@ def secant_curvature(model: ModeModel, earlier: Sequence[Linearized], step: Mode
 
 
 def bent(curvature: Array, lacking: Array) -> Array:
-    """The sum of a positive definite matrix and another one, with negative curvature turned round, and none flat."""
+    """The sum of a positive definite and another matrix, with negative eigenvalues reversed and none near zero."""
     parts, vectors = scipy.linalg.eigh(lacking, curvature)
     vectors = curvature @ vectors
     return (vectors * np.maximum(np.abs(1 + parts), FLAT)) @ vectors.T
@@ -322,7 +323,7 @@ class Descent:
                     held = (across | held) & (np.isfinite(values) | ~seen)
                     short = np.where(seen, sides * aim - values, 0.0)
                     crossed, jumped = crossed or bool(across.any()), bool((across & ~period.switches.forces).any())
-                # What comes after a jump says nothing: switches that are pressed there are to be where they were meant.
+                # The rest of a plan after a jump is meaningless: pressed switches there keep their intended values.
                 rows += (model.first[t] + np.flatnonzero(held)).tolist()
                 missing += short[held].tolist()
             if not crossed:
