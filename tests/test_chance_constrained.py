@@ -165,6 +165,16 @@ def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -
     assert cost.weight == plan.weight
     assert f"with {plan.weight:g} times the weight of obstacles" in str(plan)
 
+    # The cost is that of the problem as given: in NumPy, to rounding. Obstacles cost nothing at the given start.
+    states, controls = plan.solution.trajectory.states, plan.solution.trajectory.controls
+    away = np.hypot(states[1:-1, None, 0], states[1:-1, None, 1] - np.array([-1.0, 1.0])) - 0.6 - RADIUS
+    assert isinstance(narrow.final_cost, ls.QuadraticCost)
+    end = states[-1] - np.asarray(narrow.final_cost.about)
+    own = 0.5 * (controls**2).sum() + np.exp(-10.0 * away).sum() + 0.5 * end @ narrow.final_cost.weight @ end
+    np.testing.assert_allclose(plan.cost, own, rtol=1e-9)
+    assert plan.cost < plan.solution.cost
+    assert plan.rounds[-1][2] == plan.cost
+
 
 def test_a_margin_of_each_knot_is_kept(problem: ls.Problem) -> None:
     """At each knot but the given first, against the closed form: 1e-6 m, to which constraints are solved."""
