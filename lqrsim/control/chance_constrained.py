@@ -131,7 +131,7 @@ def smooth_chance_constrained(
       uncertainty: the uncertainty in a run; see `uncertainty_of`.
       chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
-        an OffsetFree for the uncertainty, with tolerances chosen for the second plan.
+        an OffsetFree for the uncertainty, with tolerances chosen for each plan.
       rounds: the largest number of plans with clearances.
       progress: called with the number of plans that are done, the largest possible number of plans, and a text about
         the last one. The largest number counts plans with margins and plans with heavier obstacles.
@@ -221,7 +221,6 @@ class _Search:
         self.make, self.surroundings = make, surroundings
         self.plans: list[SafePlan] = []
         self.margin = np.zeros((1, 1))  # margin of the last plan, (T+1, O)
-        self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
         # Numbers of standard deviations: the largest that is too small, the smallest that is enough, and the smallest
         # for which no plan was found.
@@ -294,10 +293,7 @@ class _Search:
     def _controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
         if self.make is not None:
             return self.make(problem, solution)
-        law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
-        if len(self.plans) == 1:  # one law for all later plans, so that the plan with more room is safer
-            self.tolerate = tuple((law.weights.state**-0.5).tolist())
-        return law
+        return OffsetFree(problem, solution, self.uncertainty)
 
     def _spread(self, plan: SafePlan) -> Spread:
         """Standard deviations of the clearances along the plan, (T+1, O)."""
