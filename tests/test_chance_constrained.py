@@ -217,3 +217,12 @@ def test_without_obstacles_there_is_nothing_to_ask(problem: ls.Problem) -> None:
     free = ls.Problem(**(fields(problem) | changed))
     with pytest.raises(ls.InputError, match="without obstacles"):
         ls.smooth_chance_constrained(free, UNCERTAINTY)
+
+
+def test_the_law_is_chosen_for_the_plan_that_it_runs(problem: ls.Problem) -> None:
+    """With more room a gentler law fails less often than the one that was chosen for a plan with less."""
+    strong = Uncertainty(start=0.02, control=4.0, measurement=0.05)
+    plan = ls.smooth_chance_constrained(problem, strong, chance=1e-2)
+    assert len(plan.rounds) > 2
+    assert isinstance(plan.controller, ls.OffsetFree)
+    assert plan.controller.digest == ls.OffsetFree(plan.problem, plan.solution, strong).digest
