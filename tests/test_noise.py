@@ -242,7 +242,7 @@ def test_a_file_says_what_the_noise_was(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ls.Noise(shaken), "^Noise: size: got None, want a whole number >= 1"),
+        (lambda: ls.Noise(shaken), "^Noise: size: got none, want k, the number of entries of w"),
         (lambda: ls.Noise([1.0, 2.0]), r"^Noise: function: got shape \(2,\), want"),
         (lambda: ls.Noise(np.eye(2), size=2), "^Noise: size: got 2 beside a matrix, want none$"),
         (lambda: ls.Noise(shaken, size=3, depends_on=("x0",)), "^Noise: depends_on: .* want none: it is derived$"),
