@@ -140,11 +140,10 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     now = [0.0]
     clock = SimpleNamespace(perf_counter=lambda: now[0])
     monkeypatch.setattr(budget, "time", clock)
-    monkeypatch.setattr(free_duration, "time", clock, raising=False)
 
-    def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
+    def solve(fixed: ls.Problem, settings: SmootherSettings, stop: budget.Stop) -> ls.Solution:
         now[0] += 100.0
-        return strategy.solve(fixed, settings)
+        return strategy.solve(fixed, settings, stop=stop)
 
     solution = free_duration.solve_for_duration(
         problem(), SmootherSettings(time_limit=1e6), solve, attentive=False, callback=None
@@ -154,9 +153,33 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     assert max(one.seconds for one in solution.iterations) < 50.0
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9])
+def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """On a clock that advances whenever it is read, so that a solve takes the same time on every machine.
+
+    The stated second is too short, so most of the time is that of the solve for it. To return the plan that was found
+    takes some more readings, however long the limit is.
+    """
+    now = [0.0]
+
+    def read() -> float:
+        now[0] += 1.0
+        return now[0]
+
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
+    short, options = dataclasses.replace(problem(), dt=1 / 20), SmootherSettings()
+    assert strategy.solve(short, options).success
+    whole, now[0] = now[0], 0.0
+    limited = strategy.solve(short, dataclasses.replace(options, time_limit=share * whole))
+    assert limited.status is Status.TIME_LIMIT
+    assert now[0] <= share * whole + 40
+    assert whole > 500
+
+
 def test_a_duration_ends_at_its_bound() -> None:
     solution = ls.smooth(problem(duration=(3.0, 5.0)))
     assert solution.trajectory.horizon == pytest.approx(3.0, abs=1e-7)
+    assert "\n  duration:  3 s, free from 3 to 5 s, at a price of 1 a second\n" in str(solution)
     solution = ls.smooth(problem(weight=1.0, duration=(1.0, 5.0), time_weight=0.0))
     assert solution.trajectory.horizon == pytest.approx(5.0, abs=1e-6)
 
