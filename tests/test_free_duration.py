@@ -1,6 +1,7 @@
 """A final time that is free: closed forms, differences in the duration, and other solves of the settled problem."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,10 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
+import lqrsim.gym
+from lqrsim import cli
 from lqrsim.results.solution_parts import Status
+from lqrsim.scenarios.references import resolve
 from lqrsim.solvers import budget, free_duration, strategy
 from lqrsim.solvers.free_duration import settled
 from lqrsim.solvers.settings import SmootherSettings
@@ -224,3 +228,63 @@ def test_solvers_that_cannot_free_it_say_so() -> None:
         ls.prepare(free)
     with pytest.raises(ls.InputError, match="duration"):
         ls.smooth(free, finish=None)
+
+
+HURRIED = """
+import dataclasses
+
+import numpy as np
+
+import lqrsim as ls
+
+
+def hurried() -> ls.Scenario:
+    stated = ls.scenarios.differential_drive()
+    problem = dataclasses.replace(
+        stated.problem, dt=1 / 6, steps=30, initial=ls.FixedState((0.0, -2.5, np.pi)),
+        stage_cost=ls.ControlCost((60.0, 60.0), about=(0.25, 0.25)), duration=(1.0, 20.0), time_weight=1.0,
+        final_cost=ls.QuadraticCost((1.0, 1.0, 1.0), about=(-0.8, -2.5, np.pi)),
+        constraints=[ls.GoalState((-0.8, -2.5, np.pi))],
+    )
+    noise = ls.disturbances.ControlNoise(0.01)
+    return dataclasses.replace(stated, name="hurried", problem=problem, disturbances=(noise,))
+"""
+
+
+def test_commands_run_a_plan_in_the_duration_that_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its control period is no multiple of the physics step of the MJCF; by plain MuJoCo the plan ends at its goal."""
+    monkeypatch.chdir(tmp_path)
+    Path("hurried.py").write_text(HURRIED)
+    own = ["--scenario", "hurried.py:hurried"]
+    assert cli.main(["solve", "hurried.py:hurried", "--figure", "hurried.png"]) == 0
+    solution = ls.load("runs/hurried/solution.npz", ls.Solution)
+    scenario = resolve("hurried.py:hurried")
+    dt, physics = solution.trajectory.dt, scenario.scene.model.opt.timestep
+    assert abs(dt / physics - round(dt / physics)) > 1e-3
+    for controller in ("feedback", "track"):
+        given = ["runs/hurried/solution.npz", *own, "--controller", controller, "--out", controller]
+        assert cli.main(["simulate", *given, "--disturbances", "scenario"]) == 0
+        rollout = ls.load(f"{controller}/rollout.npz", ls.Rollout)
+        assert rollout.outcome == ("reached",)
+        assert rollout.times[-1] == pytest.approx(solution.trajectory.horizon)
+        assert rollout.tube is not None
+    policies = ["--policies", "smooth", "track", "offset_free", "replan"]
+    few = ["--trials", "2", "--strengths", "1", "--sweep", "scenario", "--workers", "0"]
+    assert cli.main(["stress", "hurried.py:hurried", *policies, *few]) == 0
+    results = ls.stress.Results("runs/stress/hurried", scenario="hurried.py:hurried")
+    assert all(results.tally(cell)["reached"] == 2 for cell in results.cells)
+    reliability = ls.stress.ReliabilityProblem("hurried.py:hurried", solution="runs/hurried/solution.npz")
+    assert reliability.score.plant.substeps(dt) == round(np.ceil(dt / physics))
+
+
+def test_a_gymnasium_environment_has_the_duration_that_was_found(tmp_path: Path) -> None:
+    (tmp_path / "hurried.py").write_text(HURRIED)
+    environment = lqrsim.gym.Environment(f"{tmp_path / 'hurried.py'}:hurried")
+    environment.reset(seed=0)
+    solution, ended, steps = environment.task.solution, False, 0
+    while not ended:
+        *_, terminated, truncated, _ = environment.step(
+            environment.task.actions_of(solution.trajectory.controls[steps])
+        )
+        ended, steps = terminated or truncated, steps + 1
+    assert steps == solution.trajectory.steps
