@@ -138,7 +138,9 @@ def _load_file(path: Path) -> ModuleType:
     sys.modules[name] = module  # dataclasses look up their module while it runs
     folder = str(path.resolve().parent)
     if folder not in sys.path:
-        sys.path.append(folder)  # for the modules beside it, as if Python ran the file; last, so that they hide no other
+        sys.path.append(
+            folder
+        )  # for the modules beside it, as if Python ran the file; last, so that they hide no other
     spec.loader.exec_module(module)
     return module
 
