@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_joints import Equalities, couplings_of, loops_of
+from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, couplings_of, loops_of, ranges
 
 _HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
 _NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
@@ -54,8 +54,8 @@ class _Levels:
         follows = np.isin(kinds, [one.value for one in (D.mjDYN_FILTER, D.mjDYN_FILTEREXACT, D.mjDYN_MUSCLE)])
         self.activated = np.flatnonzero(follows | integrates)
         self.places = model.actuator_actadr[self.activated] + model.actuator_actnum[self.activated] - 1
-        self.ranges = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange)
-        least, most = _ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
+        self.ranges = control_ranges(model)
+        least, most = ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
         self.low, self.high = (np.clip(side, least, most) for side in self.ranges)
         pushed = np.clip(0.0, *self.ranges)  # the control of an integrator that is nearest to rest
         self.low = np.where(integrates, np.where(pushed > 0, most, least), self.low)
@@ -72,12 +72,6 @@ class _Levels:
         """Apply levels (nu,) to the model's data."""
         data.ctrl[:] = self.controls(levels)
         data.act[self.places] = levels[self.activated]
-
-
-def _ranges(limited: Array, ranges: Array) -> tuple[Array, Array]:
-    """The least and the largest numbers (nu,) of ranges (nu, 2), infinite where there is no limit."""
-    low, high = np.where(limited.astype(bool), ranges.T, [[-np.inf], [np.inf]])
-    return low, high
 
 
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
