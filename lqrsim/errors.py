@@ -285,6 +285,11 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 1:
         check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
+    if raw.ndim > 2:
+        raise InputError(
+            f"{field}: got shape {_shape(raw.shape)}, want a square matrix or its diagonal; for weights that change"
+            " with time, make the time a state and state the cost as a SymbolicCost"
+        )
     matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (None, None))
     if matrix.shape[0] != matrix.shape[1] or not matrix.size:
         raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
