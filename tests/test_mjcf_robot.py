@@ -851,3 +851,22 @@ def test_ctrl_c_ends_an_iteration_that_would_take_minutes(solve: Any) -> None:
     assert raised.value.solution.status is ls.Status.INTERRUPTED  # pyright: ignore[reportAttributeAccessIssue]
     after = robot.dynamics.step(robot.at(hinge=1.0), np.zeros(1), 1e-6)
     assert np.isfinite(after).all()  # the robot can be used again
+
+
+def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
+    """It only pulls, and for a control near 0 as much as it can. By `mj_step` the load stays for half a second."""
+    robot = ls.MjcfRobot(scene_from_xml("""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body name="trolley" pos="0 0 3"><joint name="trolley" type="slide" axis="1 0 0" damping="5"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="10"/><site name="hook"/></body>
+      <body name="load" pos="0 0 1"><freejoint name="load"/><geom type="box" size="0.2 0.2 0.1" mass="6"/>
+      <site name="eye" pos="0 0 0.1"/></body></worldbody>
+      <tendon><spatial name="rope"><site site="hook"/><site site="eye"/></spatial></tendon>
+      <actuator><motor name="drive" joint="trolley"/>
+      <position name="winch" tendon="rope" kp="3000" kv="300" forcelimited="true" forcerange="-500 0"/></actuator>
+      </mujoco>""", "crane"))  # fmt: skip
+    state = robot.at()
+    np.testing.assert_array_equal(robot.settled(state), state)
+    data = mujoco.MjData(robot.scene.model)
+    data.ctrl[:] = robot.hold(state)
+    mujoco.mj_step(robot.scene.model, data, 250)
+    np.testing.assert_allclose(data.qpos, robot.configuration(state)[0], rtol=0, atol=1e-6)

@@ -83,9 +83,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     """
     from scipy.optimize import lsq_linear
 
-    free = copy.copy(model)
-    free.actuator_forcelimited[:] = 0
-    free.jnt_actfrclimited[:] = 0
+    free = _without_force_limits(model)
     data = mujoco.MjData(free)
     data.qpos[:], data.act[:] = qpos, act
     mujoco.mj_inverse(free, data)
@@ -122,18 +120,25 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     return Holding(controls, data.act.copy(), missed, levels.drifting, held)
 
 
+def _without_force_limits(model: mujoco.MjModel) -> mujoco.MjModel:
+    free = copy.copy(model)
+    free.actuator_forcelimited[:] = 0
+    free.jnt_actfrclimited[:] = 0
+    return free
+
+
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
     It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
     as along a floor.
     """
-    data, levels = mujoco.MjData(model), _Levels(model)
+    data, levels, strong = mujoco.MjData(model), _Levels(model), _without_force_limits(model)
     data.qpos[:] = qpos
 
     def forces(asked: Array) -> Array:
         levels.act(asked, data)
-        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(strong, data)  # at its limit, a force does not change, though the joint is driven
         return data.qfrc_actuator.copy()
 
     driven = np.zeros(model.nv, dtype=bool)
