@@ -51,8 +51,8 @@ class List:
 class Solve:
     """Compute a feedback policy for a scenario.
 
-    Prints each iteration as it ends, then the status and, if it failed, the remedy. Writes solution.npz in any case;
-    the exit code is 1 if the solver did not converge.
+    Prints each iteration as it ends, from the hundredth on every tenth, then the status and, if it failed, the remedy.
+    Writes solution.npz in any case; the exit code is 1 if the solver did not converge.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
