@@ -288,7 +288,10 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
     matrix = np.diag(raw) if raw.ndim == 1 else raw
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not matrix.size:
         got = f"the number {raw:g}" if raw.ndim == 0 else f"shape {_shape(raw.shape)}"
-        raise InputError(f"{field}: got {got}, want a square matrix or its diagonal, such as (1.0,)")
+        wanted = "a square matrix or its diagonal, such as (1.0,)"
+        if raw.ndim > 2:
+            wanted += "; for weights that change with time, make the time a state and state the cost as a SymbolicCost"
+        raise InputError(f"{field}: got {got}, want {wanted}")
     matrix = check_array(field, matrix, matrix.shape)
     scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)
     skew = np.abs(matrix - matrix.T)

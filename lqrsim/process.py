@@ -32,7 +32,9 @@ class _Signals:
       deferring: whether signals have to wait.
       deferred: number of the signal that waits, 0 for none.
       stopped_by: number of the signal that stopped the process, 0 for none.
-      when: time of that signal, in seconds.
+      when: time at which that signal was handled, in seconds.
+      arrived: time at which the last signal arrived. It is handled later if compiled code runs.
+      ending: number of the signal with which the process ends, 0 as long as it does not.
       last_words: text for stderr when the process is stopped.
     """
 
@@ -41,6 +43,8 @@ class _Signals:
     deferred = 0
     stopped_by = 0
     when = -GRACE
+    arrived = -GRACE
+    ending = 0
     last_words = ""
 
 
@@ -76,7 +80,10 @@ def _wake_for_signals() -> None:
     def watch() -> None:
         got = 0
         while True:
-            got += sum(number in SIGNALS for number in os.read(arrived, 64))
+            numbers = os.read(arrived, 64)
+            if new := sum(number in SIGNALS for number in numbers):
+                _Signals.arrived = time.monotonic()
+                got += new
             for _ in range(MOST_WAKES):
                 if _Signals.handled >= got:
                     break
@@ -177,7 +184,9 @@ def end_stopped() -> NoReturn:
     """End this process after a signal has stopped it and it has tidied up."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.flush()
-    _end_at_once(_Signals.stopped_by or signal.SIGINT, None)
+    number = _Signals.stopped_by or signal.SIGINT
+    _end_at_once(number, None)
+    os._exit(128 + number)  # not reached, which the line before cannot promise as a handler of signals
 
 
 def discard_output() -> None:
@@ -207,8 +216,11 @@ def printing() -> Iterator[None]:
         raise Unprintable(error) from error
 
 
-def _end_at_once(number: int, frame: FrameType | None) -> NoReturn:
+def _end_at_once(number: int, frame: FrameType | None) -> None:
     """End the process at once, because there is nothing to tidy up."""
+    if _Signals.ending:  # this signal came during the last words, and the call that it interrupted goes on
+        return
+    _Signals.ending = number
     if _Signals.last_words:
         with contextlib.suppress(OSError):
             os.write(2, f"{_Signals.last_words}\n".encode())
@@ -220,7 +232,8 @@ def _raise_interrupt(number: int, frame: FrameType | None) -> None:
     if _Signals.deferring:
         _Signals.deferred = number
         return
-    repeated = time.monotonic() - _Signals.when < GRACE
+    came = _Signals.arrived if _Signals.arrived > _Signals.when else time.monotonic()
+    repeated = came - _Signals.when < GRACE
     if not repeated:
         _Signals.stopped_by, _Signals.when = number, time.monotonic()
         raise KeyboardInterrupt

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -386,3 +387,21 @@ def test_cache_shows_and_clears(
     assert main(["cache", "--clear"]) == 0
     assert capsys.readouterr().out == f"removed 3 items from {tmp_path}\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_many_iterations_are_not_many_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A solve of two thousand iterations: each of the first hundred, then ever fewer, with their true numbers."""
+    scenario = ls.scenarios.differential_drive()
+    solution = ls.smooth(scenario.problem, max_iterations=2)
+
+    def solve(scenario: ls.Scenario, solver: str, *, callback: Any) -> ls.Solution:
+        for _ in range(2000):
+            callback(solution.iterations[0])
+        return solution
+
+    monkeypatch.setattr("lqrsim.scenarios.solutions.solve", solve)
+    console.solve(scenario)
+    rows = [int(line.split()[0]) for line in capsys.readouterr().out.splitlines() if line.split()[0].isdecimal()]
+    assert rows == [*range(1, 100), *range(100, 1000, 10), *range(1000, 2001, 100)]

@@ -6,7 +6,9 @@ from comparing import assert_white
 from scipy import stats
 from tracking import hover, weave
 
+import lqrsim as ls
 from lqrsim.errors import InputError
+from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import ControlNoise, ControlOffset, ForceNoise, MeasurementNoise, Push
 
@@ -111,3 +113,22 @@ def test_descriptions_are_readable_and_in_units(arena, cage):
     assert ControlNoise((0.05, 0.1)).describe(arena) == "control noise, std (0.05, 0.1) m/s"
     assert MeasurementNoise((0.01, 0.01, 0.02)).describe(arena) == "measurement noise, std 0.01 m, 0.02 rad"
     assert Push((0.3, 0.0, 0.0), at=2.0).describe(cage) == "push of (0.3, 0, 0) N s at 2 s"
+
+
+@pytest.mark.parametrize("gravity", ["0 0 -9.81", "0 0 0"])
+def test_a_preset_has_no_disturbance_of_size_zero(gravity: str) -> None:
+    """The force is a share of the weight, which there is not without gravity, and a control without limits has none."""
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option gravity="{gravity}"/><worldbody><body>
+      <joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body></worldbody>
+      <actuator><motor joint="slide"/></actuator></mujoco>""", "puck"))  # fmt: skip
+    found = {type(one).__name__ for one in ls.disturbances.preset("light", ls.Plant(robot, robot.scene))}
+    assert ("ForceNoise" in found) == (gravity != "0 0 0")
+    assert "MeasurementNoise" in found
+    assert "ControlNoise" not in found
+
+
+def test_numbers_by_name_are_refused_with_what_is_wanted() -> None:
+    with pytest.raises(
+        InputError, match=r"^MeasurementNoise: std: got numbers by name, want one number, or one for each"
+    ):
+        ls.disturbances.MeasurementNoise({"m": 0.01})  # pyright: ignore[reportArgumentType]

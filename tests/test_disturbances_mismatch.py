@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances import (
 )
 from lqrsim.simulation.disturbances.mismatch import cut_normal
 from lqrsim.simulation.effects import Effects, seeded
-from lqrsim.simulation.mujoco_physics import MujocoPhysics, bodies
+from lqrsim.simulation.mujoco_physics import MujocoPhysics
 from lqrsim.simulation.plant import Plant
 
 DT = 1 / 30
@@ -52,7 +52,7 @@ def test_factors_are_normal_cut_at_three():
 def test_mass_and_inertia_are_off_by_one_factor_a_trial_and_nothing_else_is(request, fixture, kind, field):
     plant, std, trials = request.getfixturevalue(fixture), 0.1, 400
     simulations = altered(plant, kind(std), trials)
-    own = bodies(plant)
+    own = plant.bodies
     factors = simulations.expanded(field)[:, own].reshape(trials, -1) / getattr(plant.model, field)[own].ravel()
     np.testing.assert_allclose(factors, np.broadcast_to(factors[:, :1], factors.shape))
     assert abs(factors.mean() - 1) < 4 * std / np.sqrt(trials)

@@ -1,6 +1,7 @@
 """A final time that is free: closed forms, differences in the duration, and other solves of the settled problem."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,10 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
+import lqrsim.gym
+from lqrsim import cli
 from lqrsim.results.solution_parts import Status
+from lqrsim.scenarios.references import resolve
 from lqrsim.solvers import budget, free_duration, strategy
 from lqrsim.solvers.free_duration import settled
 from lqrsim.solvers.settings import SmootherSettings
@@ -140,11 +144,10 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     now = [0.0]
     clock = SimpleNamespace(perf_counter=lambda: now[0])
     monkeypatch.setattr(budget, "time", clock)
-    monkeypatch.setattr(free_duration, "time", clock, raising=False)
 
-    def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
+    def solve(fixed: ls.Problem, settings: SmootherSettings, stop: budget.Stop) -> ls.Solution:
         now[0] += 100.0
-        return strategy.solve(fixed, settings)
+        return strategy.solve(fixed, settings, stop=stop)
 
     solution = free_duration.solve_for_duration(
         problem(), SmootherSettings(time_limit=1e6), solve, attentive=False, callback=None
@@ -154,9 +157,33 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
     assert max(one.seconds for one in solution.iterations) < 50.0
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9])
+def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """On a clock that advances whenever it is read, so that a solve takes the same time on every machine.
+
+    The stated second is too short, so most of the time is that of the solve for it. To return the plan that was found
+    takes some more readings, however long the limit is.
+    """
+    now = [0.0]
+
+    def read() -> float:
+        now[0] += 1.0
+        return now[0]
+
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
+    short, options = dataclasses.replace(problem(), dt=1 / 20), SmootherSettings()
+    assert strategy.solve(short, options).success
+    whole, now[0] = now[0], 0.0
+    limited = strategy.solve(short, dataclasses.replace(options, time_limit=share * whole))
+    assert limited.status is Status.TIME_LIMIT
+    assert now[0] <= share * whole + 40
+    assert whole > 500
+
+
 def test_a_duration_ends_at_its_bound() -> None:
     solution = ls.smooth(problem(duration=(3.0, 5.0)))
     assert solution.trajectory.horizon == pytest.approx(3.0, abs=1e-7)
+    assert "\n  duration:  3 s, free from 3 to 5 s, at a price of 1 a second\n" in str(solution)
     solution = ls.smooth(problem(weight=1.0, duration=(1.0, 5.0), time_weight=0.0))
     assert solution.trajectory.horizon == pytest.approx(5.0, abs=1e-6)
 
@@ -201,3 +228,63 @@ def test_solvers_that_cannot_free_it_say_so() -> None:
         ls.prepare(free)
     with pytest.raises(ls.InputError, match="duration"):
         ls.smooth(free, finish=None)
+
+
+HURRIED = """
+import dataclasses
+
+import numpy as np
+
+import lqrsim as ls
+
+
+def hurried() -> ls.Scenario:
+    stated = ls.scenarios.differential_drive()
+    problem = dataclasses.replace(
+        stated.problem, dt=1 / 6, steps=30, initial=ls.FixedState((0.0, -2.5, np.pi)),
+        stage_cost=ls.ControlCost((60.0, 60.0), about=(0.25, 0.25)), duration=(1.0, 20.0), time_weight=1.0,
+        final_cost=ls.QuadraticCost((1.0, 1.0, 1.0), about=(-0.8, -2.5, np.pi)),
+        constraints=[ls.GoalState((-0.8, -2.5, np.pi))],
+    )
+    noise = ls.disturbances.ControlNoise(0.01)
+    return dataclasses.replace(stated, name="hurried", problem=problem, disturbances=(noise,))
+"""
+
+
+def test_commands_run_a_plan_in_the_duration_that_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its control period is no multiple of the physics step of the MJCF; by plain MuJoCo the plan ends at its goal."""
+    monkeypatch.chdir(tmp_path)
+    Path("hurried.py").write_text(HURRIED)
+    own = ["--scenario", "hurried.py:hurried"]
+    assert cli.main(["solve", "hurried.py:hurried", "--figure", "hurried.png"]) == 0
+    solution = ls.load("runs/hurried/solution.npz", ls.Solution)
+    scenario = resolve("hurried.py:hurried")
+    dt, physics = solution.trajectory.dt, scenario.scene.model.opt.timestep
+    assert abs(dt / physics - round(dt / physics)) > 1e-3
+    for controller in ("feedback", "track"):
+        given = ["runs/hurried/solution.npz", *own, "--controller", controller, "--out", controller]
+        assert cli.main(["simulate", *given, "--disturbances", "scenario"]) == 0
+        rollout = ls.load(f"{controller}/rollout.npz", ls.Rollout)
+        assert rollout.outcome == ("reached",)
+        assert rollout.times[-1] == pytest.approx(solution.trajectory.horizon)
+        assert rollout.tube is not None
+    policies = ["--policies", "smooth", "track", "offset_free", "replan"]
+    few = ["--trials", "2", "--strengths", "1", "--sweep", "scenario", "--workers", "0"]
+    assert cli.main(["stress", "hurried.py:hurried", *policies, *few]) == 0
+    results = ls.stress.Results("runs/stress/hurried", scenario="hurried.py:hurried")
+    assert all(results.tally(cell)["reached"] == 2 for cell in results.cells)
+    reliability = ls.stress.ReliabilityProblem("hurried.py:hurried", solution="runs/hurried/solution.npz")
+    assert reliability.score.plant.substeps(dt) == round(np.ceil(dt / physics))
+
+
+def test_a_gymnasium_environment_has_the_duration_that_was_found(tmp_path: Path) -> None:
+    (tmp_path / "hurried.py").write_text(HURRIED)
+    environment = lqrsim.gym.Environment(f"{tmp_path / 'hurried.py'}:hurried")
+    environment.reset(seed=0)
+    solution, ended, steps = environment.task.solution, False, 0
+    while not ended:
+        *_, terminated, truncated, _ = environment.step(
+            environment.task.actions_of(solution.trajectory.controls[steps])
+        )
+        ended, steps = terminated or truncated, steps + 1
+    assert steps == solution.trajectory.steps

@@ -356,6 +356,36 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
         robot.problem(start, goal, weights={"N": 1.0})
 
 
+@settings(max_examples=examples(8), deadline=None)
+@given(seed=SEEDS)
+def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:
+    """Two of them, one against the other, with or without a range of their own: by `mj_step` the limb stays for 0.2 s.
+
+    MuJoCo passes on only controls in 0..1, and with less the muscle on the other side would have to push.
+    """
+    rng = np.random.default_rng(seed)
+    limited = rng.choice(["", 'ctrllimited="true" ctrlrange="-1 2"', 'ctrllimited="true" ctrlrange="0.05 0.9"'])
+    places = {"a": -rng.uniform(0.04, 0.06), "b": rng.uniform(0.04, 0.06)}
+    sites = {one: "".join(f'<site name="{one}{k}" pos="{x} 0 {z}"/>' for k, x in places.items())
+             for one, z in (("top", 0.3), ("limb", -0.1))}  # fmt: skip
+    muscles = "".join(f'<muscle name="{k}" tendon="{k}" lengthrange="0.3 0.5" force="40" {limited}/>' for k in places)
+    tendons = "".join(f'<spatial name="{k}"><site site="top{k}"/><site site="limb{k}"/></spatial>' for k in places)
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      {sites["top"]}<body name="limb"><joint name="hinge" axis="0 1 0" damping="0.5"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>{sites["limb"]}</body></worldbody>
+      <tendon>{tendons}</tendon><actuator>{muscles}</actuator></mujoco>""", "limb"))  # fmt: skip
+    space = robot.dynamics.control_coordinates
+    state = robot.at(hinge=rng.uniform(-0.2, 0.2))
+    control, data = robot.hold(state), mujoco.MjData(robot.scene.model)
+    least, most = (0.05, 0.9) if "0.05" in limited else (0.0, 1.0)
+    assert (space.low, space.high) == ((least,) * 2, (most,) * 2)
+    assert ((control >= least) & (control <= most)).all()
+    data.qpos[:], data.act[:], data.ctrl[:] = state[:1], state[2:], control
+    mujoco.mj_step(robot.scene.model, data, 100)
+    np.testing.assert_allclose(data.qpos, state[:1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(data.act, state[2:], rtol=0, atol=1e-12)
+
+
 def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     """Four cables to a mass in a plane: of the tensions that hold it, all within their limits, by `mj_step`."""
     sites = {"a": (-2, 3), "b": (2, 3), "c": (-2, 0), "d": (2, 0)}
@@ -821,3 +851,22 @@ def test_ctrl_c_ends_an_iteration_that_would_take_minutes(solve: Any) -> None:
     assert raised.value.solution.status is ls.Status.INTERRUPTED  # pyright: ignore[reportAttributeAccessIssue]
     after = robot.dynamics.step(robot.at(hinge=1.0), np.zeros(1), 1e-6)
     assert np.isfinite(after).all()  # the robot can be used again
+
+
+def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
+    """It only pulls, and for a control near 0 as much as it can. By `mj_step` the load stays for half a second."""
+    robot = ls.MjcfRobot(scene_from_xml("""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body name="trolley" pos="0 0 3"><joint name="trolley" type="slide" axis="1 0 0" damping="5"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="10"/><site name="hook"/></body>
+      <body name="load" pos="0 0 1"><freejoint name="load"/><geom type="box" size="0.2 0.2 0.1" mass="6"/>
+      <site name="eye" pos="0 0 0.1"/></body></worldbody>
+      <tendon><spatial name="rope"><site site="hook"/><site site="eye"/></spatial></tendon>
+      <actuator><motor name="drive" joint="trolley"/>
+      <position name="winch" tendon="rope" kp="3000" kv="300" forcelimited="true" forcerange="-500 0"/></actuator>
+      </mujoco>""", "crane"))  # fmt: skip
+    state = robot.at()
+    np.testing.assert_array_equal(robot.settled(state), state)
+    data = mujoco.MjData(robot.scene.model)
+    data.ctrl[:] = robot.hold(state)
+    mujoco.mj_step(robot.scene.model, data, 250)
+    np.testing.assert_allclose(data.qpos, robot.configuration(state)[0], rtol=0, atol=1e-6)

@@ -4,6 +4,7 @@ import html
 import json
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from lqrsim.cli import main
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign
+from lqrsim.stress.specification import Campaign, Cell
 
 OWN = """
 import dataclasses
@@ -103,3 +104,27 @@ def test_a_campaign_knows_where_its_scenario_is(elsewhere: Path) -> None:
     assert found == f"{elsewhere / 'own file.py'}:shorter,steps=9"
     assert Campaign(scenario="quadrotor,query=2", sweeps={"calm": ()}).scenario == "quadrotor,query=2"
     assert Campaign(scenario="package.robots:hallway", sweeps={"calm": ()}).scenario == "package.robots:hallway"
+
+
+def test_a_file_may_import_the_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if Python ran it, wherever the command is run; also in a function, and in a worker. They hide no module."""
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "arena_of_mine.py").write_text("STEPS = 9\n", encoding="utf-8")
+    (folder / "length_of_mine.py").write_text("DT = 0.25\n", encoding="utf-8")
+    (folder / "json.py").write_text("raise AssertionError\n", encoding="utf-8")
+    (folder / "tests_own.py").write_text(
+        "import arena_of_mine\n" + OWN + "\n\ndef beside() -> ls.Scenario:\n"
+        "    import json\n\n    import length_of_mine\n\n"
+        "    scenario = shorter(arena_of_mine.STEPS)\n    problem = scenario.problem\n    json.dumps(problem.steps)\n"
+        "    return dataclasses.replace(scenario, problem=dataclasses.replace(problem, dt=length_of_mine.DT))\n",
+        encoding="utf-8",
+    )
+    reference = f"{folder / 'tests_own.py'}:beside"
+    problem = resolve(reference).problem
+    assert (problem.steps, problem.dt) == (9, 0.25)
+    assert (
+        main(["stress", reference, "--out", str(tmp_path / "run"), "--policies", "smooth", *FEW, "--workers", "1"]) == 0
+    )
+    assert "error" not in Results(tmp_path / "run", scenario=reference).tally(Cell("smooth", "scenario", 1.0))

@@ -108,3 +108,73 @@ def test_what_cannot_carry_a_load_is_refused_by_name() -> None:
         Payload(-1.0, "hand")
     scenario = ls.scenarios.quadrotor()
     assert ls.uncertainty_of(scenario.plant(), [Payload(0.1, "quadrotor")]).unknowns == (Unknown({"mass": 1.0}, 0.1),)
+
+
+TWO = """
+<mujoco model="two carts">
+  <option timestep="0.01" gravity="0 0 -10"/>
+  <worldbody>
+    <body name="left"><joint name="left" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>
+    <body name="right" pos="0 1 0">
+      <joint name="right" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/>
+      <body name="tip" pos="0 0 0.3"><geom size="0.1" mass="0.5"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="left" joint="left"/><motor name="right" joint="right"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "masses"),
+    [
+        (Payload(1.5, "left"), (2.5, 2.5)),
+        (Payload(1.5, "right"), (1.0, 4.0)),
+        (Payload(1.5, "tip"), (1.0, 4.0)),
+        (MassMismatch(factor=1.4), (1.4, 3.5)),
+    ],
+)
+def test_a_robot_of_several_trees_is_loaded_as_a_whole(
+    disturbance: ls.disturbances.Disturbance, masses: tuple[float, float]
+) -> None:
+    """Newton's law for each cart: without friction its speed is force * time / mass, in a run and by the unknown."""
+    robot = ls.MjcfRobot(scene_from_xml(TWO, "two"))
+    plant, dynamics = ls.Plant(robot, robot.scene), robot.dynamics
+    assert plant.weight == pytest.approx(35.0, rel=1e-12)
+    force, steps, dt = np.array([3.0, -2.0]), 20, 0.05
+    states, controls = np.zeros((steps + 1, 4)), np.tile(force, (steps, 1))
+    pushed = ls.AffinePolicy(
+        gain=np.zeros((steps, 2, 4)), offset=controls, nominal=states[:-1], dt=dt,
+        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
+    )  # fmt: skip
+    plan = ls.smooth(robot.problem(robot.at(), robot.at(left=0.1), steps=steps, dt=dt), max_iterations=1)
+    run = ls.simulate(plant, plan, controller=pushed, disturbances=[disturbance])
+    np.testing.assert_allclose(run.states[0, -1, 2:], force * steps * dt / masses, rtol=1e-9)
+    unknown = dynamics.disturbed.with_parameters(**unknowns_of_disturbance(plant, disturbance))
+    np.testing.assert_allclose(unknown.step(states[0], force, dt)[2:], force * dt / masses, rtol=1e-9)
+
+
+def unknowns_of_disturbance(plant: ls.Plant, disturbance: ls.disturbances.Disturbance) -> dict[str, float]:
+    """The loads, in kg, at one standard deviation of the only unknown."""
+    (unknown,) = ls.uncertainty_of(plant, [disturbance]).unknowns
+    assert not isinstance(unknown.of, str)
+    return {name: unknown.std * share for name, share in unknown.of.items()}
+
+
+def test_a_free_body_is_loaded() -> None:
+    """Thrust / mass - gravity: the load has inertia as well as weight. MuJoCo keeps the inertia of such a body."""
+    free = """
+    <mujoco model="free">
+      <option timestep="0.01" gravity="0 0 -10"/>
+      <worldbody>
+        <body name="drone">
+          <freejoint name="drone"/><geom type="box" size="0.1 0.2 0.05" mass="1.5"/><site name="s"/>
+        </body>
+      </worldbody>
+      <actuator><motor name="thrust" site="s" gear="0 0 1 0 0 0"/></actuator>
+    </mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(free, "free"))
+    loaded = robot.dynamics.disturbed.with_parameters(drone_load=0.5)
+    rise = robot.dynamics.state_coordinates.names.index("drone_vz")
+    for turned in (robot.at(), robot.at(drone_wx=1.0)):
+        assert loaded.step(turned, [30.0], 0.01)[rise] == pytest.approx((30.0 / 2.0 - 10.0) * 0.01, rel=1e-9)

@@ -241,3 +241,25 @@ def test_obstacles_cast_the_shadow_of_their_shape() -> None:
     side = shadow(0, 2)
     assert np.ptp(side[:, 0]) == pytest.approx(0.8 * np.cos(angle) + 0.6 * np.sin(angle))
     assert np.ptp(side[:, 1]) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.1, 0.01, 1e-4])
+def test_no_planned_state_is_flat_beside_another(ratio: float) -> None:
+    """Two motions of one unit: every curve takes at least a twentieth of its strip, if it moves at all."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0], p.ratio * u[0], x[0], 0 * x[0]], parameters={"ratio": ratio},
+        states={"large": "m", "small": "m", "way": "m s", "still": "m"}, controls={"speed": "m/s"},
+    )  # fmt: skip
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=10, initial=ls.FixedState(np.zeros(4)), stage_cost=ls.ControlCost([0.1]),
+        final_cost=ls.QuadraticCost([10.0, 0, 0, 0], about=[1.0, 0, 0, 0]),
+    )  # fmt: skip
+    figure = Figure()
+    draw_policy(figure, ls.smooth(problem), ls.load_scene("arena").world, 0.1, None)
+    names = {"large", "small", "way", "still"}
+    seen = [(axes, line) for axes in figure.axes for line in axes.lines if line.get_label() in names]
+    assert sorted(str(line.get_label()) for _, line in seen) == sorted(names)
+    for axes, line in seen:
+        bottom, top = axes.get_ylim()
+        height = np.ptp(np.asarray(line.get_ydata(), dtype=np.float64))
+        assert line.get_label() == "still" or height >= 0.05 * (top - bottom) / 1.2

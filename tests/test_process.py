@@ -103,6 +103,70 @@ def test_a_signal_while_it_films_leaves_nothing(flown: Path, number: int, suffix
     assert list(tmp_path.iterdir()) == []
 
 
+AGAIN = """
+import os, signal, sys, time
+from lqrsim import process
+
+process.handle_signals("stopped")
+write = os.write
+
+
+def interrupted(descriptor, text):
+    written = write(descriptor, text)
+    if descriptor == 2:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return written
+
+
+os.write = interrupted
+os.kill(os.getpid(), signal.SIGINT)
+time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_the_last_words_are_said_once() -> None:
+    """Though a second signal comes while they are said."""
+    done = subprocess.run([sys.executable, "-c", AGAIN], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "stopped\n")
+
+
+LATE = """
+import hashlib, os, signal, time
+from lqrsim import process
+
+process.handle_signals("stopped")
+process.GRACE, rounds, took = 0.3, 100_000, 0.0
+while took < 5 * process.GRACE:  # compiled code for longer than a second signal is ignored
+    rounds, began = 2 * rounds, time.monotonic()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+    took = time.monotonic() - began
+print("ready", flush=True)
+try:
+    with process.interruptible():
+        try:
+            time.sleep(60)
+        finally:
+            print("tidying", flush=True)
+            hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+            print("tidied", flush=True)
+except KeyboardInterrupt:
+    process.end_stopped()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_a_second_signal_at_once_is_ignored_however_late_it_is_handled() -> None:
+    """While compiled code tidies up, Python handles no signal; what counts is when it came."""
+    with start(sys.executable, "-c", LATE) as process:
+        assert process.stdout is not None
+        for line in ("ready\n", "tidying\n"):
+            assert process.stdout.readline() == line
+            process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=600)
+    assert (process.returncode, out, error) == (130, "tidied\n", "stopped\n")
+
+
 @pytest.mark.parametrize(
     ("number", "everyone"), [(signal.SIGINT, True), (signal.SIGINT, False), (signal.SIGTERM, False)]
 )

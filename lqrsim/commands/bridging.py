@@ -85,7 +85,7 @@ class Bridge:
         solution = save_load.load(self.policy, Solution)
         if not self.scenario and not solution.scenario:
             raise InputError("--scenario: got none, and the solution names none, want the scenario to run with --robot")
-        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario).settled(solution)
         with bridge.SimulatedRobot(solution, **topics) as robot:
             rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough(None, None))
         console.say(rollout.summary())

@@ -128,7 +128,10 @@ def keeping(write: Callable[[Any], object]) -> Iterator[None]:
 
 
 def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":
-    """Solve a scenario; print each iteration as it ends, then the status. The options are the solver's options."""
+    """Solve a scenario; print iterations as they end, then the status. The options are the solver's options.
+
+    Of the hundredth to the thousandth iteration every tenth is printed, then every hundredth, and so on.
+    """
     from lqrsim.results.solution_parts import Iteration
     from lqrsim.scenarios import solutions
 
@@ -137,7 +140,8 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
     def show(iteration: "Iteration") -> None:
         nonlocal count
         count += 1
-        say(iteration.row(count))
+        if count % 10 ** max(len(str(count)) - 2, 0) == 0:
+            say(iteration.row(count))
 
     say(Iteration.HEADER)
     solution = solutions.solve(scenario, solver, callback=show, **options)

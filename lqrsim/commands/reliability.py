@@ -263,7 +263,7 @@ class FunnelCommand(PolicyOptions):
 
         with console.keeping(write), console.progress("looking", "knot") as progress:
             found = funnel(
-                scenario.plant(),
+                scenario.settled(solution).plant(),
                 solution,
                 disturbances=disturbances,
                 controller=controller,

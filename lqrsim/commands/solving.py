@@ -51,8 +51,8 @@ class List:
 class Solve:
     """Compute a feedback policy for a scenario.
 
-    Prints each iteration as it ends, then the status and, if it failed, the remedy. Writes solution.npz in any case;
-    the exit code is 1 if the solver did not converge.
+    Prints each iteration as it ends, from the hundredth on every tenth, then the status and, if it failed, the remedy.
+    Writes solution.npz in any case; the exit code is 1 if the solver did not converge.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -125,7 +125,8 @@ class Solve:
             from lqrsim.simulation.uncertainty_of import tube_under
             from lqrsim.view.plots import plot_policy
 
-            tube, remark = tube_under(problem, solution, scenario.plant(), scenario.disturbances)
+            ran = scenario.settled(solution)
+            tube, remark = tube_under(ran.problem, solution, ran.plant(), ran.disturbances)
             if remark:
                 console.say(remark)
             world, radius = scenario.scene.world, scenario.robot.radius
@@ -218,7 +219,7 @@ class Simulate:
             raise InputError(
                 "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
             )
-        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario).settled(solution)
         if self.open_loop:
             solution = solution.open_loop()
         if self.design_disturbances is not None:

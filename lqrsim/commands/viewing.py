@@ -206,8 +206,9 @@ class View:
         else:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
-            plant = scenario.plant()
             solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
+            scenario = scenario.settled(solution)
+            plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             arguments = viewer.arguments_for_plant(plant, solution, goal)
             if self.design_disturbances is not None:

@@ -81,6 +81,9 @@ class Task:
                     f"scenario: got control {name} within {low:g} to {high:g}, want finite limits, for the actions"
                 )
         self._disturbances = self.disturbances_of(disturbances, strength)
+        if scenario.problem.duration is not None:  # the control period is part of the solution
+            self.scenario = scenario.settled(self.solution)
+            self.plant = self.scenario.plant()
 
     @cached_property
     def solution(self) -> Solution:

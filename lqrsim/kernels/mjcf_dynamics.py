@@ -38,16 +38,17 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # threads find their work, 0 without helpers; YIELD: the address of the function that yields to other threads;
 # KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
 # mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of bodies that may carry a load, and
-# address of the loads, in kg; the numbers of these bodies and their own masses follow. TABLE: the joints' kind and
-# places in qpos and qvel, three numbers each.
+# address of the loads, in kg; the numbers of these bodies and their own masses follow. SIMPLE: number of degrees of
+# freedom whose constant inertia is the mass of such a body; for each, the number of the load, the degree of freedom and
+# its inertia without a load follow. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, SIMPLE, TABLE = 22, 23, 24, 25, 26, 27, 28, 29, 30
 
 # Addresses that a slot has for each of its two MjData.
-SLOT, SIZE = 28, 14
+SLOT, SIZE = 30, 15
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
-OWN_MODEL, MASSES = 12, 13
+OWN_MODEL, MASSES, INERTIAS = 12, 13, 14
 
 # The words that a team shares: whether it is in use, the next column, combined with the number of the job, the number
 # of finished columns, whether to stop, the number of helpers, and whether a signal came, after which all steps are NaN.
@@ -273,6 +274,10 @@ def write_loads(p, one):
     count, first, masses = int(p[LOADED]), int(p[LOADS]), at(one[MASSES])
     for k in range(count):
         masses[int(p[first + count + k])] = p[first + 2 * count + k] + p[first + k]
+    inertias = at(one[INERTIAS])
+    for k in range(int(p[SIMPLE])):
+        row = first + 3 * (count + k)
+        inertias[int(p[row + 1])] = p[row + 2] + p[first + int(p[row])]
 
 
 def start_from(p, one, guess):

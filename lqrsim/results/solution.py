@@ -138,7 +138,7 @@ class Solution(Plan):
         return "\n".join([Iteration.HEADER, *rows])
 
     def summary(self) -> str:
-        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 15 lines."""
+        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 16 lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
@@ -154,6 +154,8 @@ class Solution(Plan):
             risk = self.options.get("risk")
             meant = f"log E exp(risk cost) / risk, risk {risk}" if risk else "an expectation"
             lines.append(f"  noise:     {self.options['noise']}; the cost is {meant}")
+        if "duration" in self.options:
+            lines.append(f"  duration:  {self.trajectory.horizon:.6g} s, free from {self.options['duration']}")
         if self.clearance is not None:
             knot = int(np.argmin(self.clearance))
             verdict = "collides" if self.clearance[knot] < 0 else "clear"

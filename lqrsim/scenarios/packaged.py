@@ -3,15 +3,26 @@
 import inspect
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import check_count, check_items, check_kind, check_name, check_number, check_seed, check_text, keep
+from lqrsim.errors import (
+    check_count,
+    check_flag,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_seed,
+    check_text,
+    keep,
+)
 from lqrsim.problem.costs import ControlCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target
+from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
@@ -41,6 +52,8 @@ class Scenario:
         a tenth of the distance to the goal if the start is within the radius.
       goal_tolerance: the tolerance for goals without a position; both are as in `simulate`.
       simulator: the simulator that moves the robot, such as `ls.simulators.RotorPy()`; None for MuJoCo.
+      fit_timestep: whether the plant has the longest physics step that divides the control period, as for a plan of a
+        free duration; by default a control period that is not a multiple of the physics step is refused.
     """
 
     name: str
@@ -55,6 +68,7 @@ class Scenario:
     goal_radius: float | None = None
     goal_tolerance: float | None = None
     simulator: Simulator | None = None
+    fit_timestep: bool = False
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
         """The goal options of `simulate`: the given ones, or the scenario's own if neither is given.
@@ -100,12 +114,28 @@ class Scenario:
         keep(self, disturbances=check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted))
         if not is_function(self.start):  # a function is called when the scenario is solved
             resolve(self.start, self.problem)
+        check_flag("Scenario: fit_timestep", self.fit_timestep)
         check_kind("Scenario: simulator", self.simulator, (Simulator, type(None)), "a Simulator, or None for MuJoCo")
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
         """The robot in its scene, ready to run."""
-        return Plant(self.robot, self.scene, self.simulator)
+        plant = Plant(self.robot, self.scene, self.simulator)
+        return plant.for_period(self.problem.dt) if self.fit_timestep else plant
+
+    def settled(self, plan: Solution) -> "Scenario":
+        """The scenario in which a plan runs: if its problem has a free duration, that with the duration of the plan.
+
+        The physics step of its plant then divides the control period of the plan.
+
+        Args:
+          plan: a solution of the scenario.
+        """
+        if self.problem.duration is None:
+            return self
+        dt = plan.trajectory.dt
+        problem = replace(self.problem, dt=dt, duration=None, time_weight=0.0)
+        return replace(self, problem=problem, fit_timestep=True)
 
 
 def names() -> list[str]:

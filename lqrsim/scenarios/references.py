@@ -4,7 +4,7 @@ A scenario is the name of a registered scenario, a user's function, or an MJCF, 
 
   quadrotor                     a name that `lqrsim list` prints
   quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
-  my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario
+  my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario; it may import files beside it
   my_package.robots:hallway     a function in a module of yours
   my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
 
@@ -136,6 +136,11 @@ def _load_file(path: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look up their module while it runs
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(
+            folder
+        )  # for the modules beside it, as if Python ran the file; last, so that they hide no other
     spec.loader.exec_module(module)
     return module
 

@@ -114,8 +114,7 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
     lines: list[str] = []
     if not solution.success:
         lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
-    # With a free duration, the solution belongs to a problem with the duration that was found.
-    if scenario.problem.duration is None and solution.problem_digest != scenario.problem.digest:
+    if solution.problem_digest != scenario.settled(solution).problem.digest:
         solved = f" (solved as {solution.scenario})" if solution.scenario else ""
         lines.append(f"is of another problem than that of {scenario.name}{solved}; its plan is run as it is")
     return lines

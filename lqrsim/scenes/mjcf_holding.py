@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_joints import Equalities, couplings_of, loops_of
+from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, couplings_of, loops_of, ranges
 
 _HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
 _NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
@@ -54,8 +54,8 @@ class _Levels:
         follows = np.isin(kinds, [one.value for one in (D.mjDYN_FILTER, D.mjDYN_FILTEREXACT, D.mjDYN_MUSCLE)])
         self.activated = np.flatnonzero(follows | integrates)
         self.places = model.actuator_actadr[self.activated] + model.actuator_actnum[self.activated] - 1
-        self.ranges = _ranges(model.actuator_ctrllimited, model.actuator_ctrlrange)
-        least, most = _ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
+        self.ranges = control_ranges(model)
+        least, most = ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
         self.low, self.high = (np.clip(side, least, most) for side in self.ranges)
         pushed = np.clip(0.0, *self.ranges)  # the control of an integrator that is nearest to rest
         self.low = np.where(integrates, np.where(pushed > 0, most, least), self.low)
@@ -74,12 +74,6 @@ class _Levels:
         data.act[self.places] = levels[self.activated]
 
 
-def _ranges(limited: Array, ranges: Array) -> tuple[Array, Array]:
-    """The least and the largest numbers (nu,) of ranges (nu, 2), infinite where there is no limit."""
-    low, high = np.where(limited.astype(bool), ranges.T, [[-np.inf], [np.inf]])
-    return low, high
-
-
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
     """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
 
@@ -89,9 +83,7 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     """
     from scipy.optimize import lsq_linear
 
-    free = copy.copy(model)
-    free.actuator_forcelimited[:] = 0
-    free.jnt_actfrclimited[:] = 0
+    free = _without_force_limits(model)
     data = mujoco.MjData(free)
     data.qpos[:], data.act[:] = qpos, act
     mujoco.mj_inverse(free, data)
@@ -128,18 +120,25 @@ def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArr
     return Holding(controls, data.act.copy(), missed, levels.drifting, held)
 
 
+def _without_force_limits(model: mujoco.MjModel) -> mujoco.MjModel:
+    free = copy.copy(model)
+    free.actuator_forcelimited[:] = 0
+    free.jnt_actfrclimited[:] = 0
+    return free
+
+
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
     It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
     as along a floor.
     """
-    data, levels = mujoco.MjData(model), _Levels(model)
+    data, levels, strong = mujoco.MjData(model), _Levels(model), _without_force_limits(model)
     data.qpos[:] = qpos
 
     def forces(asked: Array) -> Array:
         levels.act(asked, data)
-        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(strong, data)  # at its limit, a force does not change, though the joint is driven
         return data.qfrc_actuator.copy()
 
     driven = np.zeros(model.nv, dtype=bool)

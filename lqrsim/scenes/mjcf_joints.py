@@ -132,13 +132,24 @@ def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
 
 def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
     """All actuators, in MuJoCo's order."""
-    found = []
-    for number in range(model.nu):
-        low, high = (
-            model.actuator_ctrlrange[number].tolist() if model.actuator_ctrllimited[number] else (-np.inf, np.inf)
-        )
-        found.append(Actuator(model.actuator(number).name, number, _unit(model, number), low, high))
-    return tuple(found)
+    low, high = (side.tolist() for side in control_ranges(model))
+    return tuple(
+        Actuator(model.actuator(number).name, number, _unit(model, number), low[number], high[number])
+        for number in range(model.nu)
+    )
+
+
+def ranges(limited: npt.NDArray[np.bool_], sides: Array) -> tuple[Array, Array]:
+    """The least and the largest numbers (nu,) of ranges (nu, 2), infinite where there is no limit."""
+    low, high = np.where(limited, sides.T, [[-np.inf], [np.inf]])
+    return low, high
+
+
+def control_ranges(model: mujoco.MjModel) -> tuple[Array, Array]:
+    """The least and the largest control of each actuator, (nu,). To a muscle MuJoCo passes on only what is in 0..1."""
+    muscle = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE.value
+    low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
+    return np.where(muscle, np.clip(low, 0, 1), low), np.where(muscle, np.clip(high, 0, 1), high)
 
 
 def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:

@@ -63,8 +63,8 @@ class MujocoPhysics(Physics):
 
     def multiply(self, parameter: str, factors: Array) -> None:
         field, which = {
-            "mass": ("body_mass", bodies(self.plant)),
-            "inertia": ("body_inertia", bodies(self.plant)),
+            "mass": ("body_mass", self.plant.bodies),
+            "inertia": ("body_inertia", self.plant.bodies),
             "thrust": ("actuator_gainprm", self.plant.ctrl),
         }[parameter]
         values = self.simulations.expand(field)
@@ -209,15 +209,6 @@ def _product(a: Array, b: Array) -> Array:
         [w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i,
          w * k + x * j - y * i + z * s], axis=1,
     )  # fmt: skip
-
-
-def bodies(plant: Plant) -> Indices:
-    """Ids of the robot's bodies: its main body and those attached to it."""
-    found = {plant.body}
-    for body in range(plant.body + 1, plant.model.nbody):  # parents come before their children
-        if plant.model.body_parentid[body] in found:
-            found.add(body)
-    return np.array(sorted(found), dtype=np.intp)
 
 
 def _span(indices: Indices) -> slice | Indices:

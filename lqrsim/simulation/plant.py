@@ -45,6 +45,7 @@ class Plant:
         stand on: level planes that face up, and height fields.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body.
+      bodies: ids of all its bodies: that one, those that its joints move, and those attached to them.
       qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: timestep of the physics, in seconds.
@@ -78,6 +79,7 @@ class Plant:
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
+        self.bodies = _attached(self.model, [self.body, *(int(joint.bodyid[0]) for joint in joints)])
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
         self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
         self.ctrl = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
@@ -106,7 +108,8 @@ class Plant:
         """Weight of the robot in N."""
         if self.simulator is not None:
             return self.simulator.weight
-        return float(self.model.body_subtreemass[self.body] * np.linalg.norm(self.model.opt.gravity))
+        roots = self.bodies[~np.isin(self.model.body_parentid[self.bodies], self.bodies)]
+        return float(self.model.body_subtreemass[roots].sum() * np.linalg.norm(self.model.opt.gravity))
 
     def check_simulator(self, what: str, parameter: str | None = None) -> None:
         """Check that a disturbance can change a parameter of the physics.
@@ -358,6 +361,15 @@ def _near(robot: Robot, scene: Scene) -> World:
     """The obstacles that MuJoCo lets a robot touch, except what it stands on."""
     ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id), floors=True))
     return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
+
+
+def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:
+    """Ids of these bodies and of those attached to them."""
+    found = set(roots)
+    for body in range(model.nbody):  # parents come before their children
+        if model.body_parentid[body] in found:
+            found.add(body)
+    return np.array(sorted(found), dtype=np.intp)
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

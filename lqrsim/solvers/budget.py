@@ -23,11 +23,14 @@ SELDOM = 60.0  # s
 class Stop:
     """The reason for a solve to end early: a deadline on the clock of `time.perf_counter`, or an exception.
 
+    All runs of a solve share one, and so do all solves of which a solve for a free duration consists.
+
     An exception of the callback, or Ctrl-C, ends a solve like a deadline, with the best plan so far. `finish` raises
     the exception again, with that plan as its `solution`.
     """
 
     deadline: float = np.inf
+    begun: float = np.nan
     error: BaseException | None = None
     # Expected duration of the next iteration in s: an iteration that would end after the deadline is not begun. By
     # default it is the duration of the last iteration.
@@ -39,8 +42,20 @@ class Stop:
     told: float = -np.inf
 
     def begin(self, seconds: float | None) -> None:
-        """Set a deadline this many seconds from now; None for no deadline."""
-        self.deadline = np.inf if seconds is None else time.perf_counter() + seconds
+        """Start the clock, with a deadline this many seconds from now; None for no deadline."""
+        self.begun = time.perf_counter()
+        self.deadline = np.inf if seconds is None else self.begun + seconds
+
+    @contextlib.contextmanager
+    def not_counting(self) -> Iterator[None]:
+        """A block whose time does not count, such as compiling."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            taken = time.perf_counter() - began
+            self.begun += taken
+            self.deadline += taken
 
     @property
     def due(self) -> bool:
@@ -65,7 +80,7 @@ class Stop:
         """A block that reports the progress if the caller hears nothing for long, unless many problems are solved."""
         if not attentive:
             return contextlib.nullcontext()
-        return reported(what, lambda: self.found, lambda: self.told)
+        return reported(what, lambda: self.found, lambda: self.told, self.begun)
 
     @contextlib.contextmanager
     def heeding(self) -> Iterator[None]:
@@ -203,7 +218,9 @@ class Laps:
 
 
 @contextlib.contextmanager
-def reported(what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf) -> Iterator[None]:
+def reported(
+    what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf, begun: float | None = None
+) -> Iterator[None]:
     """A block that reports its progress after two silent seconds, as a warning of the logger `lqrsim`.
 
     Args:
@@ -211,8 +228,9 @@ def reported(what: str, found: Callable[[], str], told: Callable[[], float] = la
       found: function that returns the results so far, and the time that is left, as text.
       told: function that returns the time at which the caller was last told otherwise, on the clock of
         `time.perf_counter`.
+      begun: time at which the activity began, on the same clock; by default now.
     """
-    ended, begun = threading.Event(), time.perf_counter()
+    ended, begun = threading.Event(), time.perf_counter() if begun is None else begun
 
     def watch() -> None:
         wait = SILENT

@@ -6,7 +6,6 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 """
 
 import copy
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -23,7 +22,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
-from lqrsim.solvers.budget import Budget, Callback, Laps
+from lqrsim.solvers.budget import Budget, Callback, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
 from lqrsim.solvers.settings import SmootherSettings
@@ -38,13 +37,14 @@ Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
 
 
 def solve_for_duration(
-    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], *,
+    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings, Stop], Solution], *,
     attentive: bool, callback: Callback | None,
 ) -> Solution:  # fmt: skip
     """Solve for the stated duration, then find the best duration near it, and finish the plan with that duration.
 
     With a weight on time, and no start from the caller, shorter durations are also tried, because they may lead to
-    another route. `solve` is for problems with a fixed duration; for `attentive` see `Budget`.
+    another route. `solve` is for problems with a fixed duration, within the time of this solve; for `attentive` see
+    `Budget`.
     """
     budget = Budget(settings.max_iterations, callback=callback)
     stop, log = budget.stop, budget.log
@@ -53,9 +53,9 @@ def solve_for_duration(
     stated, first, best, near = problem.steps * problem.dt, None, None, None
     for attempt in range(SHORTENED + 1 if problem.time_weight > 0 and settings.start is None else 1):
         tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-        begin = solve(settled(problem, stated), tries)
+        begin = solve(settled(problem, stated), tries, stop)
         first = begin if first is None else first
-        if attempt and not begin.success:
+        if stop.due or (attempt and not begin.success):
             break
         with stop.reporting("smooth", attentive):
             near = find_duration(
@@ -63,9 +63,11 @@ def solve_for_duration(
                 violation=settings.violation_tolerance(problem), most=settings.max_iterations, budget=budget,
             )  # fmt: skip
         cheaper = best is None or near[1].measures.cost < best[1].measures.cost
-        if stop.due or not near[1].solved or not cheaper:
+        if not near[1].solved or not cheaper:
             break
         best = near
+        if stop.due:
+            break
         stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
     assert first is not None
     if best is not None:
@@ -75,17 +77,26 @@ def solve_for_duration(
             np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
             f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
         )  # fmt: skip
-        return stop.finish(solve(ordinary, replace(settings, start=guess, starts=None)))
+        return stop.finish(_described(solve(ordinary, replace(settings, start=guess, starts=None), stop), problem))
     candidates = [first]
     if near is not None and np.isfinite(near[1].plan.states).all() and not stop.due:
         ordinary, found = near
         start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
-        candidates.append(solve(ordinary, replace(settings, start=start, starts=None)))
+        candidates.append(solve(ordinary, replace(settings, start=start, starts=None), stop))
     chosen = min(candidates, key=lambda one: _rank_with_time(one, problem.time_weight))
     status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
     detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
     iterations = (*first.iterations, *log, *(chosen.iterations if chosen is not first else ()))
-    return stop.finish(replace(chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations))
+    chosen = replace(chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations)
+    return stop.finish(_described(chosen, problem))
+
+
+def _described(solution: Solution, problem: Problem) -> Solution:
+    """The solution with the free duration among its options, in words."""
+    assert problem.duration is not None
+    low, high = problem.duration
+    price = f", at a price of {problem.time_weight:g} a second" if problem.time_weight else ""
+    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"})
 
 
 def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
@@ -103,10 +114,10 @@ def find_duration(
     the budget, which may end the search earlier.
     """
     assert problem.duration is not None
-    clock = time.perf_counter()
-    freed, n = with_duration(problem), len(problem.dynamics.state_coordinates)
-    stages = Stages(freed)
-    budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
+    n = len(problem.dynamics.state_coordinates)
+    with budget.stop.not_counting():  # compiling
+        freed = with_duration(problem)
+        stages = Stages(freed)
     stages.free[n] = 1.0
     laps = Laps(budget)
 

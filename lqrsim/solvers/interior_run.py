@@ -5,7 +5,6 @@ function finishes the plan. This puts controls exactly at their limits, and give
 other plan is rolled out.
 """
 
-import time
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -47,9 +46,8 @@ class InteriorRun:
     def __init__(self, run: SolveRun) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self.allowed = run.settings.violation_tolerance(run.problem)
-        clock = time.perf_counter()
-        self.stages = Stages(run.problem)
-        run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
+        with run.budget.stop.not_counting():  # compiling
+            self.stages = Stages(run.problem)
 
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
         """The result from a plan if it converges; else None, so that smoothing can continue."""

@@ -28,7 +28,6 @@ The budget of each start is `max_iterations`; all starts share one deadline (`bu
 
 import contextlib
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -83,21 +82,30 @@ def solve(
     attentive: bool = False,
     threads: int = 1,
     callback: Callback | None = None,
+    stop: Stop | None = None,
 ) -> Solution:
-    """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts."""
+    """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts.
+
+    `stop` is that of a solve of which this one is a part; its time limit is then for both.
+    """
     if problem.duration is not None:
-        fixed = functools.partial(solve, attentive=attentive, threads=threads, callback=callback)
+
+        def fixed(settled: Problem, options: SmootherSettings, whole: Stop) -> Solution:
+            return solve(settled, options, attentive=attentive, threads=threads, callback=callback, stop=whole)
+
         return solve_for_duration(problem, settings, fixed, attentive=attentive, callback=callback)
-    given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
-    start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
-    check_functions(problem, start, first.offset[0].copy())
-    stop = Stop()
-    runs = [
-        SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
-        for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
-    ]
-    stop.begin(settings.time_limit)  # compiling, which comes before, does not count
+    if stop is None:
+        stop = Stop()
+        stop.begin(settings.time_limit)
+    with stop.not_counting():  # compiling
+        given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
+        start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+        first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
+        check_functions(problem, start, first.offset[0].copy())
+        runs = [
+            SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
+            for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
+        ]
     search = Search([name for name, _ in given], runs, callback, threads)
     with stop.reporting("smooth", attentive):
         with problem.dynamics.solving(threads if len(runs) == 1 else 1):

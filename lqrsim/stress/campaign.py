@@ -168,7 +168,8 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
-    plant.substeps(problem.dt)
+    if problem.duration is None:
+        plant.substeps(problem.dt)
     scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):

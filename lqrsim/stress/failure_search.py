@@ -112,7 +112,7 @@ class ReliabilityProblem:
             )
         solution, controller = make_policy(self.policy, scenario, self.design_disturbances, self.given)
         score = TrialScore(
-            plant,
+            scenario.settled(solution).plant(),
             solution,
             disturbances,
             controller=controller,

@@ -109,7 +109,8 @@ def solve(
         for remark in solving.remarks(scenario, plan):
             _log.warning("the solution of %s %s", solver, remark)
     if "track" in policies:
-        law = track(scenario.problem, solutions["track"], uncertainty=design_uncertainty(scenario, design))
+        problem = scenario.settled(solutions["track"]).problem
+        law = track(problem, solutions["track"], uncertainty=design_uncertainty(scenario, design))
         solutions["track"] = replace(solutions["track"], policy=law)
     return solutions
 
@@ -135,8 +136,10 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
     found: dict[str, str] = {}
     if scenario.problem.constraints:
         found["ilqr"] = "which cannot keep the scenario's constraints"
+    elif scenario.problem.duration is not None:
+        found["ilqr"] = "which cannot find the scenario's free duration"
     replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
-    if replanned is not None and replanned.problem_digest != scenario.problem.digest:
+    if replanned is not None and replanned.problem_digest != scenario.settled(replanned).problem.digest:
         found["replan"] = "which re-plans the scenario's problem, while the solution is of another problem"
     return found
 
@@ -168,7 +171,7 @@ def make_controller(
     Raises:
       InputError: there is no such controller, or it does not fit the scenario and the solution.
     """
-    problem = scenario.problem
+    problem = scenario.settled(solution).problem
     match check_name("controller", name, CONTROLLERS):
         case "track":
             return track(problem, solution, uncertainty=design_uncertainty(scenario, design))

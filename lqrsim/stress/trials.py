@@ -25,8 +25,9 @@ class Trials:
     """Runs the trials of a campaign's cells, each policy with its solution."""
 
     def __init__(self, campaign: Campaign, scenario: Scenario, solutions: Mapping[str, Solution]) -> None:
-        self.campaign, self.scenario, self.solutions = campaign, scenario, solutions
-        self.plant = scenario.plant()
+        self.campaign, self.solutions = campaign, solutions
+        self.scenario = scenario.settled(next(iter(solutions.values())))  # all plans have the same duration
+        self.plant = self.scenario.plant()
         self._controllers: dict[str, Controller | AffinePolicy] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:

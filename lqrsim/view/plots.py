@@ -228,6 +228,7 @@ def _convergence(axes: Axes, solution: Solution) -> None:
 TUBE = {"face": "#8ad7d5", "edge": "#008f91"}
 COST_TUBE = {"face": "#d5c8ec", "edge": "#7a4dc7"}
 LINES = ("-", "--", "-.", ":")
+FLAT = 0.05  # a curve whose range is a smaller part of the largest one's in its unit has another strip
 
 
 def plot_policy(
@@ -279,9 +280,9 @@ def draw_policy(figure: Figure, solution: Solution, world: World, radius: float,
             _tube(axes, solution, world, radius, plane, tube)
         figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
     else:
-        units = list(dict.fromkeys(policy.state_coordinates.units))
-        places = grid[0].subgridspec(len(units), 1, hspace=0.18)
-        _states([figure.add_subplot(place) for place in places], units, solution)
+        together = _drawn_together(solution)
+        places = grid[0].subgridspec(len(together), 1, hspace=0.18)
+        _states([figure.add_subplot(place) for place in places], together, solution)
     strips = list(
         product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(policy.state_coordinates.units))
     )
@@ -329,13 +330,28 @@ def _begin_projection(
     return np.eye(len(space.position))[list(plane)]
 
 
-def _states(strips: list[Axes], units: list[str], solution: Solution) -> None:
-    """The planned states over time, one strip for each unit."""
+def _drawn_together(solution: Solution) -> list[list[int]]:
+    """The states of each strip: of one unit, and with ranges along the plan that can be seen beside one another."""
+    space, found = solution.policy.state_coordinates, list[list[int]]()
+    sizes = np.ptp(solution.trajectory.states, axis=0)
+    for unit in dict.fromkeys(space.units):
+        strip = list[int]()
+        for i in sorted((i for i, one in enumerate(space.units) if one == unit), key=lambda i: -sizes[i]):
+            if strip and 0 < sizes[i] < FLAT * sizes[strip[0]]:
+                found.append(sorted(strip))
+                strip = []
+            strip.append(i)
+        found.append(sorted(strip))
+    return sorted(found)
+
+
+def _states(strips: list[Axes], together: list[list[int]], solution: Solution) -> None:
+    """The planned states over time, in strips."""
     space, plan = solution.policy.state_coordinates, solution.trajectory
-    for axes, unit in zip(strips, units, strict=True):
-        for i, name in enumerate(space.names):
-            if space.units[i] == unit:
-                axes.plot(plan.times, plan.states[:, i], label=name.replace("_", " "))
+    for axes, drawn in zip(strips, together, strict=True):
+        for i in drawn:
+            axes.plot(plan.times, plan.states[:, i], label=space.names[i].replace("_", " "))
+        unit = space.units[drawn[0]]
         axes.set_ylabel(f"({unit})" if unit else "")
         axes.margins(x=0.01)
         axes.legend(loc="best")

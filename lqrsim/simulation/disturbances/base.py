@@ -211,6 +211,8 @@ def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) ->
 def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
     """A field as a number or a tuple. Raises InputError for no numbers, and for too small or infinite numbers."""
     field = f"{type(disturbance).__name__}: {name}"
+    if isinstance(numbers, Mapping):
+        raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
     if real(field, numbers).ndim == 0:
         return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
     values = check_array(field, numbers, (None,))

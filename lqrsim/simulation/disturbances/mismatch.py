@@ -31,7 +31,6 @@ from lqrsim.simulation.disturbances.base import (
     unknowns_of,
     words,
 )
-from lqrsim.simulation.mujoco_physics import bodies
 from lqrsim.simulation.plant import Plant
 
 CUT = 3.0  # standard deviations at which normal numbers are truncated
@@ -118,7 +117,7 @@ class MassMismatch(Mismatch):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         dynamics, masses = plant.robot.dynamics, plant.model.body_mass
-        loads = {load_of(plant, number): float(masses[number]) for number in bodies(plant) if masses[number] > 0}
+        loads = {load_of(plant, number): float(masses[number]) for number in plant.bodies if masses[number] > 0}
         if loads.keys() <= dynamics.disturbances.keys():  # true for a robot from an MJCF
             return unknowns_of(self, plant, [Unknown(loads, float(self.spread(plant)[0]))])
         return parameter_unknown(self, plant, "mass")
@@ -149,7 +148,7 @@ class Payload(Disturbance):
         self._number(plant)
 
     def _number(self, plant: Plant) -> int:
-        known = {plant.model.body(number).name: int(number) for number in bodies(plant)}
+        known = {plant.model.body(number).name: int(number) for number in plant.bodies}
         return known[check_name("Payload: body", self.body, known)]
 
     def describe(self, plant: Plant) -> str:
@@ -167,7 +166,7 @@ class Payload(Disturbance):
     def uncertainty(self, plant: Plant) -> Uncertainty:
         load, whole = load_of(plant, self._number(plant)), "mass"
         declared = possible_unknowns(plant.robot.dynamics)
-        alone = load not in declared and whole in declared and len(bodies(plant)) == 1
+        alone = load not in declared and whole in declared and len(plant.bodies) == 1
         return unknowns_of(self, plant, [Unknown(whole if alone else load, self.mass)])
 
 

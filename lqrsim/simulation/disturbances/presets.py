@@ -4,7 +4,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name
 from lqrsim.simulation.disturbances.actuation import MotorLag
-from lqrsim.simulation.disturbances.base import Disturbance
+from lqrsim.simulation.disturbances.base import Disturbance, GaussianDisturbance
 from lqrsim.simulation.disturbances.links import CommandDropouts, MeasurementDropouts
 from lqrsim.simulation.disturbances.mismatch import (
     AxleMismatch,
@@ -50,7 +50,7 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     """
     check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     strength = PRESETS[check_name("preset", name, PRESETS)]
-    return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one)]
+    return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one) and _acts(one)]
 
 
 def _light(plant: Plant) -> list[Disturbance]:
@@ -75,6 +75,11 @@ def _light(plant: Plant) -> list[Disturbance]:
         ForceNoise(0.01 * plant.weight),  # our choice: 1 % of the weight
         Dryden("light", altitude=2.0),
     ]
+
+
+def _acts(disturbance: Disturbance) -> bool:
+    """Whether it is not zero for this robot, as a share of the weight is where there is no gravity."""
+    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(disturbance.std))
 
 
 def _can_have(plant: Plant, disturbance: Disturbance) -> bool:
