@@ -96,6 +96,7 @@ class FilterRun(ControllerRun):
         self._last = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))
+        self._wider = np.ones(trials)  # see `correct`
         self.estimates, self.innovations = records or (None, None)
         self._limits = Limits(*law.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
@@ -123,7 +124,8 @@ class FilterRun(ControllerRun):
         self._last[:] = measured
         model.compiled.correct(
             self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
-            law.filter.gain[knot], model.compiled_sensor, model.turning, self.z, self._differences,
+            law.filter.gain[knot], law.filter.limit[knot], self._wider, model.compiled_sensor, model.turning,
+            self.z, self._differences,
         )  # fmt: skip
         at = step - self._latency
         if self.estimates is not None and self.innovations is not None and at < len(self.estimates):

@@ -19,6 +19,12 @@ from lqrsim.errors import Array, InputError
 # exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
 RESOLUTION = 1e-6
 NOTHING = 1e-150  # the least noise if the prediction is certain: its square is still a positive number
+# The largest correction of an unknown by one measurement, in standard deviations of that correction. If all is as
+# stated, one correction in 5e8 is larger. In a run, such corrections have other causes: a command or the first
+# measurement was lost, or there was a push that nobody stated. Attributed to a mass, the error of a state can make the
+# mass negative. The limit doubles with each measurement that exceeds it. A gate, which rejects measurements, could lock
+# out for good what differs far from its statement.
+PLAUSIBLE = 6.0
 
 
 class KalmanFilter(NamedTuple):
@@ -30,6 +36,7 @@ class KalmanFilter(NamedTuple):
       corrected: covariance of that error after the measurement, (T+1, Z, Z).
       corrected_root: lower triangular square roots of `corrected`, (T+1, Z, Z).
       innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
+      limit: largest correction of each state of the unknowns by one measurement, (T+1, D); see `PLAUSIBLE`.
     """
 
     gain: Array
@@ -37,6 +44,7 @@ class KalmanFilter(NamedTuple):
     corrected: Array
     corrected_root: Array
     innovation: Array
+    limit: Array
 
 
 def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
@@ -50,6 +58,8 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
     gain, innovation = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
     before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
+    first = n + model.lagging
+    limit = np.zeros((knots, size - first))
     root = model.start_root if known is None else known
     for t in range(knots):
         before[t] = root
@@ -64,11 +74,13 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         innovation[t] = S @ S.T
         if t or known is None:
             gain[t] = solve_triangular(S, array[measured:, :measured].T, lower=True, trans=1).T
+            limit[t] = PLAUSIBLE * np.sqrt((array[measured + first :, :measured] ** 2).sum(axis=1))
             root = array[measured:, measured:]
         after[t] = root
         if t + 1 < knots:
             root = triangular_root(np.concatenate([model.F[t] @ root, model.process_root[t]], axis=1))
-    return KalmanFilter(gain, before @ before.transpose(0, 2, 1), after @ after.transpose(0, 2, 1), after, innovation)
+    predicted, corrected = (one @ one.transpose(0, 2, 1) for one in (before, after))
+    return KalmanFilter(gain, predicted, corrected, after, innovation, limit)
 
 
 def check_observable(model: PlanModel) -> None:

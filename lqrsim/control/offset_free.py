@@ -51,7 +51,8 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
     is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
     so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
-    and predicted states by at least 2 % of what that effort moves them in two periods. If the robot would leave its
+    and predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
+    unknown by at most six standard deviations of such a correction; see `kalman.py`. If the robot would leave its
     plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
     `lag_margin.py`. `model.uncertainty` is the uncertainty that the filter assumes.
 
