@@ -9,7 +9,6 @@ sensors measure the same quantity, or if two unknowns are nearly identical.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import triangular_root
@@ -56,10 +55,8 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         model's start.
     """
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
-    gain, innovation = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
+    learned, innovation_root = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
     before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
-    first = n + model.lagging
-    limit = np.zeros((knots, size - first))
     root = model.start_root if known is None else known
     for t in range(knots):
         before[t] = root
@@ -70,17 +67,28 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         array[:measured, :n], array[:measured, n : n + measured] = noise, np.diag(least)
         array[:measured, n + measured :], array[measured:, n + measured :] = expected, root
         array = triangular_root(array)
-        S = array[:measured, :measured]
-        innovation[t] = S @ S.T
+        innovation_root[t] = array[:measured, :measured]
         if t or known is None:
-            gain[t] = solve_triangular(S, array[measured:, :measured].T, lower=True, trans=1).T
-            limit[t] = PLAUSIBLE * np.sqrt((array[measured + first :, :measured] ** 2).sum(axis=1))
+            learned[t] = array[measured:, :measured]
             root = array[measured:, measured:]
         after[t] = root
         if t + 1 < knots:
             root = triangular_root(np.concatenate([model.F[t] @ root, model.process_root[t]], axis=1))
-    predicted, corrected = (one @ one.transpose(0, 2, 1) for one in (before, after))
-    return KalmanFilter(gain, predicted, corrected, after, innovation, limit)
+    limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
+    predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
+    return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)
+
+
+def _gains(learned: Array, root: Array) -> Array:
+    """K of K S = learned (T+1, Z, Y), for lower triangular S (T+1, Y, Y), of all knots at once.
+
+    OpenBLAS solves even such small systems with all its threads, which then wait for each other.
+    """
+    gain = np.empty_like(learned)
+    for j in range(root.shape[1] - 1, -1, -1):
+        rest = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
+        gain[:, :, j] = (learned[:, :, j] - rest) / root[:, j, j, None]
+    return gain
 
 
 def check_observable(model: PlanModel) -> None:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
+from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
-from lqrsim.control.lag_margin import Design, with_margin
+from lqrsim.control.lag_margin import with_margin
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
@@ -130,10 +130,11 @@ class OffsetFree(Controller):
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
-        self.weights = self._weights(tolerate, efforts, at_end)
+        design = Design(self.model, self.filter, self._weights(tolerate, efforts, at_end))
         if uncertainty.lag > 0 and memory < np.inf:
-            self._keep_margin(stated, memory, tolerate, efforts, at_end)
-        self._law = FilterLaw.of(solution, self.model, self.filter, self.weights)
+            design = self._with_margin(design, stated, memory, tolerate, efforts, at_end)
+        self.model, self.filter, self.weights = design.model, design.filter, design.weights
+        self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
 
     def _replan_rule(self, every: float) -> ReplanRule:
@@ -155,16 +156,18 @@ class OffsetFree(Controller):
         told = self.problem, self.solution, self.uncertainty
         return choose_tolerances(*told, self.model, effort, at_end, moments)
 
-    def _keep_margin(
-        self, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
-    ) -> None:
-        """Make the design milder if it needs the lag."""
-        tried = tolerances_to_try(self.model, effort, at_end) if tolerate is None else self.weights.alone
-        design = Design(self.model, self.filter, self.weights)
-        self.model, self.filter, self.weights = with_margin(
-            self.problem, self.solution, stated, design, tried,
-            lambda share, doubt: for_filter(_told_of(stated, share), memory, effort, doubt),
-        )  # fmt: skip
+    def _with_margin(
+        self, design: Design, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
+    ) -> Design:
+        """The design, or a milder one if it needs the lag."""
+
+        def tried() -> Weights:
+            return design.weights.alone if tolerate is not None else tolerances_to_try(design.model, effort, at_end)
+
+        def assumed(share: float, doubt: float) -> PlanModel:
+            return for_filter(_told_of(stated, share), memory, effort, doubt)
+
+        return with_margin(self.problem, self.solution, stated, design, tried, assumed)
 
     def start(self, trials: int) -> "FilterRun | ReplannedRun":
         records = empty_records(self._law, trials) if self.record else None
