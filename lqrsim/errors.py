@@ -285,9 +285,11 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 1:
         check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
-    matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (None, None))
-    if matrix.shape[0] != matrix.shape[1] or not matrix.size:
-        raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
+    matrix = np.diag(raw) if raw.ndim == 1 else raw
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not matrix.size:
+        got = f"the number {raw:g}" if raw.ndim == 0 else f"shape {_shape(raw.shape)}"
+        raise InputError(f"{field}: got {got}, want a square matrix or its diagonal, such as (1.0,)")
+    matrix = check_array(field, matrix, matrix.shape)
     scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)
     skew = np.abs(matrix - matrix.T)
     if skew.max(initial=0.0) > 1e-9 * scale:

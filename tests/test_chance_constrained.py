@@ -165,6 +165,16 @@ def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -
     assert cost.weight == plan.weight
     assert f"with {plan.weight:g} times the weight of obstacles" in str(plan)
 
+    # The cost is that of the problem as given: in NumPy, to rounding. Obstacles cost nothing at the given start.
+    states, controls = plan.solution.trajectory.states, plan.solution.trajectory.controls
+    away = np.hypot(states[1:-1, None, 0], states[1:-1, None, 1] - np.array([-1.0, 1.0])) - 0.6 - RADIUS
+    assert isinstance(narrow.final_cost, ls.QuadraticCost)
+    end = states[-1] - np.asarray(narrow.final_cost.about)
+    own = 0.5 * (controls**2).sum() + np.exp(-10.0 * away).sum() + 0.5 * end @ narrow.final_cost.weight @ end
+    np.testing.assert_allclose(plan.cost, own, rtol=1e-9)
+    assert plan.cost < plan.solution.cost
+    assert plan.rounds[-1][2] == plan.cost
+
 
 def test_a_margin_of_each_knot_is_kept(problem: ls.Problem) -> None:
     """At each knot but the given first, against the closed form: 1e-6 m, to which constraints are solved."""
@@ -207,3 +217,12 @@ def test_without_obstacles_there_is_nothing_to_ask(problem: ls.Problem) -> None:
     free = ls.Problem(**(fields(problem) | changed))
     with pytest.raises(ls.InputError, match="without obstacles"):
         ls.smooth_chance_constrained(free, UNCERTAINTY)
+
+
+def test_the_law_is_chosen_for_the_plan_that_it_runs(problem: ls.Problem) -> None:
+    """With more room a gentler law fails less often than the one that was chosen for a plan with less."""
+    strong = Uncertainty(start=0.02, control=4.0, measurement=0.05)
+    plan = ls.smooth_chance_constrained(problem, strong, chance=1e-2)
+    assert len(plan.rounds) > 2
+    assert isinstance(plan.controller, ls.OffsetFree)
+    assert plan.controller.digest == ls.OffsetFree(plan.problem, plan.solution, strong).digest

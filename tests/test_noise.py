@@ -242,7 +242,7 @@ def test_a_file_says_what_the_noise_was(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ls.Noise(shaken), "^Noise: size: got None, want a whole number >= 1"),
+        (lambda: ls.Noise(shaken), "^Noise: size: got none, want k, the number of entries of w"),
         (lambda: ls.Noise([1.0, 2.0]), r"^Noise: function: got shape \(2,\), want"),
         (lambda: ls.Noise(np.eye(2), size=2), "^Noise: size: got 2 beside a matrix, want none$"),
         (lambda: ls.Noise(shaken, size=3, depends_on=("x0",)), "^Noise: depends_on: .* want none: it is derived$"),
@@ -387,3 +387,39 @@ def test_risk_averse_tracking(share):
     assert off(law.gain, riccati(numbers, problem, risk=share * most).gain) < 1e-9
     with pytest.raises(InputError, match=r"^track: risk: got 1 and a problem without noise, want noise=Noise"):
         ls.track(dataclasses.replace(problem, noise=None), solution, **asked, risk=1.0)
+
+
+@settings(max_examples=examples(12), deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_expected_cost_has_no_penalties(seed: int) -> None:
+    """A double integrator to a goal of some states, in the closed form of its policy's expected cost: to rounding."""
+    rng, dt = np.random.default_rng(seed), 0.1
+    steps, goal = int(rng.integers(5, 30)), rng.normal(size=2)
+    A, B = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt])
+    M, Q, R, end = (
+        0.1 * rng.normal(size=(2, 2)),
+        rng.uniform(0, 2, size=2),
+        rng.uniform(0.5, 2),
+        rng.uniform(0, 2, size=2),
+    )
+    kept = {name: goal[i] for i, name in enumerate(("x", "v")) if i == 1 or rng.random() < 0.5}
+    problem = ls.Problem(
+        dynamics=ls.Dynamics(lambda x, u, p: [x.v, u.a], states={"x": "m", "v": "m/s"}, controls={"a": "m/s2"}),
+        dt=dt, steps=steps, initial=ls.FixedState((0.0, 0.0)),
+        stage_cost=ls.ControlCost((R,)) + ls.QuadraticCost(Q, about=goal), final_cost=ls.QuadraticCost(end, about=goal),
+        constraints=[ls.GoalState(kept)], noise=ls.Noise(M),
+    )  # fmt: skip
+    solution = ls.smooth(problem)
+    assert solution.success
+    mean, covariance, cost = np.zeros(2), np.zeros((2, 2)), 0.0
+    for t in range(steps):
+        gain = solution.policy.gain[t]
+        control = gain @ mean + solution.policy.offset[t]
+        cost += (
+            0.5
+            * (R * (control**2 + gain @ covariance @ gain.T) + Q @ ((mean - goal) ** 2 + np.diag(covariance))).item()
+        )
+        closed = A + B[:, None] @ gain
+        mean, covariance = A @ mean + B * control, closed @ covariance @ closed.T + M @ M.T
+    cost += 0.5 * end @ ((mean - goal) ** 2 + np.diag(covariance))
+    np.testing.assert_allclose(solution.cost, cost, rtol=1e-8)

@@ -34,7 +34,7 @@ def measure(config: Config) -> dict[str, Any]:
         against = compare(ended["offset free, safe plan"], ended["smoother"])
         rows.append({
             "strength": strength, "reached": {name: share(one) for name, one in ended.items()},
-            "predicted": safe.tube.collision_chance, "cost": [plan.cost, safe.solution.cost],
+            "predicted": safe.tube.collision_chance, "cost": [plan.cost, safe.cost],
             "p_value": against.p_value, "only_safe": against.only_first, "only_smoother": against.only_second,
         })  # fmt: skip
     return {"rows": rows, "trials": trials}

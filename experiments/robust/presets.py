@@ -32,7 +32,7 @@ def measure(config: Config) -> dict[str, Any]:
             disturbances = ls.disturbances.preset(preset, plant)
             stated = ls.uncertainty_of(plant, disturbances)
             safe = safe_plan(query, preset, ASKED[preset])
-            costs[preset].append([plan.cost, safe.solution.cost, safe.tube.collision_chance])
+            costs[preset].append([plan.cost, safe.cost, safe.tube.collision_chance])
             flown = laws(scenario, plan, safe, stated, preset)
             try:
                 gains = BEST_AT_LIGHT if preset == "light" else BEST_AT_MODERATE

@@ -49,7 +49,7 @@ def of_world(config: Config, robot: ls.Quadrotor, scene: ls.Scene, start: Array,
     collided = int(np.isfinite(rollout.collided_at).sum())
     measured = rate(collided, config.world_trials)
     return {
-        "success": safe.success, "bare_solved": bare.success, "bare": bare.cost, "cost": safe.solution.cost,
+        "success": safe.success, "bare_solved": bare.success, "bare": bare.cost, "cost": safe.cost,
         "misses": safe.solution.target.misses(robot.radius),  # the goal: the way there may be too narrow
         "at_first": safe.rounds[0][3], "predicted": safe.tube.collision_chance, "collided": collided,
         # More often than asked, as surely as 95 %.

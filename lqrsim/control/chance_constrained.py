@@ -33,6 +33,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
+from lqrsim.solvers.compiled import costs_of
 from lqrsim.solvers.smoother import smooth
 
 # A plan whose chance is below the requested one by no more than this factor is not made cheaper.
@@ -55,7 +56,7 @@ class SafePlan:
       tube: the prediction of its runs; `tube.collision_chance` is the chance.
       asked: the requested chance.
       rounds: for each plan that was solved for: smallest and largest margin in m, cost, and predicted chance.
-      weight: factor of the weight of the problem's obstacles, in its own cost as well; usually 1.
+      weight: factor of the weight of the problem's obstacles, usually 1. `solution.cost` has it, `cost` does not.
       instead: if the plan is not safe enough, the predicted chances on the same plan with actuators without lag, with
         twice their range, with exact sensors, and with all of these. They show what limits the safety.
     """
@@ -85,13 +86,24 @@ class SafePlan:
         """Whether the plan is a solution, and its predicted chance of collision is at most the requested one."""
         return self.solution.success and self.tube.collision_chance <= self.asked
 
+    @property
+    def cost(self) -> float:
+        """Cost of the plan with the obstacles as heavy as in the given problem, so that plans can be compared."""
+        if self.weight == 1:
+            return self.solution.cost
+        given, plan = _weighing(self.problem, 1 / self.weight), self.solution.trajectory
+        own, heavier = (costs_of(one, plan.states[None], plan.controls[None])[0] for one in (given, self.problem))
+        return float(self.solution.cost - (heavier - own))
+
     def __str__(self) -> str:
         lines = [f"{self.solution.summary()}", "  margin (m)       cost        chance of collision"]
         lines += [f"  {low:5.3f} to {high:5.3f}  {cost:10.6g}  {chance:.3g}" for low, high, cost, chance in self.rounds]
         verdict = "as asked" if self.success else "MORE than asked" if self.solution.success else "no solution"
         lines.append(f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})")
         if self.weight != 1:
-            lines.append(f"  with {self.weight:g} times the weight of obstacles")
+            lines.append(
+                f"  with {self.weight:g} times the weight of obstacles, without which it costs {self.cost:.6g}"
+            )
         if self.instead:
             each = ", ".join(f"{chance:.3g} with {what}" for what, chance in self.instead.items())
             lines.append(f"  on this plan {each}")
@@ -119,7 +131,7 @@ def smooth_chance_constrained(
       uncertainty: the uncertainty in a run; see `uncertainty_of`.
       chance: chance of collision, between 0 and 1.
       controller: (problem, solution) -> the controller that runs the plan, an OffsetFree or an AffinePolicy. By default
-        an OffsetFree for the uncertainty, with tolerances chosen for the second plan.
+        an OffsetFree for the uncertainty, with tolerances chosen for each plan.
       rounds: the largest number of plans with clearances.
       progress: called with the number of plans that are done, the largest possible number of plans, and a text about
         the last one. The largest number counts plans with margins and plans with heavier obstacles.
@@ -163,6 +175,13 @@ def smooth_chance_constrained(
     return search.result()
 
 
+def _weighing(problem: Problem, times: float) -> Problem:
+    """The problem with the weights of its obstacles multiplied."""
+    terms = terms_of(problem.stage_cost)
+    costs = tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms)
+    return problem.with_costs(stage_cost=CostSum(costs))
+
+
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
     """Predicted chances of collision on a plan, with one improvement at a time, and with all of them.
 
@@ -202,7 +221,6 @@ class _Search:
         self.make, self.surroundings = make, surroundings
         self.plans: list[SafePlan] = []
         self.margin = np.zeros((1, 1))  # margin of the last plan, (T+1, O)
-        self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
         # Numbers of standard deviations: the largest that is too small, the smallest that is enough, and the smallest
         # for which no plan was found.
@@ -243,13 +261,12 @@ class _Search:
         """Predict the outcome of a plan, and keep it."""
         controller, margin = self._controller(problem, solution), self.margin
         tube = predict_tube(problem, solution, self.uncertainty, controller)
-        self.lines.append((float(margin.min()), float(margin.max()), solution.cost, tube.collision_chance))
-        self.plans.append(
-            SafePlan(
-                problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked,
-                rounds=tuple(self.lines), weight=weight,
-            )
+        plan = SafePlan(
+            problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked, rounds=(),
+            weight=weight,
         )  # fmt: skip
+        self.lines.append((float(margin.min()), float(margin.max()), plan.cost, tube.collision_chance))
+        self.plans.append(plan)
         return tube
 
     def heavier(self) -> Iterator[float]:
@@ -263,9 +280,7 @@ class _Search:
 
     def solve_heavier(self, times: float) -> None:
         """Plan with heavier obstacles and without margins, and predict the outcome."""
-        terms = terms_of(self.problem.stage_cost)
-        costs = tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms)
-        problem = self.problem.with_costs(stage_cost=CostSum(costs))
+        problem = _weighing(self.problem, times)
         solution, self.margin = smooth(problem), np.zeros((1, 1))
         if solution.success:
             self._keep(problem, solution, times)
@@ -278,10 +293,7 @@ class _Search:
     def _controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
         if self.make is not None:
             return self.make(problem, solution)
-        law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
-        if len(self.plans) == 1:  # one law for all later plans, so that the plan with more room is safer
-            self.tolerate = tuple((law.weights.state**-0.5).tolist())
-        return law
+        return OffsetFree(problem, solution, self.uncertainty)
 
     def _spread(self, plan: SafePlan) -> Spread:
         """Standard deviations of the clearances along the plan, (T+1, O)."""
@@ -340,7 +352,7 @@ class _Search:
         """The cheapest plan that is safe enough, or else the safest."""
         safe = [plan for plan in self.plans if plan.success]
         if safe:
-            return min(safe, key=lambda plan: plan.solution.cost)
+            return min(safe, key=lambda plan: plan.cost)
         return min(self.plans, key=lambda plan: (not plan.solution.success, plan.tube.collision_chance))
 
     def last(self) -> str:

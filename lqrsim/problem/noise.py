@@ -107,6 +107,8 @@ class Noise:
         if callable(function):
             self.level = level_of(function, level)
             check_signature(function, ("x", "u", "p"))
+            if size is None:
+                raise InputError("Noise: size: got none, want k, the number of entries of w and of each row of M")
             self.size = check_count("Noise: size", size, at_most=MOST)
             if depends_on is not None and self.level == "symbolic":
                 raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want none: it is derived")

@@ -530,11 +530,25 @@ class SolveRun:
             claimed=self.budget.log[-1].cost if found.success else None,
             tolerance=self.final if found.status is Status.CONVERGED else None,
         )  # fmt: skip
+        if self.problem.noise_term is not None and self.problem.constraint_terms:
+            certificate = replace(certificate, cost=self._expected_cost(found))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
             return found
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
+
+    def _expected_cost(self, found: RunResult) -> float:
+        """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
+        size = found.states.shape
+        to_go = CostToGo(np.zeros((*size, size[1])), np.zeros(size), np.zeros(size[0]))
+        out = np.zeros(1, CERTIFICATE)
+        task, first, last, options, model, *rest = self._check_arguments(declarations.EVALUATE, found, to_go, out)
+        stage, final = (
+            cost._replace(constraints=cost.constraints._replace(size=0)) for cost in (model.stage, model.final)
+        )
+        self._loop(task, first, last, options, model._replace(stage=stage, final=final), *rest)
+        return float(out[0]["cost"])
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
         """This run as a candidate of a search; `found` is its result if it was run to its end."""
