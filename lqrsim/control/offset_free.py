@@ -184,14 +184,19 @@ class OffsetFree(Controller):
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
-    def loop(self) -> LinearLoop:
-        """Return the closed loop about the plan as matrices, under the uncertainty as stated.
+    def loop(self, uncertainty: Uncertainty | None = None) -> LinearLoop:
+        """Return the closed loop about the plan as matrices.
+
+        Args:
+          uncertainty: uncertainty of the run; by default the one for which the law was designed.
 
         Raises:
-          InputError: with `replan_every`, which leads to other plans.
+          InputError: with `replan_every`, which leads to other plans; or the uncertainty does not fit the system.
         """
         self._check_one_plan("loop")
-        truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
+        met = self.uncertainty if uncertainty is None else uncertainty
+        met.check(self.problem.dynamics)
+        truth = replace(self.model, uncertainty=met.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)
