@@ -16,7 +16,7 @@ from scipy.linalg import expm
 from scipy.stats import binom, chi2
 
 import lqrsim as ls
-from lqrsim.control.kalman import RESOLUTION, kalman_filter
+from lqrsim.control.kalman import PLAUSIBLE, RESOLUTION, kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
@@ -75,7 +75,7 @@ def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tup
 @hypothesis.given(st.integers(0, len(CASES) - 1), st.integers(0, 10**6), st.booleans())
 @hypothesis.settings(max_examples=examples(20))
 def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstable: bool) -> None:
-    """Mean and covariance after each measurement, whatever is measured: 1e-8 of their size."""
+    """Mean and covariance after each measurement, of any plausible numbers: 1e-8 of their size."""
     rng, steps = np.random.default_rng(seed), 6
     rates = rng.normal(size=(2, 2)) + (1.0 if unstable else -2.0) * np.eye(2)
     system = linear(
@@ -84,7 +84,7 @@ def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstab
     )  # fmt: skip
     law = law_of(system, case)
     run, plan = law.start(1), system.plan
-    off = rng.normal(size=(steps + 1, 2))
+    off = 0.05 * rng.normal(size=(steps + 1, 2))
     inputs = np.array([run.control(t, (plan.states[t] + off[t])[None])[0] for t in range(steps + 1)])[:steps]
     assert run.estimates is not None
     for t in range(steps + 1):
@@ -93,6 +93,55 @@ def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstab
         np.testing.assert_allclose(estimate, mean, rtol=0, atol=1e-8 * (1 + np.abs(mean).max()))
         largest = np.abs(covariance).max()
         np.testing.assert_allclose(law.filter.corrected[t], covariance, rtol=0, atol=1e-8 * (1 + largest))
+
+
+@hypothesis.given(st.sampled_from([1, 2, 3]), st.integers(0, 10**6), st.floats(1.0, 1e6))
+@hypothesis.settings(max_examples=examples(20))
+def test_an_implausible_measurement_moves_no_unknown_far(case: int, seed: int, times: float) -> None:
+    """At most by six standard deviations of a correction, all in proportion; the state is corrected in full.
+
+    These deviations are the differences of the variances before and after the measurement, of which the dense
+    conditioning is the reference: 1e-6 of the change, for the differences cancel.
+    """
+    rng, steps = np.random.default_rng(seed), 5
+    system = double_integrator(start=rng.normal(size=2), controls=rng.normal(size=(steps, 1)))
+    law = law_of(system, case)
+    run, plan, model = law.start(1), system.plan, law.model
+    own, jumps = model.n + model.lagging, int(rng.integers(1, steps + 1))
+    off = 0.02 * rng.normal(size=(steps + 1, 2))
+    off[jumps] *= times
+    commands = np.array([run.control(t, (plan.states[t] + off[t])[None])[0] for t in range(jumps + 1)])
+    inputs, before = commands[:jumps] - plan.controls[:jumps], jumps - 1
+    assert run.estimates is not None
+    at = run.estimates[:, 0] - law.nominal
+    F, G, c = model.F[before], model.G[before], model.c[before]
+    predicted = F @ at[before] + G @ inputs[before] + c
+    spread = F @ conditional(model, inputs, off, before)[1] @ F.T + model.process_noise[before]
+    mean, left = conditional(model, inputs, off, jumps)
+    full, std = mean - predicted, np.sqrt(np.diagonal(spread - left))[own:]
+    share = min(1.0, 6.0 * float((std / np.maximum(np.abs(full[own:]), 1e-300)).min()))
+    assert PLAUSIBLE == 6.0
+    full[own:] *= share
+    np.testing.assert_allclose(at[jumps] - predicted, full, rtol=0, atol=1e-6 * np.abs(full).max())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("times", [10.0, 500.0])
+def test_an_unknown_beyond_its_statement_is_found_all_the_same(times: float, noise: float) -> None:
+    """A steady push of 10 and 500 standard deviations: a gate that rejects measurements would lock it out.
+
+    After 6 s it is found to 2 % and the noise, of which the estimate has some 0.02 N.
+    """
+    steps = 60
+    system = double_integrator(controls=np.zeros((steps, 1)))
+    uncertainty = Uncertainty(unknowns=[Unknown("d0", 0.1)], start=0.01, measurement=noise)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    run, x, rng = law.start(1), system.plan.states[0], np.random.default_rng(0)
+    for t in range(steps):
+        command = run.control(t, x[None] + noise * rng.normal(size=(1, 2)))[0]
+        x = system.A @ x + system.B @ command + system.E @ [0.1 * times]
+    assert run.estimates is not None
+    np.testing.assert_allclose(run.estimates[steps - 1, 0, -1], 0.1 * times, rtol=0.02, atol=5 * noise)
 
 
 class Truth:

@@ -1043,6 +1043,8 @@ class TestControl:
             measured,
             X,
             rng.normal(size=(z, 2)),
+            np.array([0.1, 5.0]),
+            np.array([1.0, 2.0, 100.0]),
             sensor,
             turning,
             estimates,

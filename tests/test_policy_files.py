@@ -74,7 +74,7 @@ def test_class_page_and_compiled_controller_agree_on_a_linear_system(
         [[float(one == f"s{i}") for i in (0, 1)] if isinstance(one, str) else one for one in sensors]
     )  # fmt: skip
     for t in range(steps):
-        shown = system.plan.states[t] + 0.4 * rng.normal(size=2)
+        shown = system.plan.states[t] + 0.2 * rng.normal(size=2)
         y = chosen @ shown
         here = control(t, shown[None])[0]
         u, z = policy.step(z, y, t * DT)

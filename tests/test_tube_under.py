@@ -16,14 +16,16 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
     differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
     problem, plant = differential_drive.problem, differential_drive.plant()
+    elsewhere = ls.FixedState(drive_solution.trajectory.states[0] + 0.1)
+    another = ls.smooth(dataclasses.replace(problem, initial=elsewhere))
     cases = {
         "an OffsetFree or an AffinePolicy": (
             [NOISE],
             ls.Replanner(problem, drive_solution, every=1.0),
         ),
-        "designed for other disturbances": (
+        "an OffsetFree of another plan": (
             [NOISE],
-            ls.OffsetFree(problem, drive_solution, ls.uncertainty_of(plant, [ControlNoise(0.06)])),
+            ls.OffsetFree(problem, another, ls.uncertainty_of(plant, [NOISE])),
         ),
     }
     for word, (disturbances, controller) in cases.items():

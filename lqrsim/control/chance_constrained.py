@@ -185,7 +185,8 @@ def _weighing(problem: Problem, times: float) -> Problem:
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
     """Predicted chances of collision on a plan, with one improvement at a time, and with all of them.
 
-    Each prediction uses an OffsetFree made for it.
+    In the place of an OffsetFree each prediction uses one made for it, which measures all states; a policy stays the
+    same.
     """
     policy = plan.solution.policy
     space = policy.control_coordinates

@@ -5,6 +5,7 @@ The run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPoli
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -19,6 +20,26 @@ from lqrsim.kernels.records import Limits, Measurements, Policy
 from lqrsim.results.coordinates import Coordinates, Spaces, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
+
+
+@dataclass(frozen=True)
+class Design:
+    """A filter with the weights of the law that follows it.
+
+    Attributes:
+      model: the model that the filter assumes.
+      filter: its gains and covariances.
+      weights: of the law, or of C laws.
+    """
+
+    model: PlanModel
+    filter: KalmanFilter
+    weights: Weights
+
+    @cached_property
+    def laws(self) -> tuple[Array, Array]:
+        """Gain and offset, as of `tracking_laws`."""
+        return tracking_laws(self.model, self.weights)
 
 
 @dataclass(frozen=True)
@@ -43,18 +64,16 @@ class FilterLaw:
     nominal: Array
 
     @classmethod
-    def of(
-        cls, plan: Plan, model: PlanModel, kalman: KalmanFilter, weights: Weights, granted: Array | None = None
-    ) -> "FilterLaw":
+    def of(cls, plan: Plan, design: Design, granted: Array | None = None) -> "FilterLaw":
         """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes; 0 by default."""
+        model, (gain, offset) = design.model, design.laws
         trajectory = model.plan
         granted = np.zeros(len(model.transition)) if granted is None else granted
-        gain, offset = tracking_laws(model, weights)
         # From deviations to the filter's own numbers.
         unknowns = np.tile(granted, (trajectory.steps + 1, 1))
         nominal = np.concatenate([trajectory.states, model.reached, unknowns], axis=1)
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
-        return cls(plan, model, kalman, weights, gain, offset, nominal)
+        return cls(plan, model, design.filter, design.weights, gain, offset, nominal)
 
     @property
     def coordinates(self) -> Spaces:
@@ -96,6 +115,7 @@ class FilterRun(ControllerRun):
         self._last = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))
+        self._wider = np.ones(trials)  # see `correct`
         self.estimates, self.innovations = records or (None, None)
         self._limits = Limits(*law.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
@@ -123,7 +143,8 @@ class FilterRun(ControllerRun):
         self._last[:] = measured
         model.compiled.correct(
             self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
-            law.filter.gain[knot], model.compiled_sensor, model.turning, self.z, self._differences,
+            law.filter.gain[knot], law.filter.limit[knot], self._wider, model.compiled_sensor, model.turning,
+            self.z, self._differences,
         )  # fmt: skip
         at = step - self._latency
         if self.estimates is not None and self.innovations is not None and at < len(self.estimates):

@@ -15,16 +15,16 @@ Designs that do well without their lag, such as those for the quadrotor, stay as
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.kalman import KalmanFilter, kalman_filter
+from lqrsim.control.filter_law import Design
+from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking import Prediction, StateMoments, narrowest, predictions, with_filter, worth_of
-from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.control.tracking import Prediction, StateMoments, narrowest, predictions, worth_of
+from lqrsim.control.tracking_laws import Weights
 from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
@@ -43,61 +43,52 @@ WIDER = 1.25
 GONE = Prediction(chance=1.0, width=1e30, saturation=1.0)  # for a loop whose moments are not finite
 
 
-class Design(NamedTuple):
-    """A filter with the weights of the law that follows it.
-
-    Attributes:
-      model: the model that the filter assumes. filter: its gains and covariances. weights: of the law, or of C laws.
-    """
-
-    model: PlanModel
-    filter: KalmanFilter
-    weights: Weights
-
-
 def with_margin(
-    problem: Problem, solution: Solution, stated: PlanModel, design: Design, tried: Weights,
+    problem: Problem, solution: Solution, stated: PlanModel, design: Design, tried: Callable[[], Weights],
     assumed: Callable[[float, float], PlanModel],
 ) -> Design:  # fmt: skip
     """The design, or a milder one if it is much worse without the lag.
 
     Args:
       stated: model of the true system, with a lag.
-      tried: weights of C laws that may be chosen.
+      design: of one law.
+      tried: makes the weights of C laws that may be chosen.
       assumed: model for a filter that is told of this share of the lag, with this much doubt.
     """
     told, space = stated.uncertainty.as_steady, solution.policy.control_coordinates
     limits = np.array(space.low), np.array(space.high)
     present, absent = (replace(stated, uncertainty=replace(told, lag=lag)) for lag in (told.lag, 0.0))
 
-    def predicted(truth: PlanModel, one: Design) -> list[Prediction]:
-        found, lost = _moments(truth, one, limits)
-        shown = predictions(problem, solution, told, stated, found)
-        return [GONE if gone else own for gone, own in zip(lost, shown, strict=True)]
+    def predicted(one: Design, laws: tuple[Array, Array]) -> tuple[list[Prediction], list[Prediction]]:
+        """The predictions for C laws, with the lag and without it."""
+        found = []
+        for truth in (present, absent):
+            moments, lost = _moments(LinearLoop(truth, *laws, one.filter.gain, *limits, one.model))
+            shown = predictions(problem, solution, told, stated, moments)
+            found.append([GONE if gone else own for gone, own in zip(lost, shown, strict=True)])
+        return found[0], found[1]
 
-    own = design._replace(weights=design.weights.alone)
-    with_lag = predictions(problem, solution, told, stated, with_filter(*own, limits))
+    gain, offset = design.laws
+    with_lag, without = predicted(design, (gain[None], offset[None]))
     least = narrowest(stated, with_lag)
-    if worth_of(predicted(absent, own), least)[0] <= worth_of(with_lag, least)[0] + CLIFF:
+    if worth_of(without, least)[0] <= worth_of(with_lag, least)[0] + CLIFF:
         return design
+    weights = tried()
     models = [assumed(share, doubt) for share, doubt in MILDER]
-    designs = [design._replace(weights=tried), *(Design(model, kalman_filter(model), tried) for model in models)]
-    found = [(predicted(present, one), predicted(absent, one)) for one in designs]
+    designs = [replace(design, weights=weights), *(Design(model, kalman_filter(model), weights) for model in models)]
+    found = [predicted(one, one.laws) for one in designs]
     least = narrowest(stated, [one for with_lag, _ in found for one in with_lag])
     worth = np.array([np.add(worth_of(one, least), ABSENT * np.array(worth_of(other, least))) for one, other in found])
     worth[np.array([[each.width > WIDER * least for each in with_lag] for with_lag, _ in found])] = np.inf
     i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
-    return designs[i]._replace(weights=tried.pick(int(j)))
+    return replace(designs[i], weights=weights.pick(int(j)))
 
 
-def _moments(
-    truth: PlanModel, design: Design, limits: tuple[Array, Array]
-) -> tuple[StateMoments, npt.NDArray[np.bool_]]:
-    """Moments of the true system under the laws of C weights, and which of them are not finite, (C,): zeros instead."""
-    gain, offset = tracking_laws(design.model, design.weights)
-    n = truth.n
+def _moments(loop: LinearLoop) -> tuple[StateMoments, npt.NDArray[np.bool_]]:
+    """Moments of the true system under C laws, and which of them are not finite, (C,): zeros instead."""
+    n = loop.model.n
     with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-        found = LinearLoop(truth, gain, offset, design.filter.gain, *limits, design.model).moments()
+        found = loop.moments()
         lost = np.asarray(~np.isfinite(found.covariance).all(axis=(1, 2, 3)))
         parts = found.mean[..., :n], found.covariance[..., :n, :n], found.across, found.saturation.mean(axis=(1, 2))
     for part in parts:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from lqrsim.control.plan_model import PlanModel, Step
+from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
 
 
@@ -60,71 +60,65 @@ class LinearLoop:
 
     def moments(self) -> LoopMoments:
         """Prediction from the start to the plan's end, for C laws at once with gain (C, T, m, Z)."""
-        model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
-        estimates = self.filter_gain is not None
-        width, many = size + self._assumed.size if estimates else size, self.gain.shape[:-3]
+        model, steps, n, m, size = self.model, self.model.plan.steps, self.model.n, self.model.m, self.model.size
+        first = 0 if self.filter_gain is None else size  # of the numbers on which the law acts
+        acts, width = slice(first, first + self.gain.shape[-1]), size if first == 0 else size + self._assumed.size
+        halves = [(slice(0, size), model)] + ([(slice(size, width), self._assumed)] if first else [])
+        many = self.gain.shape[:-3]
         mean, covariance = np.zeros((*many, steps + 1, width)), np.zeros((*many, steps + 1, width, width))
-        across, std = np.empty((*many, steps, n, n)), np.empty((*many, steps, model.m))
-        saturation = np.empty((*many, steps, model.m))
+        across, std = np.empty((*many, steps, n, n)), np.empty((*many, steps, m))
+        saturation = np.empty((*many, steps, m))
         covariance[..., 0, :size, :size] = model.start_root @ model.start_root.T
+        # A command u that arrives moves the true system by G (u - a) further than a lost one, after which a stays in
+        # force. The variance of that choice is s (1 - s) G E[(u - a) (u - a)'] G' for a share s that arrives.
+        arrives = model.steps_of_commands[0]
+        lossy = arrives.share * (1 - arrives.share)
         for t in range(steps):
-            seen, noise = self._seen(t)
-            gain, planned, P = self.gain[..., t, :, :], model.plan.controls[t], covariance[..., t, :, :]
-            law = gain @ seen  # as a function of X
-            response = law @ P
-            spread = (response * law).sum(axis=-1) + (gain @ noise * gain).sum(axis=-1)
-            std[..., t, :] = np.sqrt(np.maximum(spread, 0.0))
-            answer = (law @ mean[..., t, :, None])[..., 0]
+            x, P = self._corrected(t, mean[..., t, :], covariance[..., t, :, :])
+            gain, planned = self.gain[..., t, :, :], model.plan.controls[t]
+            response = gain @ P[..., acts, :]
+            shown = 0.0 if first else gain**2 @ model.shown_std**2
+            std[..., t, :] = np.sqrt(np.maximum((response[..., acts] * gain).sum(axis=-1) + shown, 0.0))
+            answer = (gain @ x[..., acts, None])[..., 0]
             slope, level, left = limited(planned + self.offset[..., t, :] + answer, std[..., t, :], self.low, self.high)
             saturation[..., t, :] = 1 - slope
-            ways = []
-            for step in model.steps_of_commands:
-                free, onto, drift = self._without_control(step, t, seen)
-                moved = free @ P + onto @ (slope[..., None] * response)
-                to_noise = onto @ (slope[..., None] * gain)
-                if estimates:
-                    to_noise[..., size:, :] += self._assumed.F[t]
-                ahead = moved @ free.T + moved @ np.swapaxes(slope[..., None] * law, -1, -2) @ onto.T
-                ahead += to_noise @ noise @ np.swapaxes(to_noise, -1, -2) + (onto * left[..., None, :]) @ onto.T
-                means = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
-                ways.append((step.share, means, ahead, moved[..., :n, :n]))
-            mean[..., t + 1, :] = sum(share * means for share, means, _, _ in ways)
-            across[..., t, :, :] = sum(share * moved for share, _, _, moved in ways)
-            total = np.zeros_like(P)
-            for share, means, ahead, _ in ways:
-                apart = means - mean[..., t + 1, :]
-                total += share * (ahead + apart[..., :, None] * apart[..., None, :])
-            total[..., :size, :size] += model.process_noise[t]
-            covariance[..., t + 1, :, :] = 0.5 * (total + np.swapaxes(total, -1, -2))
+            law, response = slope[..., None] * gain, slope[..., None] * response
+            noise = left[..., None] * np.eye(m)  # of the commands
+            if not first:
+                noise = noise + (law * model.shown_std**2) @ np.swapaxes(law, -1, -2)
+            # M P M', of which M has the rows F + G law of the true system and of the filter.
+            moved, ahead, onto = np.empty_like(P), np.empty_like(P), np.empty((width, m))
+            for own, one in halves:
+                moved[..., own, :] = one.F[t] @ P[..., own, :] + one.G[t] @ response
+                mean[..., t + 1, own] = x[..., own] @ one.F[t].T + (level - planned) @ one.G[t].T + one.c[t]
+                onto[own] = one.G[t]
+            pushed = moved[..., acts] @ np.swapaxes(law, -1, -2) + onto @ noise
+            for own, one in halves:
+                ahead[..., own] = moved[..., own] @ one.F[t].T + pushed @ one.G[t].T
+            across[..., t, :, :] = moved[..., :n, :n]
+            ahead[..., :size, :size] += model.process_noise[t]
+            if lossy:
+                force = slice(n, n + m)
+                apart, between = level - model.reached[t] - x[..., force], response - P[..., force, :]
+                square = between[..., acts] @ np.swapaxes(law, -1, -2) - between[..., force] + noise
+                square += apart[..., :, None] * apart[..., None, :]
+                ahead[..., :size, :size] += lossy * (arrives.G[t] @ square @ arrives.G[t].T)
+            covariance[..., t + 1, :, :] = 0.5 * (ahead + np.swapaxes(ahead, -1, -2))
         return LoopMoments(mean, covariance, across, std, saturation)
 
-    def _without_control(self, step: Step, t: int, seen: Array) -> tuple[Array, Array, Array]:
-        """Transition of X without control deviations, the input matrix of these, and the drift: (X, X), (X, m), (X,).
-
-        The rows of the estimates are means over commands, because the filter is not told which commands are lost.
-        """
-        F, G, c = step.F[t], step.G[t], step.c[t]
+    def _corrected(self, t: int, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Mean (X,) and covariance (X, X) after a measurement. For losses, all measurements count less."""
         if self.filter_gain is None:
-            return F, G, c
-        assumed = self._assumed
-        own = assumed.F[t] @ seen
-        free = np.vstack([F @ np.eye(len(F), seen.shape[1]), own])
-        return free, np.vstack([G, assumed.G[t]]), np.concatenate([c, assumed.c[t]])
-
-    def _seen(self, t: int) -> tuple[Array, Array]:
-        """Input of the law as a matrix times X, and the covariance of its noise."""
+            return mean, covariance
         model, n, size = self.model, self.model.n, self.model.size
-        if self.filter_gain is None:
-            return np.eye(n, size), np.diag(model.shown_std**2)
         received = 1 - model.uncertainty.loss
-        K = received * self.filter_gain[t]
-        guess = self._assumed.size
-        seen = np.zeros((guess, size + guess))
-        seen[:, size:] = np.eye(guess)
-        seen[:, :n] += K @ model.H[t]
-        seen[:, size : size + n] -= K @ model.H[t]
+        K, H, x, P = received * self.filter_gain[t], model.H[t], mean.copy(), covariance.copy()
+        x[..., size:] += (x[..., :n] - x[..., size : size + n]) @ H.T @ K.T
+        P[..., size:, :] += K @ (H @ (P[..., :n, :] - P[..., size : size + n, :]))
+        P[..., size:] += (P[..., :n] - P[..., size : size + n]) @ H.T @ K.T
         noise = K @ model.measurement_root[t]
-        return seen, noise @ noise.T / max(received, 1e-12)
+        P[..., size:, size:] += noise @ noise.T / max(received, 1e-12)
+        return x, P
 
 
 def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
+from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
-from lqrsim.control.lag_margin import Design, with_margin
+from lqrsim.control.lag_margin import with_margin
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
@@ -51,7 +51,8 @@ class OffsetFree(Controller):
     unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. A measurement that
     is late by `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation,
     so there is no windup. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort,
-    and predicted states by at least 2 % of what that effort moves them in two periods. If the robot would leave its
+    and predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
+    unknown by at most six standard deviations of such a correction; see `kalman.py`. If the robot would leave its
     plan without a stated lag, filter and law are milder, and with the lag the tube is at most a quarter wider: see
     `lag_margin.py`. `model.uncertainty` is the uncertainty that the filter assumes.
 
@@ -129,10 +130,11 @@ class OffsetFree(Controller):
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
-        self.weights = self._weights(tolerate, efforts, at_end)
+        design = Design(self.model, self.filter, self._weights(tolerate, efforts, at_end))
         if uncertainty.lag > 0 and memory < np.inf:
-            self._keep_margin(stated, memory, tolerate, efforts, at_end)
-        self._law = FilterLaw.of(solution, self.model, self.filter, self.weights)
+            design = self._with_margin(design, stated, memory, tolerate, efforts, at_end)
+        self.model, self.filter, self.weights = design.model, design.filter, design.weights
+        self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
 
     def _replan_rule(self, every: float) -> ReplanRule:
@@ -154,16 +156,18 @@ class OffsetFree(Controller):
         told = self.problem, self.solution, self.uncertainty
         return choose_tolerances(*told, self.model, effort, at_end, moments)
 
-    def _keep_margin(
-        self, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
-    ) -> None:
-        """Make the design milder if it needs the lag."""
-        tried = tolerances_to_try(self.model, effort, at_end) if tolerate is None else self.weights.alone
-        design = Design(self.model, self.filter, self.weights)
-        self.model, self.filter, self.weights = with_margin(
-            self.problem, self.solution, stated, design, tried,
-            lambda share, doubt: for_filter(_told_of(stated, share), memory, effort, doubt),
-        )  # fmt: skip
+    def _with_margin(
+        self, design: Design, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
+    ) -> Design:
+        """The design, or a milder one if it needs the lag."""
+
+        def tried() -> Weights:
+            return design.weights.alone if tolerate is not None else tolerances_to_try(design.model, effort, at_end)
+
+        def assumed(share: float, doubt: float) -> PlanModel:
+            return for_filter(_told_of(stated, share), memory, effort, doubt)
+
+        return with_margin(self.problem, self.solution, stated, design, tried, assumed)
 
     def start(self, trials: int) -> "FilterRun | ReplannedRun":
         records = empty_records(self._law, trials) if self.record else None
@@ -180,14 +184,19 @@ class OffsetFree(Controller):
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
-    def loop(self) -> LinearLoop:
-        """Return the closed loop about the plan as matrices, under the uncertainty as stated.
+    def loop(self, uncertainty: Uncertainty | None = None) -> LinearLoop:
+        """Return the closed loop about the plan as matrices.
+
+        Args:
+          uncertainty: uncertainty of the run; by default the one for which the law was designed.
 
         Raises:
-          InputError: with `replan_every`, which leads to other plans.
+          InputError: with `replan_every`, which leads to other plans; or the uncertainty does not fit the system.
         """
         self._check_one_plan("loop")
-        truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
+        met = self.uncertainty if uncertainty is None else uncertainty
+        met.check(self.problem.dynamics)
+        truth = replace(self.model, uncertainty=met.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.filter_law import FilterLaw, FilterRun
+from lqrsim.control.filter_law import Design, FilterLaw, FilterRun
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
@@ -116,7 +116,7 @@ class ReplannedRun(ControllerRun):
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
-        run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
+        run.law, run.first = FilterLaw.of(solution, Design(about, kalman, law.weights), granted), step
 
 
 def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:

@@ -32,8 +32,9 @@ class SampledLoop:
 
     Attributes:
       mean: mean of the states' deviations from the plan, (T+1, n). covariance: (T+1, n, n). across: covariance with the
-        deviation at the previous knot, (T, n, n). All three are over the trials whose states stay finite.
+        deviation at the previous knot, (T, n, n).
       command: standard deviation of each command, (T, m). saturation: fraction of the commands at their limits, (T, m).
+        Like the moments, they are over the trials whose states stay finite.
       collided: whether each trial collides at a knot, or its state is not finite, (K,).
       farthest: largest distance of each trial from its plan in m, (K,).
     """
@@ -80,7 +81,8 @@ def sample_loop(
             farthest = np.maximum(farthest, np.where(finite, np.linalg.norm(off, axis=1), np.inf))
             if t < plan.steps:
                 commands[t] = robots.advance(t, run.control(t, robots.measure(t)))
-    off = (states - plan.states[:, None])[:, np.isfinite(farthest)]
+    stayed = np.isfinite(farthest)
+    off, commands = (states - plan.states[:, None])[:, stayed], commands[:, stayed]
     mean = off.mean(axis=1)
     off -= mean[:, None]
     count = max(off.shape[1], 1)

@@ -174,8 +174,9 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits
     gain, offset = tracking_laws(model, weights)
     learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
     unlearned = model.F[:, :n] @ kalman.corrected[:-1, :, :n]
-    # Covariance and mean of the estimate's deviation from the plan.
-    estimate, mean = np.zeros((count, model.size, model.size)), np.zeros((count, model.size))
+    # Covariance and mean of the estimate's deviation from the plan. As in `of_states`, no law moves the unknowns.
+    size, transition = model.size, model.transition
+    estimate, mean = np.zeros((count, size, size)), np.zeros((count, own))
     covariance, across = np.empty((count, steps + 1, n, n)), np.empty((count, steps, n, n))
     means, beyond = np.empty((count, steps + 1, n)), np.zeros((count, model.m))
     for t in range(steps + 1):
@@ -183,23 +184,23 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits
         estimate += learned[t]
         if t == steps:
             break
-        law, F, G = gain[:, t], model.F[t], model.G[t, :own]
+        law, F, G, planned = gain[:, t], model.F[t, :own], model.G[t, :own], model.plan.controls[t]
         response = law @ estimate
         std = np.sqrt(np.maximum((response * law).sum(axis=2), 0.0))
-        planned = model.plan.controls[t]
-        slope, level, left = limited(planned + offset[:, t] + (law @ mean[:, :, None])[:, :, 0], std, *limits)
+        centre = planned + offset[:, t] + (law[:, :, :own] @ mean[:, :, None])[:, :, 0]
+        slope, level, left = limited(centre, std, *limits)
         beyond += (1 - slope) / steps
-        # M estimate M' of M = F + G slope law. Only the rows of G for the state and the actuators are not zero.
-        law = slope[:, :, None] * law
-        moved = F @ estimate
-        moved[:, :own] += G @ (slope[:, :, None] * response)
+        # M estimate M' of M = F + G slope law. The estimate is symmetric, so one product serves all laws.
+        moved = np.ascontiguousarray((estimate.reshape(-1, size) @ F.T).reshape(count, size, own).swapaxes(1, 2))
+        moved += G @ (slope[:, :, None] * response)
+        pushed = moved @ (slope[:, :, None] * law).transpose(0, 2, 1) + G * left[:, None, :]
         # The true state is the estimate plus its error; the control moves only the estimate.
         across[:, t] = moved[:, :n, :n] + unlearned[t]
-        estimate = moved @ F.T
-        estimate[:, :, :own] += moved @ law.transpose(0, 2, 1) @ G.T
-        estimate[:, :own, :own] += (G * left[:, None, :]) @ G.T
-        mean = mean @ F.T + model.c[t]
-        mean[:, :own] += (level - planned) @ G.T
+        meet = moved[:, :, own:] @ transition.T
+        estimate[:, own:, own:] = transition @ estimate[0, own:, own:] @ transition.T
+        estimate[:, :own, :own] = (moved.reshape(-1, size) @ F.T).reshape(count, own, own) + pushed @ G.T
+        estimate[:, :own, own:], estimate[:, own:, :own] = meet, meet.transpose(0, 2, 1)
+        mean = mean @ F[:, :own].T + model.c[t, :own] + (level - planned) @ G.T
     return StateMoments(means, covariance, across, beyond.mean(axis=1))
 
 

@@ -119,7 +119,8 @@ def predict_tube(
       solution: the solution whose plan is run.
       uncertainty: the uncertainty in a run. With a latency or a delay, mean and covariance are computed from the
         samples that stay finite.
-      controller: an OffsetFree or an AffinePolicy; by default the solution's policy.
+      controller: an OffsetFree of this solution or an AffinePolicy; by default the solution's policy. It may have been
+        designed for another uncertainty.
       samples: number of trials with the nonlinear model, for the chance of collision. By default 4000, more for short
         plans of small systems, up to 20,000; none without obstacles, with dynamics that are stepped by MuJoCo or
         written in plain Python, and with distances by MuJoCo.
@@ -138,7 +139,10 @@ def predict_tube(
     check_count("predict_tube: seed", seed, at_least=0)
     plan = solution.trajectory
     if isinstance(controller, OffsetFree):
-        loop, law = controller.loop(), controller
+        own = controller.solution.trajectory
+        if not (np.array_equal(own.states, plan.states) and np.array_equal(own.controls, plan.controls)):
+            raise InputError("predict_tube: controller: got an OffsetFree of another plan, want one of the solution")
+        loop, law = controller.loop(uncertainty), controller
     else:
         asked: object = solution.policy if controller is None else controller
         policy = check_kind("predict_tube: controller", asked, AffinePolicy, "an OffsetFree or an AffinePolicy")

@@ -30,6 +30,7 @@ from lqrsim.results.coordinates import Coordinates, PerEntry
 MEAN = 0.5  # for a filter, the standard deviation of a varying unknown's mean, relative to the unknown's
 SUMMED = ("start", "control", "measurement", "model_error")  # standard deviations of independent noises
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)  # of Gauss and Legendre, from -1 to 1
 
 
 @dataclass(frozen=True)
@@ -274,10 +275,9 @@ def shaping_filter(unknown: Unknown, dt: float) -> ShapingFilter:
         return ShapingFilter(np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std))
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
     # The integral of e^As b b' e^A's over the period. It equals I - F F', but that form cancels if the period is short.
-    nodes, weights = np.polynomial.legendre.leggauss(32)
     length = min(step, 40.0)
-    s = 0.5 * length * (nodes + 1)
-    noise = np.sqrt(0.5 * length * weights) * 2 * np.exp(-s) * np.array([s, 1 - s])
+    s = 0.5 * length * (NODES + 1)
+    noise = np.sqrt(0.5 * length * WEIGHTS) * 2 * np.exp(-s) * np.array([s, 1 - s])
     return ShapingFilter(F, triangular_root(noise), std / 2 * np.array([1.0, np.sqrt(3.0)]), np.eye(2))
 
 

@@ -56,27 +56,35 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
         q[k] = p[k]
 
 
-def correct(count, measured, near, gain, sensor, angular, estimates, innovations):
+def correct(count, measured, near, gain, limit, wider, sensor, angular, estimates, innovations):
     """Update estimates (count, Z) with measurements, except where these were lost.
 
     Args:
       measured: Measurements; its states are replaced by the representatives nearest to the estimates.
       near: (N,) a state; the estimates are first replaced by the representatives nearest to it. gain: (Z, Y).
+      limit: (D,) largest corrections of the unknowns' states; if one is exceeded, all of these are scaled down.
+      wider: (count,) factors of the limit. They double where it is exceeded, and are 1 again where it is not.
       innovations: (count, Y) measurements minus expectations, written; NaN where the measurement was lost.
     """
     for k in range(count):
-        correct_one(measured.shown[k], measured.lost[k], near, gain, sensor, angular, estimates[k], innovations[k])
+        shown, lost, z = measured.shown[k], measured.lost[k], estimates[k]
+        share = correct_one(shown, lost, near, gain, limit, wider[k], sensor, angular, z, innovations[k])
+        if share < 1.0:
+            wider[k] *= 2.0
+        elif lost == 0.0:
+            wider[k] = 1.0
 
 
 @outline
-def correct_one(shown, lost, near, gain, sensor, angular, z, innovation):
-    """Update the estimate z (Z,) of one trial."""
-    x, seen, expected = stack(N), stack(Y), stack(Y)
+def correct_one(shown, lost, near, gain, limit, wider, sensor, angular, z, innovation):
+    """Update the estimate z (Z,) of one trial. Returns the share of the unknowns' correction that was made."""
+    x, seen, expected, corrected = stack(N), stack(Y), stack(Y), stack(Z)
+    share = 1.0
     to_nearest(z, near, angular)
     if lost != 0.0:
         for j in range(Y):
             innovation[j] = nan
-        return
+        return share
     copy(shown, N, x)
     to_nearest(x, z, angular)
     call(sensor.measure, x, sensor.data, seen)
@@ -87,7 +95,17 @@ def correct_one(shown, lost, near, gain, sensor, angular, z, innovation):
         total = z[i]
         for j in range(Y):
             total += gain[i, j] * innovation[j]
-        z[i] = total
+        corrected[i] = total
+    for i in range(D):
+        change = abs(corrected[N + LAG + i] - z[N + LAG + i])
+        if change * share > wider * limit[i]:
+            share = wider * limit[i] / change
+    for i in range(Z):
+        if share < 1.0 and i >= N + LAG:
+            z[i] += share * (corrected[i] - z[i])
+        else:
+            z[i] = corrected[i]
+    return share
 
 
 def predict(count, controls, predictor, estimates):

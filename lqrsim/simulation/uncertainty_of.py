@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty, gathered
 from lqrsim.errors import InputError, check_kind
@@ -64,9 +63,6 @@ def tube_under(
         uncertainty = uncertainty_of(plant, disturbances)
         if not problem.dynamics.state_coordinates.position:
             raise InputError("the robot has no position")
-        # The filter has the states of the disturbances for which it was designed, and no others.
-        if isinstance(controller, OffsetFree) and repr(controller.uncertainty) != repr(uncertainty):
-            raise InputError("the controller was designed for other disturbances")
         with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop overflows; it is refused below
             tube = predict_tube(problem, solution, uncertainty, controller)
         if not np.isfinite(tube.covariance).all():
