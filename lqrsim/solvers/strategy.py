@@ -369,7 +369,8 @@ class Search:
         """The cheapest plan, whether it has converged or not; with constraints, the best."""
         if self._problem.constraints:
             return self.best[1]
-        return min((found for _, found in self._finished), key=lambda one: one.cost if np.isfinite(one.cost) else np.inf)
+        finite = [found for _, found in self._finished if np.isfinite(found.cost)]
+        return min(finite, key=lambda found: found.cost, default=self.best[1])
 
     def _stiffen(
         self, found: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int
