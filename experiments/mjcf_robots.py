@@ -5,6 +5,7 @@
     python experiments/mjcf_robots.py --only acrobot swimmer
     python experiments/mjcf_robots.py --quick       # a few iterations of each
     python experiments/mjcf_robots.py --family --models models    # arms, hands, legs and vehicles, as they come
+    python experiments/mjcf_robots.py --rounding --iterations 60  # what a change of the start by 1e-12 does
 
 `experiments/mjcf/tasks.py` says what each is to do, `experiments/mjcf/family.py` what the family is, and how to get its
 files. What is not installed is left out, and named. Each row is kept as soon as it is done: the same command goes on
@@ -32,6 +33,7 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 OUT = Path("runs/mjcf_robots")
 TILE = 400, 225  # pixels of a picture on the sheet of all
 WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and below what it is better
+ROUNDING = 1e-12  # standard deviation of a change of controls
 EXACT = 1e-14  # tolerance of MuJoCo's constraint solver in plans
 CLOSE = 0.01  # rad or m; a robot is at its goal if no joint is farther from it
 
@@ -54,6 +56,8 @@ class Config(FolderSettings):
     """Draw each run."""
     frictionless: bool = False
     """Begin with a plan without dry friction, which hides from a plan at rest that controls have an effect."""
+    rounding: bool = False
+    """Only the costs from three starts that differ by rounding: the default controls, changed by 1e-12."""
 
 
 def main(config: Config) -> Result:
@@ -67,6 +71,9 @@ def main(config: Config) -> Result:
     here = [task for task in wanted if task.path is not None]
     result = opening(config) | {"rows": [], "missing": [task.name for task in wanted if task not in here]}
     for task in progress(here, "robots"):
+        if config.rounding:
+            result["rows"].append({"name": task.name, "costs": costs_by_rounding(task, most)})
+            continue
         limits = {"iterations": most, "time_limit": config.time_limit}
         row = row_of(config, task, limits | ({"frictionless": True} if config.frictionless else {}))
         result["rows"].append(row)
@@ -144,6 +151,16 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
             titles=(task.name,),
         )  # fmt: skip
     return row
+
+
+def costs_by_rounding(task: Task | FamilyTask, most: int) -> list[float]:
+    """The costs of plans from the default controls, changed by `ROUNDING`; with a start, nothing is softened."""
+    problem, costs = task.problem(task.robot()), []
+    for seed in (1, 2, 3):
+        controls = np.tile(problem.nominal_control, (problem.steps, 1))
+        controls += ROUNDING * np.random.default_rng(seed).standard_normal(controls.shape)
+        costs.append(ls.smooth(problem, start=controls, max_iterations=most).cost)
+    return costs
 
 
 def without_friction(problem: ls.Problem) -> ls.Problem:
@@ -266,6 +283,9 @@ def line(row: dict[str, Any]) -> str:
 
 
 def report(result: Result) -> str:
+    if any("costs" in row for row in result["rows"]):
+        rows = [[row["name"], *(f"{cost:.4g}" for cost in row["costs"])] for row in result["rows"]]
+        return table(("robot", "cost", "of the second", "of the third"), rows)
     lines = [table(HEAD, [cells(row) for row in result["rows"]]), ""]
     solved = [row for row in result["rows"] if "cost" in row]
     there = sum(row["success"] and "off" in row and abs(farthest(row)[1]) <= row["close"] for row in solved)

@@ -870,3 +870,54 @@ def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
     data.ctrl[:] = robot.hold(state)
     mujoco.mj_step(robot.scene.model, data, 250)
     np.testing.assert_allclose(data.qpos, robot.configuration(state)[0], rtol=0, atol=1e-6)
+
+
+DRY = """<mujoco model="dry"><option timestep="0.005" integrator="implicitfast"/><compiler autolimits="true"/>
+  <worldbody><body><joint name="way" type="slide" axis="1 0 0" frictionloss="LOSS"/>
+  <geom type="box" size="0.1 0.1 0.1" mass="MASS" contype="0" conaffinity="0"/><body>
+  <joint name="turn" axis="0 1 0" damping="0.1" frictionloss="0.05" armature="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.2" contype="0" conaffinity="0"/></body></body>
+  </worldbody><actuator><motor joint="way" gear="10" ctrlrange="-1 1"/><motor joint="turn" gear="2" ctrlrange="-1 1"/>
+  </actuator></mujoco>"""
+
+
+@settings(max_examples=examples(8), deadline=None)
+@given(mass=st.floats(0.3, 3.0), loss=st.floats(0.2, 3.0), push=st.floats(0.5, 1.0), speed=st.floats(0.5, 2.0))
+def test_dry_friction_is_coulombs_while_a_joint_moves(mass: float, loss: float, push: float, speed: float) -> None:
+    """A block that slides loses its friction from each push, whatever its speed: steps in closed form."""
+    xml = f"""<mujoco><option timestep="0.005"/><worldbody><body>
+      <joint name="way" type="slide" axis="1 0 0" frictionloss="{loss!r}"/>
+      <geom type="sphere" size="0.1" mass="{mass!r}"/></body></worldbody>
+      <actuator><motor joint="way" gear="10"/></actuator></mujoco>"""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "dry"))
+    state = robot.dynamics.step(robot.at(way_velocity=speed), [push], 0.05)
+    h, rate, way, velocity = 0.005, (10 * push - loss) / mass, 0.0, speed
+    for _ in range(10):
+        velocity += h * rate
+        way += h * velocity
+    # MuJoCo's constraint solver ends within 1e-14.
+    np.testing.assert_allclose(state, [way, velocity], rtol=1e-10)
+
+
+@pytest.mark.parametrize("loss", [0.3, 1.0])
+def test_a_plan_with_dry_friction_is_replayed_by_mujocos_own_steps(loss: float) -> None:
+    robot = ls.MjcfRobot(scene_from_xml(DRY.replace("LOSS", repr(loss)).replace("MASS", "1"), "dry"))
+    told = next(line for line in str(robot).splitlines() if "dry friction" in line)
+    assert told == f"  dry friction, in plans and runs: way {loss:g} N, turn 0.05 N m"
+    problem = robot.problem(robot.at(), robot.at(way=0.3, turn=0.4), steps=40, dt=0.02, weights={"m": 100, "rad": 100})
+    plan = ls.smooth(problem, max_iterations=30).trajectory
+    apart = {}
+    for dry in (True, False):
+        model = mujoco.MjModel.from_xml_string(robot.scene.xml)
+        model.opt.tolerance = 1e-14  # the file's own, 1e-8, is that of MuJoCo's friction, too
+        model.dof_frictionloss *= dry
+        data = mujoco.MjData(model)
+        data.qpos[:] = plan.states[0, :2]
+        worst = 0.0
+        for control, after in zip(plan.controls, plan.states[1:], strict=True):
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, 4)
+            worst = max(worst, float(np.abs(data.qpos - after[:2]).max()))
+        apart[dry] = worst
+    assert apart[True] <= 1e-8  # warm starts differ
+    assert apart[False] >= 0.01  # m or rad, if the friction is left out

@@ -372,10 +372,19 @@ class MjcfRobot(Robot):
             if space.position
             else f"  body: {self.body}, whose position is not among the states",
             f"  held at rest by: {_listed(told)}{short}",
+            *([f"  dry friction, in plans and runs: {_listed(dry)}"] if (dry := self._dry()) else []),
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",
         ]
         return "\n".join(lines)
+
+    def _dry(self) -> list[str]:
+        """The dry friction of joints and tendons, by name."""
+        model, space = self.dynamics.physics.model, self.dynamics.state_coordinates
+        joints = zip(space.names, space.units, model.dof_frictionloss.tolist(), strict=False)
+        tendons = ((model.tendon(i).name, "m", loss) for i, loss in enumerate(model.tendon_frictionloss.tolist()))
+        units = {"rad": "N m", "m": "N"}
+        return [f"{name} {loss:.4g} {units[unit]}" for name, unit, loss in (*joints, *tendons) if loss > 0]
 
     def _amiss(self) -> dict[str, list[str]]:
         """Problems of a plan that starts from the MJCF's rest: joints past their limits, and contacts."""

@@ -162,14 +162,18 @@ def reweighted(problem: Problem, times: float) -> Problem:
 
 
 def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
-    """Controls (T, m) that oscillate about the nominal ones, with a phase shift from each to the next."""
+    """Controls (T, m) that oscillate about the nominal ones, with a phase shift from each to the next.
+
+    Args:
+      cycles: their number along the plan; negative for controls that begin the other way.
+    """
     space, nominal = problem.control_coordinates, problem.nominal_control
     actuators = problem.dynamics.control_coordinates
     low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
     room = np.minimum(high - nominal, nominal - low)
     far = SWAY * np.where(np.isfinite(room), np.maximum(room, 0.0), 1.0)
     times = np.arange(problem.steps)[:, None] / problem.steps
-    return nominal + far * np.sin(2 * np.pi * (cycles * times - np.arange(len(nominal)) / 4))
+    return nominal + far * np.sign(cycles) * np.sin(2 * np.pi * (abs(cycles) * times - np.arange(len(nominal)) / 4))
 
 
 def check_starts(problem: Problem, count: int | None) -> None:

@@ -64,8 +64,9 @@ def smooth(
         dynamics of an MJCF cannot run backwards, and are run forwards.
       safeguard: if the method fails, continue from the best plan so far with steps that lower its cost; see
         `kernels/damped_iterations.py`. If this does not converge either among contacts or joint limits of an MJCF, and
-        there is no start, plan for softer contacts and limits and continue from there; see docs/mjcf_robots.md. If the
-        method converges, results are bit-identical with and without the safeguard.
+        there is no start, plan for softer contacts and limits from nine starts, continue from there, and soften and
+        descend within contact modes in at most five rounds; see docs/mjcf_robots.md. If the method converges, results
+        are bit-identical with and without the safeguard.
       stop: "optimal" (gap and first-order optimality within tolerance; for smoothing, also the change of cost) or
         "cost", the paper's test, which considers the change of cost alone and can pass early.
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and

@@ -12,7 +12,8 @@
      (`Search.retry_without_risk`).
   5. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
      step by step to the true ones (`Search.soften`).
-  6. If that ends at a jump or a kink: a descent that keeps the active contacts (`Search.keep_modes`).
+  6. If that ends at a jump or a kink: softening again from the best plan, and a descent that keeps the active contacts,
+     in turn (`Search.alternate`).
   A free duration is found in an outer loop around these steps (`free_duration.py`).
 
 `finish`, for one start
@@ -69,8 +70,12 @@ from lqrsim.solvers.settings import SmootherSettings
 IDLE = 1e-6
 # Factors on the weights of obstacles and goal that lead to another route.
 HEAVIER = (10.0, 100.0)
-# Iterations for each softness of contacts.
-SOFT = 60
+# Iterations for each softness of contacts, for a single plan and for each of several; and the factor by which there are
+# fewer plans at the next softness.
+SOFT, LOOK, FEWER = 60, 25, 3
+# Rounds in which the best plan is softened again, with this number of softnesses, and then descends within its modes;
+# the relative decrease of cost that is worth another; by how much a softened plan may cost more before it descends.
+ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 
 Finish = Callable[[SolveRun, Known], RunResult]
 
@@ -123,7 +128,7 @@ def solve(
         if default and settings.safeguard and not stop.due and not search.best[1].success:
             search.soften()
             if not search.best[1].success and not stop.due:
-                search.keep_modes()
+                search.alternate()
     chosen, found = search.best
     if found.status is Status.INFEASIBLE and not tried and stop.error is None:
         untried = "no time was left for other starts, which may keep the constraints"
@@ -198,6 +203,7 @@ class Search:
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._softer: list[Candidate] = []  # plans for softer contacts
+        self._soft: list[tuple[str, Problem]] = []  # the problem with contacts of each softness, the widest first
 
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
@@ -325,31 +331,95 @@ class Search:
         """Plan for softer contacts and limits, with decreasing softness, and then for the true ones.
 
         Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
-        earlier or later, the rest of the plan must not be lost.
+        earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
+        softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
+        are good, and a third of the plans goes on at each.
         """
-        problem, begin = self._problem, None
-        for name, dynamics in problem.dynamics.softened(self.best[1].states):
-            run, found = self._solve_soft(dataclasses.replace(problem, dynamics=dynamics), begin)
-            self._softer.append(run.candidate(f"contacts of softness {name}", found))
-            if np.isfinite(found.cost):
-                begin = policy_of(found, f"softness {name}")
-            if self._budget.stop.due:
-                return
-        if begin is None:
+        problem = self._problem
+        self._soft = [
+            (name, dataclasses.replace(problem, dynamics=dynamics))
+            for name, dynamics in problem.dynamics.softened(self.best[1].states)
+        ]
+        if not self._soft:
             return
-        run = self._add(replace(begin, summary="a plan for softer contacts"))
-        with problem.dynamics.solving(self._threads):
-            found = self._finish(run, refine)
-        stages = ", ".join(one.start.removeprefix("contacts of softness ") for one in self._softer)
-        detail = f"begun with contacts of softness {stages}; {found.detail}".removesuffix("; ")
-        self._offer(run, replace(found, detail=detail), better=found.rank < self.best[1].rank)
+        (name, widest), *harder = self._soft
+        found = {"": self._keep_softer(name, *self._search_softly(widest))}
+        for cycles, side in itertools.product(SWAYS, (1, -1)):
+            if not self._budget.stop.due:
+                begin, origin = sinusoidal_controls(widest, side * cycles), f", swaying {side * cycles} times"
+                found[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
+        self._stiffen(found, harder, [name], self._budget.left)
 
-    def _solve_soft(self, soft: Problem, begin: InitialGuess | None) -> tuple[SolveRun, RunResult]:
-        """Plan for softer contacts: from the given policy, or by a search without one."""
-        if begin is not None:
-            run = self._another(begin, soft)
-            with soft.dynamics.solving(self._threads), run.budget.limited(SOFT):
-                return run, refine(run, Known())
+    def alternate(self) -> None:
+        """Make the cheapest plan cheaper: soften its contacts a little, stiffen them again, and keep the modes.
+
+        Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
+        again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
+        """
+        optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
+        for _ in range(ROUNDS):
+            before = self._cheapest
+            again = self._stiffen({", again": before}, last, [], SOFT) if last else None
+            begin = min(
+                (one for one in (before, again) if one is not None and one is not optimum),
+                key=lambda one: one.cost, default=before,
+            )  # fmt: skip
+            if begin is optimum or self._budget.stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
+                return
+            if not self._keep_modes(begin):
+                return
+            optimum = self._cheapest
+            if not optimum.cost < before.cost - FELL * abs(before.cost):
+                return
+
+    @property
+    def _cheapest(self) -> RunResult:
+        """The cheapest plan, whether it has converged or not; with constraints, the best."""
+        if self._problem.constraints:
+            return self.best[1]
+        finite = [found for _, found in self._finished if np.isfinite(found.cost)]
+        return min(finite, key=lambda found: found.cost, default=self.best[1])
+
+    def _stiffen(
+        self, found: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int
+    ) -> RunResult | None:
+        """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
+
+        Args:
+          found: plans by the ends of their names. before: softnesses that they have passed. most: iterations at most
+            for the true contacts.
+
+        Returns:
+          The plan for the true contacts; None if no time is left for it.
+        """
+        for name, problem in soft:
+            most_soft = LOOK if len(found) > 1 else SOFT
+            found = {
+                origin: self._solve_softly(f"{name}{origin}", problem, policy_of(one, name), most_soft)
+                for origin, one in found.items()
+                if np.isfinite(one.cost)
+            } or found
+            if self._budget.stop.due:
+                return None
+            found = dict(sorted(found.items(), key=lambda pair: pair[1].cost)[: -(-len(found) // FEWER)])
+        origin = min(found, key=lambda origin: found[origin].cost)
+        run = self._add(policy_of(found[origin], "a plan for softer contacts"))
+        with self._problem.dynamics.solving(self._threads), run.budget.limited(most):
+            ended = self._finish(run, refine)
+        stages = ", ".join([*before, *(name for name, _ in soft)])
+        detail = f"begun with contacts of softness {stages}{origin}; {ended.detail}".removesuffix("; ")
+        ended = replace(ended, detail=detail)
+        self._offer(run, ended, better=ended.rank < self.best[1].rank)
+        return ended
+
+    def _solve_softly(self, name: str, soft: Problem, begin: InitialGuess, most: int) -> RunResult:
+        """Plan for softer contacts from a policy."""
+        run = self._another(begin, soft)
+        with soft.dynamics.solving(self._threads), run.budget.limited(most):
+            return self._keep_softer(name, run, refine(run, Known()))
+
+    def _search_softly(self, soft: Problem) -> tuple[SolveRun, RunResult]:
+        """Plan for softer contacts by a search."""
         given = guides(soft, None)
         runs = [self._another(resolve(one, soft), soft) for _, one in given]
         search = Search([name for name, _ in given], runs, self._callback, self._threads)
@@ -359,21 +429,31 @@ class Search:
                 search.widen()
         return search.best
 
-    def keep_modes(self) -> None:
-        """Continue from the best plan within its contact modes, in which a plan may end next to a jump or at a kink."""
+    def _keep_softer(self, name: str, run: SolveRun, found: RunResult) -> RunResult:
+        """Keep a plan for softer contacts as a candidate."""
+        self._softer.append(run.candidate(f"contacts of softness {name}", found))
+        return found
+
+    def _keep_modes(self, plan: RunResult) -> bool:
+        """Continue from a plan within its contact modes, in which it may end next to a jump or at a kink.
+
+        Returns:
+          Whether this is possible.
+        """
         from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
-        best = self.best[1]
-        run = self._another(policy_of(best, "the best plan"))
+        run = self._another(policy_of(plan, "the best plan"))
         run.budget.report_to(self._callback)
         found = None
         # A cost that is not curved in all controls has no descent of this kind.
         with self._problem.dynamics.solving(self._threads), contextlib.suppress(np.linalg.LinAlgError):
-            found = keep_modes(run, best)
-        if found is not None:
-            self._named.append(("the best plan, within its contact modes", run))
-            detail = "; ".join(part for part in (best.detail.partition("; ")[0], found.detail) if part)
-            self._offer(run, replace(found, detail=detail), better=found.rank <= best.rank)
+            found = keep_modes(run, plan)
+        if found is None:
+            return False
+        self._named.append(("the best plan, within its contact modes", run))
+        detail = "; ".join(part for part in (plan.detail.partition("; ")[0], found.detail) if part)
+        self._offer(run, replace(found, detail=detail), better=found.rank <= self.best[1].rank)
+        return True
 
     def candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
