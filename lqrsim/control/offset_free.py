@@ -162,7 +162,11 @@ class OffsetFree(Controller):
         """The design, or a milder one if it needs the lag."""
 
         def tried() -> Weights:
-            return design.weights.alone if tolerate is not None else tolerances_to_try(design.model, effort, at_end)
+            return (
+                design.weights.alone
+                if tolerate is not None
+                else tolerances_to_try(design.model, effort, at_end, self.solution.target)
+            )
 
         def assumed(share: float, doubt: float) -> PlanModel:
             return for_filter(_told_of(stated, share), memory, effort, doubt)

@@ -25,11 +25,12 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
-from lqrsim.results.goal import scale_of
+from lqrsim.results.goal import Target, scale_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 
 PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control periods in which a deviation may decay
+WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
 # The chance of failure that a tube of twice the narrowest width is charged. It is small, so that width decides only if
 # the plan is far from all obstacles, or collides with any law.
 NARROW = 0.02
@@ -73,18 +74,24 @@ def choose_tolerances(
       at_end: as in `track`.
       moments: predicts the moments under the laws of C weights and the limits of the controls.
     """
-    tried, space = tolerances_to_try(model, effort, at_end), solution.policy.control_coordinates
+    tried, space = tolerances_to_try(model, effort, at_end, solution.target), solution.policy.control_coordinates
     found = moments(tried, (np.array(space.low), np.array(space.high)))
     told = predictions(problem, solution, uncertainty, model, found)
     worth = worth_of(told, narrowest(model, told))
     return tried.pick(min(reversed(range(len(worth))), key=worth.__getitem__))  # of equals the gentlest
 
 
-def tolerances_to_try(model: PlanModel, effort: Array, at_end: float) -> Weights:
-    """Weights for each number of periods that a deviation may take to decay, the tightest first."""
+def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Target) -> Weights:
+    """Weights for each number of periods that a deviation may take to decay, the tightest first.
+
+    If the goal leaves states free, the same with wide tolerances for these follow: a satellite that must take up an
+    unplanned spin can only do so by other speeds of its wheels.
+    """
     longest = max(model.plan.steps // 2, PERIODS[0])
     reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
     tried = [unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest]
+    if (free := np.isnan(target.state)).any():
+        tried += [np.where(free, WIDE * one, one) for one in tried]
     each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
     return Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
 
@@ -135,8 +142,8 @@ def prediction_of(
     plan = model.plan.states
     place = list(model.dynamics.state_coordinates.position)
     collide = collision_chance(plan + mean, covariance, across, surroundings)[1]
-    scale = np.ones(len(place)) if place else scale_of(plan)
-    counts = place or list(range(plan.shape[1]))
+    counts = np.array(place) if place else np.flatnonzero(np.isfinite(solution.target.state))
+    scale = np.ones(len(place)) if place else scale_of(plan)[counts]
     squares = (np.diagonal(covariance, axis1=1, axis2=2)[:, counts] + mean[:, counts] ** 2) / scale**2
     width = float(np.sqrt(squares.sum(axis=1).mean()))
     return Prediction(collide + _miss(mean[-1], covariance[-1], solution), width, float(saturation))
