@@ -191,7 +191,11 @@ def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.P
         dataclasses.replace(run, balls=dataclasses.replace(run.balls, driven=run.balls.driven[:1]))
 
 
-def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(tmp_path: Path) -> None:
+@pytest.mark.parametrize("own", ['<camera name="own" pos="0 0 9"/><light pos="0 0 3"/>', ""])
+@pytest.mark.parametrize("size", [(480, 270), (400, 300)])
+def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(
+    tmp_path: Path, own: str, size: tuple[int, int]
+) -> None:
     """Red is what is drawn of the arm, blue the hull that collides, larger; the ball that is followed is low."""
     corners = "-1 -1 -1  1 -1 -1  0 1 -1  0 0 1"
     path = tmp_path / "tall.xml"
@@ -201,7 +205,7 @@ def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(tmp_path:
   <asset>
     <mesh name="hull" vertex="{corners}" scale=".12 .12 .12"/><mesh name="drawn" vertex="{corners}" scale=".1 .1 .1"/>
   </asset>
-  <worldbody><camera name="own" pos="0 0 9"/><light pos="0 0 3"/>
+  <worldbody>{own}
     <body name="mast">
       <joint name="turn" axis="0 0 1" range="-90 90" damping="1"/>
       <geom type="mesh" mesh="drawn" pos="0.3 0 1.5" rgba="1 0 0 1" contype="0" conaffinity="0"/>
@@ -216,15 +220,15 @@ def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(tmp_path:
     problem = robot.problem(robot.at(), robot.at(turn=1.0), steps=20, dt=0.02)
     run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=1))
     still = tmp_path / "still.png"
-    ls.view.render_still(run, still, size=(480, 270), every=run.times[-1] / 4, overlays=())
+    ls.view.render_still(run, still, size=size, every=run.times[-1] / 4, overlays=())
     colours = np.asarray(Image.open(still).convert("RGB")).astype(int)
     red = (colours[..., 0] > 100) & (colours[..., 1:].max(axis=2) < 60)
     blue = (colours[..., 2] > 100) & (colours[..., :2].max(axis=2) < 60)
     rows, columns = np.nonzero(red)
     assert np.ptp(rows) > 150  # a large part of the picture
     assert rows.min() > 0
-    assert rows.max() < 269
+    assert rows.max() < size[1] - 1
     assert columns.min() > 0
-    assert columns.max() < 479
+    assert columns.max() < size[0] - 1
     assert not blue.any()
     assert colours[5, 5].min() > 150

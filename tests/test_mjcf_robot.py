@@ -582,11 +582,11 @@ def test_loops_that_can_not_close_and_couplings_that_bend() -> None:
     np.testing.assert_allclose(bent.at(b=0.3)[:2], [0.1 + 0.3 + 2 * 0.3**2, 0.3], rtol=0, atol=1e-9)
 
 
-def test_a_camera_and_a_light_where_there_are_none() -> None:
+def test_a_light_where_there_is_none() -> None:
     bare = mjcf_files.draw("cart", 0).xml
     assert "<camera" not in bare
     model = ls.MjcfRobot(scene_from_xml(bare, "cart")).scene.model
-    assert (model.ncam, model.nlight) == (1, 1)
+    assert (model.ncam, model.nlight) == (0, 1)
     own = bare.replace("<worldbody>", '<worldbody><light name="lamp"/><camera name="side"/>')
     model = ls.MjcfRobot(scene_from_xml(own, "cart")).scene.model
     assert (model.camera(0).name, model.light(0).name, model.ncam, model.nlight) == ("side", "lamp", 1, 1)

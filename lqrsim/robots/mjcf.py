@@ -63,7 +63,7 @@ class MjcfRobot(Robot):
     angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
     name in the MJCF get a name, such as `unnamed_joint_0`.
 
-    If the file has no camera, or no light, a camera or light named overview is added.
+    If the file has no light, one is added. Without a camera named overview, pictures show the whole run.
 
     Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
     and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of

@@ -95,23 +95,18 @@ def named(xml: str) -> str:
 
 
 def lit(xml: str, model: mujoco.MjModel) -> str:
-    """An MJCF with a camera and a light named overview added if it has none; the same text if it has both.
+    """An MJCF with a light named overview added if it has none.
 
     Args:
       xml: the MJCF. model: the model compiled from it, for its overall size.
     """
-    if (model.ncam and model.nlight) or "</mujoco>" not in xml:
+    if model.nlight or "</mujoco>" not in xml:
         return xml
     middle, size = model.stat.center, float(model.stat.extent)
     added = ElementTree.Element("worldbody")
-    if not model.ncam:
-        place = " ".join(f"{number:.6g}" for number in middle + size * np.array([1.0, -1.6, 0.8]))
-        axes = "0.848 0.53 0 -0.207 0.331 0.921"  # the camera looks from there at the centre
-        ElementTree.SubElement(added, "camera", {"name": "overview", "pos": place, "xyaxes": axes})
-    if not model.nlight:
-        place = " ".join(f"{number:.6g}" for number in middle + size * np.array([-1.0, -1.0, 3.0]))
-        light = {"name": "overview", "pos": place, "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
-        ElementTree.SubElement(added, "light", light)
+    place = " ".join(f"{number:.6g}" for number in middle + size * np.array([-1.0, -1.0, 3.0]))
+    light = {"name": "overview", "pos": place, "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
+    ElementTree.SubElement(added, "light", light)
     end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
     return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
 

@@ -209,10 +209,12 @@ def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
     """Points (k, 3) of the run, and corners of fixed geoms that are near it."""
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    body = recorded.rollout.radius
     if recorded.rollout.balls is not None:  # the links of an arm reach farther than the tracked point
+        body = 0.0
         run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3), *_outer_points(recorded, data, signs)])
     low, high = run.min(axis=0), run.max(axis=0)
-    margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
+    margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * body
     corners = [run]
     for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
         middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]

@@ -287,7 +287,8 @@ class Overlays:
         if "forces" not in self.show:
             return
         recorded, forward = self.recorded, np.array(scene.camera[0].forward, dtype=np.float64)
-        force, radius = recorded.force_at(time), recorded.rollout.radius
+        # The radius of an arm is its reach.
+        force, radius = recorded.force_at(time), min(recorded.rollout.radius, 0.1 * recorded.model.stat.extent)
         strength, width = float(np.linalg.norm(force)), max(0.1 * radius, 1.5 * self.width)
         length = 4 * radius * strength / self.scale.force
         if length < 2 * width or abs(force @ forward) > END_ON * strength:
