@@ -559,7 +559,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     scenario = ls.scenarios.quadrotor()
     tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
     # Estimates of drag that are negative make its predictions explode.
-    wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("drag", 60.0)], measurement=0.02, start=0.01)
+    wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("drag", 3000.0)], measurement=0.02, start=0.01)
 
     def controller(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
         return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)

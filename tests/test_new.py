@@ -74,12 +74,12 @@ def test_what_is_there_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "out" / "hover_disc").mkdir(parents=True)
-    assert main(["new", "hover_disc", "--out", "out"]) == 2
+    (tmp_path / "out" / "kept_disc").mkdir(parents=True)
+    assert main(["new", "kept_disc", "--out", "out"]) == 2
     assert capsys.readouterr().err == (
-        f"lqrsim: error: name: got 'hover_disc', want one without a folder {Path('out') / 'hover_disc'}\n"
+        f"lqrsim: error: name: got 'kept_disc', want one without a folder {Path('out') / 'kept_disc'}\n"
     )
-    assert not list((tmp_path / "out" / "hover_disc").iterdir())
+    assert not list((tmp_path / "out" / "kept_disc").iterdir())
     assert main(["new", "other", "--out", "out"]) == 0
     assert "lqrsim solve out/other/other.py:scenario" in capsys.readouterr().out
 

@@ -199,6 +199,7 @@ class OffsetFree(Controller):
         """
         self._check_one_plan("loop")
         met = self.uncertainty if uncertainty is None else uncertainty
+        check_kind("uncertainty", met, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         met.check(self.problem.dynamics)
         truth = replace(self.model, uncertainty=met.as_steady)
         offset = self.offset - self.solution.trajectory.controls

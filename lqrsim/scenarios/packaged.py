@@ -130,7 +130,11 @@ class Scenario:
 
         Args:
           plan: a solution of the scenario.
+
+        Raises:
+          InputError: it is no Solution.
         """
+        check_kind("plan", plan, Solution, "a Solution of the scenario")
         if self.problem.duration is None:
             return self
         dt = plan.trajectory.dt

@@ -137,10 +137,8 @@ def _load_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look up their module while it runs
     folder = str(path.resolve().parent)
-    if folder not in sys.path:
-        sys.path.append(
-            folder
-        )  # for the modules beside it, as if Python ran the file; last, so that they hide no other
+    if folder not in sys.path:  # for the modules beside it, as if Python ran the file; last, to hide no other module
+        sys.path.append(folder)
     spec.loader.exec_module(module)
     return module
 

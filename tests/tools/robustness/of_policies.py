@@ -28,6 +28,7 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         "Uncertainty.steady": ({"self": uncertainty, "memory": 5.0, "share": 0.2},),
         "track": (common | chosen, 0.5),
         "OffsetFree": (common | chosen | {"sensors": ("x", "y"), "memory": 5.0, "record": False}, 0.5),
+        "OffsetFree.loop": ({"self": law, "uncertainty": uncertainty},),
         "predict_tube": (common | {"controller": law}, 0.5),
         "Tube": (fields(tube),),
         "OutputFeedbackPolicy": (fields(policy),),

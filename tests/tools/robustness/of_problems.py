@@ -250,6 +250,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "robots.names": ({}, 0.1),
         "robots.get": ({"name": "quadrotor"},),
         "Scenario.near_enough": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
+        "Scenario.settled": ({"self": place.scenario, "plan": place.solution},),
         "Scenario.target_radius": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
         "rotations.quaternion": ({"rotation_vector": [0.1, 0.2, 0.3]},),
         "rotations.rotation_vector": ({"quaternion": [1.0, 0.1, 0.2, 0.3]},),
