@@ -1,6 +1,6 @@
 """Policies that survive: tracking, estimation and safe plans, against the smoother's own policy and RotorPy's law.
 
-    python experiments/robust_policies.py                              # everything, some forty minutes
+    python experiments/robust_policies.py                              # everything, several hours
     python experiments/robust_policies.py --sections presets steady    # some of it
     python experiments/robust_policies.py --sections chances severe --keep F.json   # goes on where it was stopped
     python experiments/robust_policies.py --quick                      # as little as shows how it works

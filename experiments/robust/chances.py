@@ -151,5 +151,5 @@ def cells(row: dict[str, Any]) -> list[Any]:
     ratio = row["predicted"] / value if value > 0 else np.nan
     return [
         row["number"], f"{row['asked']:g}", f"{row['linear']:.2g}", f"{row['predicted']:.2g}", f"{value:.2g}",
-        f"{low:.1g} to {high:.1g}", f"{ratio:.2g}", f"{100 * row['strays']:.2g}", row["simulations"],
+        f"{low:.2g} to {high:.2g}", f"{ratio:.2g}", f"{100 * row['strays']:.2g}", row["simulations"],
     ]  # fmt: skip
