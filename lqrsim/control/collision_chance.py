@@ -130,13 +130,19 @@ def collision_chance(
 
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
     """`collision_chance` of clearances in standard deviations (T+1, O) and their correlations with the knot before."""
+    expected = beginnings(margin, correlation).sum()
+    return np.minimum(ndtr(-margin).sum(axis=1), 1.0), float(-np.expm1(-expected))
+
+
+def beginnings(margin: Array, correlation: Array) -> Array:
+    """The chance that a collision with each obstacle begins at each knot, (T+1, O)."""
     each = ndtr(-margin)
-    begins, near = np.zeros_like(correlation), margin[1:] < FAR
+    begins, near = np.zeros_like(margin), margin < FAR
+    begins[0], near[0] = each[0], False
     # In collision at a knot, but not at the previous knot.
-    before = both_below(-margin[1:][near], -margin[:-1][near], correlation[near])
-    begins[near] = np.maximum(each[1:][near] - before, 0.0)
-    expected = each[0].sum() + begins.sum()
-    return np.minimum(each.sum(axis=1), 1.0), float(-np.expm1(-expected))
+    before = both_below(-margin[near], -margin[:-1][near[1:]], correlation[near[1:]])
+    begins[near] = np.maximum(each[near] - before, 0.0)
+    return begins
 
 
 def both_below(first: Array, second: Array, correlation: Array) -> Array:

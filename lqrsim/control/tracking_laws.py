@@ -2,11 +2,12 @@
 
 With z = (e, a, d) as in `plan_model.py` and u the deviation of the command, it minimises
 
-    sum_t  e' Q e + (u + M_t d)' R (u + M_t d)  +  e_T' Q_T e_T.
+    sum_t  e' (Q + E_t) e + (u + M_t d)' R (u + M_t d)  +  e_T' (Q_T + E_T) e_T.
 
-M_t d is the control that cancels the unknowns' effect on the next state as far as controls can. It costs nothing;
-otherwise a steady disturbance would leave a steady error. For the same reason a law assumes that the current
-disturbance continues: a law that expects a wind to abate yields to one that does not.
+E_t is the emphasis on deviations that lead to a collision; see `emphasis.py`. M_t d is the control that cancels the
+unknowns' effect on the next state as far as controls can. It costs nothing; otherwise a steady disturbance would leave
+a steady error. For the same reason a law assumes that the current disturbance continues: a law that expects a wind to
+abate yields to one that does not.
 
 If commands get lost, the law minimises the expected sum over the losses (Schenato 2009: LQG with a hold). When a
 command is lost, the previous one is held. It may be large, which makes the law gentle. The effort of a lost command
@@ -39,11 +40,13 @@ class Weights:
       state: the diagonal of Q, (n,); or C diagonals to compare, (C, n).
       control: diagonal of R, (m,).
       end: the diagonal of Q_T, (n,) or (C, n).
+      emphasis: E, further weights at each knot, (T+1, n, n) or (C, T+1, n, n); None for none.
     """
 
     state: Array
     control: Array
     end: Array
+    emphasis: Array | None = None
 
     @classmethod
     def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: float = AT_END) -> "Weights":
@@ -65,11 +68,17 @@ class Weights:
     @property
     def alone(self) -> "Weights":
         """These as those of one to compare."""
-        return Weights(self.state[None], self.control, self.end[None])
+        return self.pick(None)
 
-    def pick(self, i: int) -> "Weights":
+    def pick(self, i: int | None) -> "Weights":
         """Those of one of C."""
-        return Weights(self.state[i], self.control, self.end[i])
+        emphasis = None if self.emphasis is None else self.emphasis[i]
+        return Weights(self.state[i], self.control, self.end[i], emphasis)
+
+    def stressing(self, emphasis: Array, factors: tuple[float, ...]) -> "Weights":
+        """These with an emphasis (T+1, n, n) times each of C factors, as those of C laws to compare."""
+        many, each = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
+        return Weights(many * self.state, self.control, many * self.end, each * emphasis)
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
@@ -128,6 +137,8 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
     # change the law. `ahead` is (D, s).
     S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, E.shape[2] + 1))
     S[..., range(n), range(n)] = weights.end
+    stressed = np.zeros((steps + 1, 1, 1)) if weights.emphasis is None else np.moveaxis(weights.emphasis, -3, 0)
+    S[..., :n, :n] += stressed[steps]
     for t in range(steps - 1, -1, -1):
         if averse is not None:
             S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
@@ -143,6 +154,7 @@ def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = No
             slope[..., own:] += ahead
             left += share * (kept[t, :own, :own].T @ slope)
         S, ahead = Q + left[..., :own], left[..., own:]
+        S[..., :n, :n] += stressed[t]
         S = 0.5 * (S + np.swapaxes(S, -1, -2))
     return gain, offset
 
