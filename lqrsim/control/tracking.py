@@ -39,9 +39,9 @@ EMPHASIS = (100.0, 30.0, 10.0, 5.0, 2.0, 0.0)
 # The chance of failure that a tube of twice the narrowest width is charged. It is small, so that width decides only if
 # the plan is far from all obstacles, or collides with any law.
 NARROW = 0.02
-# Factor of the squared fraction of commands beyond the limits, as an addition to the chance of failing. The linear model
-# knows nothing of trials that stay at their limits and leave the plan. This value is our choice: with a smaller one the
-# emphasis causes more such trials under strong disturbances than it prevents collisions.
+# Factor of the squared fraction of commands beyond the limits, as an addition to the chance of failing. The linear
+# model knows nothing of trials that stay at their limits and leave the plan. This value is our choice: with a smaller
+# one, under strong disturbances, the emphasis causes more such trials than it prevents collisions.
 FRAGILE = 5.0
 
 
