@@ -50,18 +50,24 @@ def of_number(config: Config, make: Callable[[int], Case], number: int) -> dict[
         "number": number, "asked": plan.asked, "linear": tube.linear_chance, "predicted": tube.collision_chance,
         "strays": tube.strays, "saturation": float(tube.saturation.mean()), "weight": plan.weight,
     }  # fmt: skip
-    if tube.collision_chance < COUNTED:
+    measured, simulations = measured_chance(config, case)
+    return row | {"measured": measured, "simulations": simulations}
+
+
+def measured_chance(config: Config, case: Case) -> tuple[list[float] | None, int]:
+    """The chance of collision with its interval, and the number of simulations; None if splitting found none."""
+    plan = case.plan
+    if plan.tube.collision_chance < COUNTED:
         score = ls.stress.TrialScore(case.plant, plan.solution, case.disturbances, controller=plan.controller)
         options: dict[str, Any] = {"particles": config.particles, "repetitions": 6, "moves": 3}
         try:
             split = ls.stress.failure_probability(score, score.size, seed=config.seed, **options)
-            return row | {"measured": interval(split.probability), "simulations": split.simulations}
         except ls.stress.NoFailure:
-            return row | {"measured": None, "simulations": score.simulations}
+            return None, score.simulations
+        return interval(split.probability), split.simulations
     trials = config.world_trials
     rollout = run(case.plant, plan.solution, plan.controller, case.disturbances, trials=trials, seed=config.seed)
-    measured = interval(rate(int(np.isfinite(rollout.collided_at).sum()), trials))
-    return row | {"measured": measured, "simulations": trials}
+    return interval(rate(int(np.isfinite(rollout.collided_at).sum()), trials)), trials
 
 
 def quadrotor(preset: str, number: int) -> Case:
