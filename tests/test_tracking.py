@@ -59,6 +59,8 @@ class Oracle:
         m = system.B.shape[1]
         self.lag = uncertainty.lag
         step = DT / self.lag if self.lag else np.inf
+        emphasis = weights.emphasis
+        self.roots = None if emphasis is None else np.linalg.cholesky(emphasis).transpose(0, 2, 1)
         self.left = np.exp(-step)
         self.mean = (1 - np.exp(-step)) / step
         # Each unknown: how its states go on, and what of d, gains and offsets it is.
@@ -107,6 +109,8 @@ class Oracle:
         found = []
         for t, command in enumerate(commands):
             found.append(np.sqrt(weights.state) * (x - plan.states[t]))
+            if self.roots is not None:
+                found.append(self.roots[t] @ (x - plan.states[t]))
             effort = np.sqrt(weights.control) * (command - plan.controls[t] + self.undone(d, t))
             if lost and lost[t]:
                 effort, applied = 0 * effort, reached
@@ -121,6 +125,8 @@ class Oracle:
             for move, _, _ in () if self.persistent else self.unknowns:
                 d[place : place + len(move)] = move @ d[place : place + len(move)]
                 place += len(move)
+        if self.roots is not None:
+            found.append(self.roots[-1] @ (x - plan.states[-1]))
         return np.concatenate([*found, np.sqrt(weights.end) * (x - plan.states[-1])])
 
     def best(self, e: Array, a: Array, d: Array) -> Array:
@@ -132,6 +138,13 @@ class Oracle:
         return np.linalg.lstsq(slope, -base, rcond=None)[0].reshape(shape)
 
 
+def weights_of(rng: np.random.Generator, n: int, m: int, steps: int) -> Weights:
+    """Weights, every other time with an emphasis."""
+    factors = rng.normal(size=(steps + 1, n, n)) * rng.uniform(0.1, 3, (steps + 1, 1, 1))
+    emphasis = factors @ factors.transpose(0, 2, 1) + 1e-6 * np.eye(n) if rng.random() < 0.5 else None
+    return Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n), emphasis)
+
+
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
 @hypothesis.settings(max_examples=examples(25))
 def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int, unstable: bool) -> None:
@@ -139,7 +152,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
     system, uncertainty = drawn(structure, seed, unstable=unstable)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
-    weights = Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n))
+    weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
@@ -170,7 +183,7 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     uncertainty = dataclasses.replace(uncertainty, command_loss=share)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
-    weights = Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n))
+    weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)

@@ -1,0 +1,144 @@
+"""Emphasis on the deviations that lead to a collision: against the slopes of the chance, and by exact Monte Carlo."""
+
+from dataclasses import replace
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from sampling import examples
+
+import lqrsim as ls
+from lqrsim.control import tracking
+from lqrsim.control.collision_chance import Surroundings, collision_chance
+from lqrsim.control.emphasis import emphasis_of
+from lqrsim.disturbances import Uncertainty
+from lqrsim.errors import Array
+
+STEPS, DT, RADIUS, START, CONTROL, SENSORS = 40, 0.1, 0.2, 0.05, 3.0, 0.05
+PLACES = ((0.0, 0.1), (0.9, -1.2))
+WORLD = ls.World(
+    [
+        ls.Obstacle(f"pillar {i}", "cylinder", np.array([x, y, 0.0]), np.eye(3), np.array([0.4, 2.0, 0.0]))
+        for i, (x, y) in enumerate(PLACES)
+    ]
+)
+UNCERTAINTY = Uncertainty(start=START, control=CONTROL, measurement=SENSORS)
+
+
+def moves(x, u, p):
+    return [x[2], x[3], u[0], u[1]]
+
+
+@pytest.fixture(scope="module")
+def problem() -> ls.Problem:
+    """A point mass that passes between two pillars with 0.1 m of room."""
+    dynamics = ls.Dynamics(
+        moves, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s2", "ay": "m/s2"},
+        position=("x", "y"), control_limits=(-5.0, 5.0),
+    )  # fmt: skip
+    return ls.Problem(
+        dynamics=dynamics, dt=DT, steps=STEPS, initial=ls.FixedState((-1.5, 0.0, 0.0, 0.0)),
+        stage_cost=ls.ControlCost((1.0, 1.0)), constraints=[ls.Clearance(WORLD, radius=RADIUS, margin=0.1)],
+        final_cost=ls.QuadraticCost(np.full(4, 500.0), about=(1.5, 0.0, 0.0, 0.0)),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def solution(problem: ls.Problem) -> ls.Solution:
+    found = ls.smooth(problem)
+    assert found.success
+    return found
+
+
+@pytest.fixture
+def without(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Laws with tolerances alone, until it is undone."""
+    monkeypatch.setattr(tracking, "EMPHASIS", (0.0,))
+    return monkeypatch
+
+
+def collisions(policy: ls.AffinePolicy, start: Array, trials: int) -> float:
+    """The share of collisions at the knots, by Monte Carlo with the exact discrete double integrator."""
+    rng = np.random.default_rng(1)
+    A = np.eye(4) + DT * np.eye(4, k=2)
+    B = np.concatenate([DT**2 / 2 * np.eye(2), DT * np.eye(2)])
+    x = start + START * rng.standard_normal((trials, 4))
+    hit = np.zeros(trials, dtype=bool)
+    for t in range(STEPS + 1):
+        for place in PLACES:
+            hit |= np.linalg.norm(x[:, :2] - place, axis=1) < 0.4 + RADIUS
+        if t < STEPS:
+            shown = x + SENSORS * rng.standard_normal(x.shape)
+            u = shown @ policy.gain[t].T + policy.offset[t]
+            u = np.clip(u, -5, 5) + CONTROL * rng.standard_normal((trials, 2))
+            x = x @ A.T + np.clip(u, -5, 5) @ B.T
+    return float(hit.mean())
+
+
+def test_laws_with_it_collide_less_often(problem: ls.Problem, solution: ls.Solution, without) -> None:
+    """20,000 trials of each law; with it 3 % collide, which has a standard error of 4 %, without it 7 %."""
+    start = solution.trajectory.states[0]
+    before = collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), start, 20_000)
+    without.undo()
+    after = collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), start, 20_000)
+    assert after < 0.7 * before
+
+
+def test_a_filters_law_collides_less_often_than_with_its_tolerances_alone(
+    problem: ls.Problem, solution: ls.Solution
+) -> None:
+    """Predicted by the trials of the model, 4000 of the same seed for both."""
+    law = ls.OffsetFree(problem, solution, UNCERTAINTY)
+    alone = ls.OffsetFree(problem, solution, UNCERTAINTY, tolerate=tuple(law.weights.state**-0.5))
+    assert law.weights.emphasis is not None
+    assert alone.weights.emphasis is None
+    chance, before = (
+        ls.predict_tube(problem, solution, UNCERTAINTY, one, samples=4000).collision_chance for one in (law, alone)
+    )
+    assert chance < 0.7 * before
+
+
+@hypothesis.given(st.integers(0, 10**6), st.floats(2.5, 6.0), st.floats(0.02, 0.3))
+@hypothesis.settings(max_examples=examples(25))
+def test_it_is_the_slope_of_the_chance(problem: ls.Problem, seed: int, margin: float, deviation: float) -> None:
+    """For knots that say nothing of each other, along random directions.
+
+    The slope of the chance is that of the emphasis times 1 to 1 + 1/z^2: the bounds of Mills' ratio. A further 1 % is
+    for the differences, and for collisions of two knots at once.
+    """
+    rng = np.random.default_rng(seed)
+    surroundings = Surroundings.of(problem, 0.0)
+    states = np.zeros((4, 4))
+    angle = rng.uniform(0, 2 * np.pi, 4)
+    away = 0.4 + RADIUS + deviation * margin * rng.uniform(1.0, 1.2, 4)
+    states[:, :2] = PLACES[0] + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    far = np.linalg.norm(states[:, :2] - PLACES[1], axis=1) - 0.4 - RADIUS
+    hypothesis.assume((far > 8 * deviation).all())  # one pillar alone matters
+    factor = rng.normal(size=(4, 4, 4)) * deviation
+    covariance = factor @ factor.transpose(0, 2, 1) + 1e-6 * np.eye(4)
+    # The same spread toward the pillar at all knots, so that the margins are those that were drawn.
+    normal = (states[:, :2] - PLACES[0]) / away[:, None]
+    scale = deviation**2 / np.einsum("ti,tij,tj->t", normal, covariance[:, :2, :2], normal)
+    covariance *= scale[:, None, None]
+    across = np.zeros((3, 4, 4))
+    found = emphasis_of(surroundings, states, covariance, across, np.ones(4))
+
+    def expected(changed: Array) -> float:
+        return -np.log1p(-collision_chance(states, changed, across, surroundings)[1])
+
+    slopes = []
+    for t in range(1, 4):
+        direction = normal[t] @ rng.normal(size=(2, 1)) * normal[t] + 0.1 * rng.normal(size=2)
+        change = np.zeros_like(covariance)
+        change[t, :2, :2] = 1e-5 * deviation**2 * np.outer(direction, direction)
+        slope = (expected(covariance + change) - expected(covariance - change)) / 2
+        slopes.append(slope / np.sum(found[t] * change[t]))
+    z = (away[1:] - 0.4 - RADIUS) / deviation
+    low, high = np.array(slopes) / (1 + 1 / z**2), np.array(slopes)
+    assert low.max() <= 1.01 * high.min()
+
+
+def test_there_is_none_without_obstacles(problem: ls.Problem) -> None:
+    free = replace(problem, constraints=[])
+    assert ls.OffsetFree(free, ls.smooth(free), UNCERTAINTY).weights.emphasis is None
