@@ -36,12 +36,15 @@ PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control pe
 WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
 # By how much the emphasis may count: deviations at the most critical knot count this many times as much.
 EMPHASIS = (100.0, 30.0, 10.0, 5.0, 2.0, 0.0)
+# The largest fraction of commands beyond the limits with which there is an emphasis. With more, the linear model promises
+# fewer collisions than it keeps: more trials leave their plan for good.
+MODELLED = 0.12
 # The chance of failure that a tube of twice the narrowest width is charged. It is small, so that width decides only if
 # the plan is far from all obstacles, or collides with any law.
 NARROW = 0.02
 # Factor of the squared fraction of commands beyond the limits, as an addition to the chance of failing. The linear
 # model knows nothing of trials that stay at their limits and leave the plan. This value is our choice: with a smaller
-# one, under strong disturbances, the emphasis causes more such trials than it prevents collisions.
+# one, under moderate disturbances, the emphasis causes more such trials than it prevents collisions.
 FRAGILE = 5.0
 
 
@@ -88,7 +91,7 @@ def choose_tolerances(
     weights, (mean, covariance, across, _) = tried.pick(best), (one[best] for one in found)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     emphasis = emphasis_of(surroundings, model.plan.states + mean, covariance, across, weights.state)
-    if not emphasis.any():
+    if told[best].saturation > MODELLED or not emphasis.any():
         return weights
     stressing = weights.stressing(emphasis, EMPHASIS)
     told = predictions(problem, solution, uncertainty, model, moments(stressing, limits))
