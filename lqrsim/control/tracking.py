@@ -36,8 +36,8 @@ PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control pe
 WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
 # By how much the emphasis may count: deviations at the most critical knot count this many times as much.
 EMPHASIS = (100.0, 30.0, 10.0, 5.0, 2.0, 0.0)
-# The largest fraction of commands beyond the limits with which there is an emphasis. With more, the linear model promises
-# fewer collisions than it keeps: more trials leave their plan for good.
+# The largest fraction of commands beyond the limits with which there is an emphasis. With more, the linear model
+# promises fewer collisions than there are, because more trials leave their plan for good.
 MODELLED = 0.12
 # The chance of failure that a tube of twice the narrowest width is charged. It is small, so that width decides only if
 # the plan is far from all obstacles, or collides with any law.
