@@ -313,7 +313,7 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
     assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()
     scale = std[1:, :, None] * std[:-1, None, :]
-    np.testing.assert_allclose(found.across / scale, moments.across / scale, rtol=0, atol=0.05)
+    np.testing.assert_allclose(found.across / scale, moments.across[:, :n, :n] / scale, rtol=0, atol=0.05)
 
 
 def test_samples_are_those_of_a_loop_with_limits_latency_and_delay() -> None:

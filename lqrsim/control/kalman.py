@@ -58,22 +58,25 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     learned, innovation_root = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
     before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
     root = model.start_root if known is None else known
+    variance = np.vecdot(model.measurement_root, model.measurement_root)
+    # [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
+    array, diagonal = np.zeros((measured + size, n + measured + size)), np.arange(measured)
+    ahead = np.empty((size, size + model.disturbing.shape[2]))
     for t in range(knots):
         before[t] = root
-        expected, noise = model.H[t] @ root[:n], model.measurement_root[t]
-        least = np.maximum(RESOLUTION * np.sqrt((expected**2).sum(axis=1) + (noise**2).sum(axis=1)), NOTHING)
-        # [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
-        array = np.zeros((measured + size, n + measured + root.shape[1]))
-        array[:measured, :n], array[:measured, n : n + measured] = noise, np.diag(least)
-        array[:measured, n + measured :], array[measured:, n + measured :] = expected, root
-        array = triangular_root(array)
-        innovation_root[t] = array[:measured, :measured]
+        expected = np.matmul(model.H[t], root[:n], out=array[:measured, n + measured :])
+        least = np.maximum(RESOLUTION * np.sqrt(np.vecdot(expected, expected) + variance[t]), NOTHING)
+        array[:measured, :n], array[diagonal, n + diagonal] = model.measurement_root[t], least
+        array[measured:, n + measured :] = root
+        both = triangular_root(array)
+        innovation_root[t] = both[:measured, :measured]
         if t or known is None:
-            learned[t] = array[measured:, :measured]
-            root = array[measured:, measured:]
+            learned[t], root = both[measured:, :measured], both[measured:, measured:]
         after[t] = root
         if t + 1 < knots:
-            root = triangular_root(np.concatenate([model.F[t] @ root, model.process_root[t]], axis=1))
+            np.matmul(model.F[t], root, out=ahead[:, :size])
+            ahead[:, size:] = model.disturbing[t]
+            root = triangular_root(ahead)
     limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
     return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)
@@ -94,14 +97,16 @@ def _gains(learned: Array, root: Array) -> Array:
 def check_observable(model: PlanModel) -> None:
     """Raise InputError, with the name, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
-    effect = np.eye(model.size)[:, first:]
+    effect, groups = np.eye(model.size)[:, first:], [list(own) for own in model.own_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
         seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
+        if all(seen[own].any() for own in groups):
+            return
         if t < model.plan.steps:
             effect = model.F[t] @ effect
-    for unknown, own in zip(model.remembered, model.own_states, strict=True):
+    for unknown, own in zip(model.remembered, groups, strict=True):
         if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(

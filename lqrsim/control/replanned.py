@@ -116,7 +116,7 @@ class ReplannedRun(ControllerRun):
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
-        run.law, run.first = FilterLaw.of(solution, Design(about, kalman, law.weights), granted), step
+        run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, law.weights), granted), step
 
 
 def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:

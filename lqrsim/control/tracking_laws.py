@@ -25,6 +25,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
 from lqrsim.results.solution import Solution
 
+Laws = tuple[Array, Array]  # gain and offset, as of `tracking_laws`
 CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
 # The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
 # alone; controls that also bring the velocity to rest there have less effort left for it.
@@ -113,38 +114,45 @@ class Averse:
         return S + spread @ S, s + spread @ s
 
 
-def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> tuple[Array, Array]:
-    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z)."""
+def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> Laws:
+    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z).
+
+    The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot.
+    """
     n, m, steps = model.n, model.m, model.plan.steps
     own = n + model.lagging  # states that controls can move
-    (arrives, slopes, G, c), *lost = model.steps_of_commands
-    F, G, c, E = slopes[:, :own, :own], G[:, :own], c[:, :own], slopes[:, :own, own:]
-    many = weights.state.shape[:-1]
+    lost, (slopes, G, c) = model.uncertainty.command_loss, model.arriving
+    F, G = slopes[:, :own, :own], G[:, :own]
+    onto = np.concatenate([slopes[:, :own], c[:, :own, None], G], axis=2)
+    back = np.concatenate([F, G], axis=2).transpose(0, 2, 1)
+    many, width = weights.state.shape[:-1], model.size + 1  # of (y, d, 1)
+    held = np.zeros((steps, m, width))
+    if lost:  # a lost command is that in force, which is a
+        held[:, range(m), range(n, own)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
     Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
     Q[..., range(n), range(n)] = weights.state
-    undo = np.moveaxis(R @ _undoing(model, weights), -3, 0)
-    gain, offset = np.empty((*many, steps, m, model.size)), np.empty((*many, steps, m))
-    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a). The cost of d alone does not
-    # change the law. `ahead` is (D, s).
-    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, E.shape[2] + 1))
+    undo = np.zeros((steps, *many, m, width))
+    undo[..., own:-1] = np.moveaxis(R @ _undoing(model, weights), -3, 0)
+    laws = np.empty((steps, *many, m, width))
+    # The cost of d alone does not change the law. `ahead` is (D, s).
+    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, width - own))
     S[..., range(n), range(n)] = weights.end
     for t in range(steps - 1, -1, -1):
         if averse is not None:
             S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
-        slope = S @ np.concatenate([F[t], E[t], c[t][:, None]], axis=1)
-        slope[..., own:] += ahead
-        right = G[t].T @ slope
-        right[..., own:-1] += undo[t]
-        law = -np.linalg.solve(R + G[t].T @ S @ G[t], right)
-        gain[..., t, :, :], offset[..., t, :] = law[..., :-1], law[..., -1]
-        left = arrives * (F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law)
-        for share, kept, _, drift in lost:
-            slope = S @ np.concatenate([kept[t, :own], drift[t, :own, None]], axis=1)
-            slope[..., own:] += ahead
-            left += share * (kept[t, :own, :own].T @ slope)
-        S, ahead = Q + left[..., :own], left[..., own:]
-        S = 0.5 * (S + np.swapaxes(S, -1, -2))
-    return gain, offset
+        slope = S @ onto[t]
+        slope[..., own:width] += ahead
+        slope = back[t] @ slope
+        right, curve = slope[..., own:, :width], slope[..., own:, width:]
+        laws[t] = law = np.linalg.inv(-R - curve) @ (right + undo[t])
+        left = slope[..., :own, width:] @ ((1 - lost) * law + lost * held[t] if lost else law)
+        left += slope[..., :own, :width]
+        if lost:
+            left[..., n:, :] += lost * (right + curve @ held[t])
+        S, ahead = left[..., :own], left[..., own:]
+        S = Q + 0.5 * (S + np.swapaxes(S, -1, -2))
+    laws = np.moveaxis(laws, 0, -3)
+    return laws[..., :-1], laws[..., -1]
 
 
 def _undoing(model: PlanModel, weights: Weights) -> Array:
@@ -153,7 +161,7 @@ def _undoing(model: PlanModel, weights: Weights) -> Array:
     weighed = B.transpose(0, 2, 1) * weights.state[..., None, None, :]
     curve = weighed @ B
     least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
-    return np.linalg.solve(curve + least[..., None, None] * np.eye(model.m), weighed @ model.E)
+    return np.linalg.inv(curve + least[..., None, None] * np.eye(model.m)) @ (weighed @ model.E)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:
