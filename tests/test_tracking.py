@@ -16,7 +16,7 @@ from scipy.linalg import expm
 import lqrsim as ls
 from lqrsim.control import tracking
 from lqrsim.control.kalman import kalman_filter
-from lqrsim.control.linear_loop import LinearLoop, limited
+from lqrsim.control.linear_loop import LinearLoop, kernels
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty
@@ -217,7 +217,8 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
             law, planned = gain[i, t] @ np.eye(n, model.size), model.plan.controls[t]
             noise = gain[i, t] @ shown @ gain[i, t].T
             std = np.sqrt(np.diag(law @ P @ law.T + noise))
-            slope, level, left = limited(planned + offset[i, t] + law @ x, std, *limits)
+            centre = planned + offset[i, t] + law @ x
+            slope, level, left = np.array([kernels().limit(*one) for one in zip(centre, std, *limits, strict=True)]).T
             law, noise = np.diag(slope) @ law, np.diag(slope) @ noise @ np.diag(slope) + np.diag(left)
             cases = [(1 - share, law, level - planned, noise)]
             if share:  # the command in force stays

@@ -11,7 +11,7 @@ from lqrsim.control.controllers import Controller
 from lqrsim.control.filter_law import Design, FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.lag_margin import with_margin
-from lqrsim.control.linear_loop import LinearLoop, LoopMoments
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
@@ -25,6 +25,7 @@ from lqrsim.control.tracking import (
 from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, PerEntry

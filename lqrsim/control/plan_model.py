@@ -382,9 +382,9 @@ class PlanModel:
         """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
         plan, a = self.plan, self.lagging
         reached = np.zeros((plan.steps + 1, a))
-        reached[0] = plan.controls[0, :a]
-        for t in range(plan.steps if a else 0):
-            reached[t + 1] = plan.controls[t] + self.lag.left * (reached[t] - plan.controls[t])
+        reached[0] = last = plan.controls[0, :a]
+        for t, control in enumerate(plan.controls if a else ()):
+            reached[t + 1] = last = control + self.lag.left * (last - control)
         return reached
 
     @cached_property
@@ -411,6 +411,12 @@ class PlanModel:
     @cached_property
     def disturbing(self) -> Array:
         """Effects on z of independent standard normal numbers that add up to w: another square root, (T, Z, any)."""
+        varying, constant = self._disturbing
+        return np.concatenate([varying, np.broadcast_to(constant, (len(varying), *constant.shape))], axis=2)
+
+    @cached_property
+    def _disturbing(self) -> tuple[Array, Array]:
+        """The effects that vary along the plan, and those that do not, (Z, any)."""
         n, first, steps = self.n, self.n + self.lagging, self.plan.steps
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
         commanded = self.arriving.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
@@ -424,13 +430,13 @@ class PlanModel:
         error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
         fresh = np.zeros((self.size, self.size - first))
         fresh[first:] = _diagonal([part.noise for part in self._filters])
-        own = [np.tile(one, (steps, 1, 1)) for one in (error, fresh)]
-        return np.concatenate([commanded, pushed, *own], axis=2)
+        return np.concatenate([commanded, pushed], axis=2), np.concatenate([error, fresh], axis=1)
 
     @cached_property
     def process_noise(self) -> Array:
         """Covariance of w, (T, Z, Z)."""
-        return self.disturbing @ self.disturbing.transpose(0, 2, 1)
+        varying, constant = self._disturbing
+        return varying @ varying.transpose(0, 2, 1) + constant @ constant.T
 
     @cached_property
     def shown_std(self) -> Array:

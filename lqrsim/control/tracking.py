@@ -17,11 +17,12 @@ from scipy.special import ndtr
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.kalman import KalmanFilter
-from lqrsim.control.linear_loop import ClosedLoop, LinearLoop, LoopMoments, given_covariance
+from lqrsim.control.linear_loop import ClosedLoop, LinearLoop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.kernels.records import LoopArrays, LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.goal import Target, scale_of
@@ -156,19 +157,16 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tupl
     The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
     from a measurement is noise that moves the estimate. The unknowns' estimates are moved by no law.
     """
-    n, own, transition = model.n, model.n + model.lagging, model.transition
+    n, own = model.n, model.n + model.lagging
     learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
-    given = given_covariance(learned[0, own:, own:], transition, learned[1:, own:, own:])
-    F, G, c, noise, given, reached = (
-        one[:, None]
-        for one in (*(part[:, :own] for part in (model.F, model.G, model.c, learned)), given, model.reached)
-    )
+    F, G, c, noise = (one[:, None, :own] for one in (model.F, model.G, model.c, learned))
     gain, offset = (one.swapaxes(0, 1) for one in laws)
     planned = model.plan.controls
-    loop = ClosedLoop(
-        F, G, c, noise, given, transition, gain, planned[:, None] + offset, planned, *limits, 0.0, reached
-    )
-    found = loop.moments(n)
+    arrays = LoopArrays(
+        F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset, planned,
+        np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
+    )  # fmt: skip
+    found = LoopMoments(*(one[0] for one in ClosedLoop(arrays, own).moments(n)))
     return found._replace(
         covariance=found.covariance + kalman.corrected[:, :n, :n],
         across=found.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],

@@ -17,9 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.kernels import tracking_law
+from lqrsim.kernels.records import PassArrays, PassSizes, PassWork
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
@@ -117,48 +121,52 @@ class Averse:
 def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> Laws:
     """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z).
 
-    The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot.
+    The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot. The cost
+    of d alone does not change the law.
     """
-    n, m, steps = model.n, model.m, model.plan.steps
-    own = n + model.lagging  # states that controls can move
-    lost, (slopes, G, c) = model.uncertainty.command_loss, model.arriving
-    F, G = slopes[:, :own, :own], G[:, :own]
-    onto = np.concatenate([slopes[:, :own], c[:, :own, None], G], axis=2)
-    back = np.concatenate([F, G], axis=2).transpose(0, 2, 1)
-    many, width = weights.state.shape[:-1], model.size + 1  # of (y, d, 1)
+    n, m, steps, lost = model.n, model.m, model.plan.steps, model.uncertainty.command_loss
+    own, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
+    state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
+    # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
+    (F, G, c), onto = model.arriving, np.zeros((steps, width, width + m))
+    onto[:, :own, : width - 1], onto[:, :own, width - 1], onto[:, :own, width:] = F[:, :own], c[:, :own], G[:, :own]
+    onto[:, range(own, width), range(own, width)] = 1.0
+    back = np.concatenate([F[:, :own, :own], G[:, :own]], axis=2).transpose(0, 2, 1)
     held = np.zeros((steps, m, width))
     if lost:  # a lost command is that in force, which is a
         held[:, range(m), range(n, own)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
-    Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
-    Q[..., range(n), range(n)] = weights.state
-    undo = np.zeros((steps, *many, m, width))
-    undo[..., own:-1] = np.moveaxis(R @ _undoing(model, weights), -3, 0)
-    laws = np.empty((steps, *many, m, width))
-    # The cost of d alone does not change the law. `ahead` is (D, s).
-    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, width - own))
-    S[..., range(n), range(n)] = weights.end
+    undo = np.zeros((steps, len(state), m, width))
+    undo[..., own:-1] = weights.control[:, None] * _undoing(model, state).swapaxes(0, 1)
+    cost, products = np.zeros((len(state), own, width)), np.empty((len(state), own + m, width + m))
+    cost[:, range(n), range(n)] = end
+    every = np.zeros((len(state), own))
+    every[:, :n] = state
+    sizes, laws = PassSizes(len(state), own, model.size, m, lost), np.empty(undo.shape)
+    given = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
+    work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
+    improve = _kernels().lay_out("improve", 0, sizes, given, work)
     for t in range(steps - 1, -1, -1):
         if averse is not None:
-            S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
-        slope = S @ onto[t]
-        slope[..., own:width] += ahead
-        slope = back[t] @ slope
-        right, curve = slope[..., own:, :width], slope[..., own:, width:]
-        laws[t] = law = np.linalg.inv(-R - curve) @ (right + undo[t])
-        left = slope[..., :own, width:] @ ((1 - lost) * law + lost * held[t] if lost else law)
-        left += slope[..., :own, :width]
-        if lost:
-            left[..., n:, :] += lost * (right + curve @ held[t])
-        S, ahead = left[..., :own], left[..., own:]
-        S = Q + 0.5 * (S + np.swapaxes(S, -1, -2))
-    laws = np.moveaxis(laws, 0, -3)
-    return laws[..., :-1], laws[..., -1]
+            cost[0, :, :own], cost[0, :, -1] = averse.worst(t, cost[0, :, :own], cost[0, :, -1])
+        np.matmul(back[t], cost @ onto[t], out=products)
+        improve(t, sizes, given, work)
+    gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]
+    return (gain, offset) if weights.state.ndim == 2 else (gain[0], offset[0])
 
 
-def _undoing(model: PlanModel, weights: Weights) -> Array:
-    """M, (T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can."""
+def _kernels() -> CompiledModule:
+    """`kernels/tracking_law.py`, which is compiled once for all sizes."""
+    return module_of(source_of(tracking_law), "tracking laws")
+
+
+def _undoing(model: PlanModel, state: Array) -> Array:
+    """M, (C, T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can.
+
+    Args:
+      state: diagonals of Q, (C, n).
+    """
     B = model.jacobian[:, :, model.n :]
-    weighed = B.transpose(0, 2, 1) * weights.state[..., None, None, :]
+    weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B
     least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
     return np.linalg.inv(curve + least[..., None, None] * np.eye(model.m)) @ (weighed @ model.E)

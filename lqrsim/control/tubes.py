@@ -13,13 +13,14 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike, Feedback
-from lqrsim.control.linear_loop import LinearLoop, LoopMoments
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import SHARE, check_fields

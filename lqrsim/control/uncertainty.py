@@ -6,6 +6,7 @@ For your own robot you can also state one directly.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -291,8 +292,13 @@ def triangular_root(root: Array) -> Array:
     if columns < rows:
         root = np.concatenate([root, np.zeros((*root.shape[:-1], rows - columns))], axis=-1)
     if root.ndim == 2:  # in half the time
-        return dgeqrf(root.T)[0].T[:, :rows] * np.tri(rows)
+        return dgeqrf(root.T)[0].T[:, :rows] * _lower(rows)
     return np.swapaxes(np.linalg.qr(np.swapaxes(root, -1, -2), mode="r"), -1, -2)
+
+
+@cache
+def _lower(size: int) -> Array:
+    return np.tri(size)
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
