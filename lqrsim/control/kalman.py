@@ -10,9 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.uncertainty import triangular_root
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels import square_root_filter
+from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes
 
 # The least noise of a measured number, relative to the standard deviation of its prediction. It makes the covariance of
 # exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
@@ -54,29 +57,21 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         used already; the gain there is then zero. By default the filter begins before that measurement, with the
         model's start.
     """
-    knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
-    learned, innovation_root = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
-    before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
-    root = model.start_root if known is None else known
-    variance = np.vecdot(model.measurement_root, model.measurement_root)
-    # [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
-    array, diagonal = np.zeros((measured + size, n + measured + size)), np.arange(measured)
-    ahead = np.empty((size, size + model.disturbing.shape[2]))
-    for t in range(knots):
-        before[t] = root
-        expected = np.matmul(model.H[t], root[:n], out=array[:measured, n + measured :])
-        least = np.maximum(RESOLUTION * np.sqrt(np.vecdot(expected, expected) + variance[t]), NOTHING)
-        array[:measured, :n], array[diagonal, n + diagonal] = model.measurement_root[t], least
-        array[measured:, n + measured :] = root
-        both = triangular_root(array)
-        innovation_root[t] = both[:measured, :measured]
-        if t or known is None:
-            learned[t], root = both[measured:, :measured], both[measured:, measured:]
-        after[t] = root
-        if t + 1 < knots:
-            np.matmul(model.F[t], root, out=ahead[:, :size])
-            ahead[:, size:] = model.disturbing[t]
-            root = triangular_root(ahead)
+    knots, size, measured, n, disturbing = (
+        model.plan.steps + 1,
+        model.size,
+        model.sensor.size,
+        model.n,
+        model.disturbing,
+    )
+    before, after = np.empty((2, knots, size, size))
+    innovation_root, learned = np.empty((knots, measured, measured)), np.zeros((knots, size, measured))
+    sizes = FilterSizes(knots, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING)
+    work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
+    root = np.array(model.start_root if known is None else known, order="C")
+    roots = FilterRoots(*map(np.ravel, (root, before, after, innovation_root, learned, work)))
+    given = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
+    module_of(source_of(square_root_filter), "Kalman filters").filter_along(sizes, given, roots)
     limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
     return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)

@@ -40,17 +40,20 @@ class ClosedLoop:
         """The moments of the first entries of y in each system under each law, (L, C, ...)."""
         loops, (steps, laws, m, width), (systems, own) = self.arrays, self.arrays.K.shape, self.arrays.F.shape[1:3]
         many, lossy = (systems, laws), 0 < self.lost < 1
+        rows, columns = loops.noise.shape[2:]
         sizes = LoopSizes(
-            steps, systems, laws, own, width, m, count, self.stated, *loops.noise.shape[2:], bool(loops.jointly.size),
-            lossy, self.lost / (1 - self.lost) if lossy else 0.0,
+            steps, systems, laws, own, width, m, count, self.stated, rows, columns, bool(loops.jointly.size), lossy,
+            self.lost / (1 - self.lost) if lossy else 0.0,
         )  # fmt: skip
         P, M = np.zeros((2, *many, width, width))
         M[..., own:, own:], moved = loops.transition, np.empty((*many, own, width))
         given = np.empty((systems + 1, *loops.transition.shape))
-        rows, numbers = np.empty((3, *many, m, own)), np.empty((3, *many, m))
+        response, law = np.empty((2, *many, m, width))
+        pushed, shaken, held = np.empty((3, *many, m, own))
+        slope, level, left = np.empty((3, *many, m))
         work = LoopWork(
-            P, M, moved, given[1:], given[0], np.zeros((*many, own)), np.empty(own),
-            *np.empty((2, *many, m, width)), *rows, *numbers,
+            P, M, moved, given[1:], given[0], np.zeros((*many, own)), np.empty(own), response, law, pushed, shaken,
+            held, slope, level, left,
         )  # fmt: skip
         shapes = ((count,), (count, count), (count, count), (m,), (m,))
         lengths = steps + 1, steps + 1, steps, steps, steps
@@ -131,7 +134,7 @@ class LinearLoop:
             noise[1:, i, :stated, :stated], fresh[1:, i] = process[:, :stated, :stated], process[:, stated:, stated:]
         planned, reached = first.plan.controls, np.stack([one.reached for one in models], axis=1)
         arrays = LoopArrays(
-            F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned, shaking @ shaking.swapaxes(-1, -2), jointly,
-            reached, self.low, self.high,
+            F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
+            shaking @ shaking.swapaxes(-1, -2), jointly, reached, self.low, self.high,
         )  # fmt: skip
         return ClosedLoop(arrays, stated, first.uncertainty.command_loss)

@@ -163,8 +163,8 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tupl
     gain, offset = (one.swapaxes(0, 1) for one in laws)
     planned = model.plan.controls
     arrays = LoopArrays(
-        F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset, planned,
-        np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
+        F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset,
+        planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
     )  # fmt: skip
     found = LoopMoments(*(one[0] for one in ClosedLoop(arrays, own).moments(n)))
     return found._replace(

@@ -6,11 +6,9 @@ For your own robot you can also state one directly.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
 
 from lqrsim.errors import (
     Array,
@@ -291,14 +289,7 @@ def triangular_root(root: Array) -> Array:
     rows, columns = root.shape[-2:]
     if columns < rows:
         root = np.concatenate([root, np.zeros((*root.shape[:-1], rows - columns))], axis=-1)
-    if root.ndim == 2:  # in half the time
-        return dgeqrf(root.T)[0].T[:, :rows] * _lower(rows)
     return np.swapaxes(np.linalg.qr(np.swapaxes(root, -1, -2), mode="r"), -1, -2)
-
-
-@cache
-def _lower(size: int) -> Array:
-    return np.tri(size)
 
 
 def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:

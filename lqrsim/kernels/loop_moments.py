@@ -26,14 +26,14 @@ def advance(t, sizes, loops, work, moments):
                 act(t, i, j, sizes, loops, work, moments)
 
 
-@inline
+@outline
 def add_row(factor, a, i, out, k, count):
     """Add factor times a[i:] to out[k:]."""
     for j in range(count):
         out[k + j] += factor * a[i + j]
 
 
-@inline
+@outline
 def add_rows(rows, factors, f, apart, a, i, width, out, k, count):
     """Add the rows of a[i:], each of this width, times factors[f:], which are some places apart, to out[k:]."""
     r = 0
@@ -51,7 +51,7 @@ def add_rows(rows, factors, f, apart, a, i, width, out, k, count):
         r += 1
 
 
-@inline
+@outline
 def dot(a, i, b, k, count):
     """The sum of products of a[i:] and b[k:]."""
     total = 0.0

@@ -315,6 +315,50 @@ class SmootherArrays(NamedTuple):
     certificate: Arrays
 
 
+class FilterSizes(NamedTuple):
+    """Sizes of a Kalman filter; see `square_root_filter.py`.
+
+    Attributes:
+      knots: T+1. entries: Z. measured: Y. states: n. disturbing: D, number of columns of the process noise's root.
+      used: whether the filter begins after the first measurement.
+      resolution, nothing: the least noise of a measurement, relative to its std and absolute.
+    """
+
+    knots: int
+    entries: int
+    measured: int
+    states: int
+    disturbing: int
+    used: bool
+    resolution: float
+    nothing: float
+
+
+class FilterModel(NamedTuple):
+    """F (T, Z, Z), H (T+1, Y, n), and roots of the noise of measurements, (T+1, Y, n), and of the process, (T, Z, D)."""
+
+    F: Arrays
+    H: Arrays
+    noise: Arrays
+    disturbing: Arrays
+
+
+class FilterRoots(NamedTuple):
+    """Square roots of a Kalman filter's covariances; the first is given, the others are written.
+
+    Attributes:
+      root: (Z, Z) at the start; overwritten. before, after: before and after each measurement, (T+1, Z, Z).
+      innovation: S, (T+1, Y, Y). learned: K S, (T+1, Z, Y). work: ((Y+Z) (n+Y+Z),) and at least (Z (Z+D),).
+    """
+
+    root: Arrays
+    before: Arrays
+    after: Arrays
+    innovation: Arrays
+    learned: Arrays
+    work: Arrays
+
+
 class LoopSizes(NamedTuple):
     """Sizes of C laws in L systems; see `loop_moments.py`.
 
@@ -350,8 +394,8 @@ class LoopArrays(NamedTuple):
 
     Attributes:
       F: (T, L, Y, X). G: (T, L, m, Y). c: (T, L, Y).
-      noise: covariance of the first entries of y with the first entries of X: at the start, and then of w, (T+1, L, rows,
-        columns).
+      noise: covariance of the first entries of y with the first entries of X: at the start, and then of w, (T+1, L,
+        rows, columns).
       fresh: covariance of d at the start, and then of its noise, (T+1, L, X - Y, X - Y).
       transition: d' is this times d and noise, (X - Y, X - Y).
       K: (T, C, m, X). command: (T, C, m). planned: (T, m).
