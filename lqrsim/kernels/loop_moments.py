@@ -97,7 +97,7 @@ def disturb(t, system, law, sizes, loops, work):
 @outline
 def arrive(t, system, law, sizes, loops, work, moments):
     """Add the noise that leads to knot t, fill in the rest of the symmetric covariance, and write the moments."""
-    Y, X, rows, columns, count = sizes.moved, sizes.entries, sizes.rows, sizes.columns, sizes.count
+    Y, X, rows, columns, count = sizes.moved, sizes.entries, sizes.rows, sizes.columns, sizes.shown
     k, loop = sizes.laws * system + law, sizes.systems * t + system
     P, R = X * X * k, X - Y
     for i in range(rows):

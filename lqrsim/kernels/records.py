@@ -335,7 +335,7 @@ class FilterSizes(NamedTuple):
 
 
 class FilterModel(NamedTuple):
-    """F (T, Z, Z), H (T+1, Y, n), and roots of the noise of measurements, (T+1, Y, n), and of the process, (T, Z, D)."""
+    """F (T, Z, Z), H (T+1, Y, n), and roots of the noise: of measurements (T+1, Y, n), of the process (T, Z, D)."""
 
     F: Arrays
     H: Arrays
@@ -363,7 +363,7 @@ class LoopSizes(NamedTuple):
     """Sizes of C laws in L systems; see `loop_moments.py`.
 
     Attributes:
-      steps: T. systems: L. laws: C. moved: Y. entries: X. controls: m. count: number of entries of y whose moments are
+      steps: T. systems: L. laws: C. moved: Y. entries: X. controls: m. shown: number of entries of y whose moments are
         written.
       stated: number of the first entries of y that are the system's own. With losses, the last m of these are the
         actuators' states.
@@ -378,7 +378,7 @@ class LoopSizes(NamedTuple):
     moved: int
     entries: int
     controls: int
-    count: int
+    shown: int
     stated: int
     rows: int
     columns: int
