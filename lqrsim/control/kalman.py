@@ -36,7 +36,7 @@ class KalmanFilter(NamedTuple):
       gain: K, (T+1, Z, Y).
       predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
       corrected: covariance of that error after the measurement, (T+1, Z, Z).
-      corrected_root: lower triangular square roots of `corrected`, (T+1, Z, Z).
+      corrected_root: lower triangular square roots of `corrected`, with nonnegative diagonals, (T+1, Z, Z).
       innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
       limit: largest correction of each state of the unknowns by one measurement, (T+1, D); see `PLAUSIBLE`.
     """
@@ -57,13 +57,8 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         used already; the gain there is then zero. By default the filter begins before that measurement, with the
         model's start.
     """
-    knots, size, measured, n, disturbing = (
-        model.plan.steps + 1,
-        model.size,
-        model.sensor.size,
-        model.n,
-        model.disturbing,
-    )
+    knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
+    disturbing = model.disturbing
     before, after = np.empty((2, knots, size, size))
     innovation_root, learned = np.empty((knots, measured, measured)), np.zeros((knots, size, measured))
     sizes = FilterSizes(knots, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING)
