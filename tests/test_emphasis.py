@@ -54,7 +54,7 @@ def solution(problem: ls.Problem) -> ls.Solution:
 @pytest.fixture
 def without(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Laws with tolerances alone, until it is undone."""
-    monkeypatch.setattr(tracking, "EMPHASIS", (0.0,))
+    monkeypatch.setattr(tracking, "MODELLED", -1.0)
     return monkeypatch
 
 
@@ -125,7 +125,7 @@ def test_it_is_the_slope_of_the_chance(problem: ls.Problem, seed: int, margin: f
     found = emphasis_of(surroundings, states, covariance, across, np.ones(4))
 
     def expected(changed: Array) -> float:
-        return -np.log1p(-collision_chance(states, changed, across, surroundings)[1])
+        return float(-np.log1p(-collision_chance(states, changed, across, surroundings)[1]))
 
     slopes = []
     for t in range(1, 4):

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_plans import linear
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -30,7 +31,12 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source
 from lqrsim.codegen.user_functions import numbers_of
+from lqrsim.control import kalman, linear_loop, tracking_laws
 from lqrsim.control.controllers import turning_of
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.tracking import with_filter
+from lqrsim.control.tracking_laws import Weights
+from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
@@ -1065,6 +1071,59 @@ class TestControl:
         replay(source, SIZES, "slopes_along", *given, np.zeros((k, 3)), np.zeros((k, 3, 5)))
         which, changes = np.array([0.0]), np.array([1e-5])
         replay(source, SIZES, "parameter_slopes", *given, which, changes, np.zeros((k, 3, 1)))
+
+
+class TestDesigns:
+    """Kernels of tracking laws, filters and their moments, in the design of a law for a robot with a lag and losses."""
+
+    def test_designs_in_plain_python_are_those_that_are_compiled(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """With five controls, for rows are added by fours, and then the rest."""
+        rng, steps, controls = np.random.default_rng(0), 2, 5
+        system = linear(
+            rng.normal(size=(3, 3)), rng.normal(size=(3, controls)), rng.normal(size=(3, 1)), start=rng.normal(size=3),
+            controls=rng.normal(size=(steps, controls)),
+        )  # fmt: skip
+        told = Uncertainty(
+            unknowns=[Unknown("d0", 0.7), Unknown("gain of u1", 0.1)], start=0.3, measurement=0.1, control=0.2,
+            lag=0.06, command_loss=0.1, loss=0.1,
+        )  # fmt: skip
+        model = PlanModel.of(system.problem.dynamics, system.plan, told)
+        weights = Weights(rng.uniform(1, 2, (2, 3)), np.ones(controls), rng.uniform(1, 2, (2, 3)))
+        limits = np.full(controls, -1.0), np.full(controls, 1.5)
+
+        def design() -> list[Array]:
+            filtered = kalman.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
+            filtered_from_start = kalman.kalman_filter(model)
+            laws = tracking_laws.tracking_laws(model, weights)
+            loop = linear_loop.LinearLoop(model, *laws, filtered_from_start.gain, *limits)
+            return [
+                *filtered,
+                *filtered_from_start,
+                *laws,
+                *loop.moments(),
+                *with_filter(model, filtered, laws, limits),
+            ]
+
+        rng_of_root = np.random.default_rng(0)
+        wanted = design()
+
+        class Plain:
+            """A compiled module's calls, each replayed."""
+
+            def __init__(self, source: Source) -> None:
+                self.source = source
+
+            def lay_out(self, name: str, *_: Any) -> Callable[..., Any]:
+                return lambda *given: replay(self.source, {}, name, *given)
+
+            def __getattr__(self, name: str) -> Callable[..., Any]:
+                return self.lay_out(name)
+
+        for module in (kalman, tracking_laws, linear_loop):
+            monkeypatch.setattr(module, "module_of", lambda source, what: Plain(source))
+        rng_of_root = np.random.default_rng(0)
+        for found, compiled_one in zip(design(), wanted, strict=True):
+            np.testing.assert_allclose(found, compiled_one, rtol=0, atol=1e-9 * max(1.0, np.abs(compiled_one).max()))
 
 
 class TestInteriorPoint:

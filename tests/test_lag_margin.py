@@ -90,7 +90,7 @@ def held(shoulder: float, elbow: float) -> tuple[ls.MjcfRobot, ls.Solution, ls.P
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("lag", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("lag", [0.0, np.finfo(np.float64).tiny, 0.1, 0.5])
 def test_moments_with_another_lag_than_the_filters_are_those_of_runs(seed: int, lag: float) -> None:
     """What a start that is off leaves behind, in NumPy: its covariance is that of the moments, to 1e-9."""
     system = joints(seed, steps=12)

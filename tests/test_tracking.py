@@ -15,7 +15,8 @@ from scipy.linalg import expm
 
 import lqrsim as ls
 from lqrsim.control import tracking
-from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.kalman import kalman_filter
+from lqrsim.control.linear_loop import LinearLoop, kernels
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty
@@ -207,8 +208,8 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.0, 0.05, 0.5, 0.95]))
 @hypothesis.settings(max_examples=examples(12))
-def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, seed: int, share: float) -> None:
-    """What compares tolerances computes a part of the covariance, for several laws at once: to 1e-9 of the numbers."""
+def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, seed: int, share: float) -> None:
+    """Of laws of measured states: dense, one law after the other, each case of a loss by itself; to 1e-9."""
     system, uncertainty = drawn(structure, seed, unstable=False)
     uncertainty = dataclasses.replace(
         uncertainty, command_loss=share, start=0.3, measurement=0.1, control=0.2, model_error=0.05
@@ -217,14 +218,52 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
     gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
     limits = np.full(m, -1.0), np.full(m, 1.5)
-    part = tracking.of_states(model, gain, offset, limits)
-    whole = LinearLoop(model, gain, offset, None, *limits).moments()
-    for i, (mean, covariance, across, saturation) in enumerate(zip(*part, strict=True)):
-        for found, wanted in (
-            (mean, whole.mean[i, :, :n]), (covariance, whole.covariance[i, :, :n, :n]), (across, whole.across[i]),
-            (saturation, whole.saturation[i].mean()),
-        ):  # fmt: skip
-            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
+    found = LinearLoop(model, gain, offset, None, *limits).moments(n)
+    shown, (F, G, c), onto_force = np.diag(model.shown_std**2), model.arriving, np.eye(m, model.size, n)
+    for i in range(3):
+        x, P = np.zeros(model.size), model.start_root @ model.start_root.T
+        for t in range(steps + 1):
+            for moment, wanted in ((found.mean[i, t], x[:n]), (found.covariance[i, t], P[:n, :n])):
+                np.testing.assert_allclose(moment, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
+            if t == steps:
+                break
+            law, planned = gain[i, t] @ np.eye(n, model.size), model.plan.controls[t]
+            noise = gain[i, t] @ shown @ gain[i, t].T
+            std = np.sqrt(np.diag(law @ P @ law.T + noise))
+            centre = planned + offset[i, t] + law @ x
+            slope, level, left = np.array([kernels().limit(*one) for one in zip(centre, std, *limits, strict=True)]).T
+            law, noise = np.diag(slope) @ law, np.diag(slope) @ noise @ np.diag(slope) + np.diag(left)
+            cases = [(1 - share, law, level - planned, noise)]
+            if share:  # the command in force stays
+                behind = x[n : n + m] + model.reached[t] - planned
+                cases.append((share, onto_force, behind, np.zeros((m, m))))
+            chances = [chance for chance, *_ in cases]
+            means = [F[t] @ x + G[t] @ moved + c[t] for _, _, moved, _ in cases]
+            moves = [F[t] + G[t] @ law for _, law, _, _ in cases]
+            spread = [M @ P @ M.T + G[t] @ noise @ G[t].T for M, (_, _, _, noise) in zip(moves, cases, strict=True)]
+            across = np.average([M @ P for M in moves], axis=0, weights=chances)[:n, :n]
+            np.testing.assert_allclose(found.across[i, t], across, rtol=0, atol=1e-9 * max(1.0, np.abs(across).max()))
+            np.testing.assert_allclose(found.command[i, t], std, rtol=1e-9)
+            x = np.average(means, axis=0, weights=chances)
+            P = np.average(spread, axis=0, weights=chances) + model.process_noise[t]
+            P += np.average([np.outer(mean - x, mean - x) for mean in means], axis=0, weights=chances)
+
+
+@hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
+@hypothesis.settings(max_examples=examples(12))
+def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, seed: int, limits: bool) -> None:
+    """Where the filter is right, what compares tolerances is the joint recursion of state and estimate: to 1e-9."""
+    system, uncertainty = drawn(structure, seed, unstable=False)
+    uncertainty = dataclasses.replace(uncertainty, start=0.3, measurement=0.1, control=0.2, model_error=0.05)
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    laws = rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m))
+    bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
+    filtered = kalman_filter(model)
+    part = tracking.with_filter(model, filtered, laws, bounds)
+    whole = LinearLoop(model, *laws, filtered.gain, *bounds).moments(n)
+    for found, wanted in zip(part, whole, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.sampled_from([0.05, 0.5, 0.95]))

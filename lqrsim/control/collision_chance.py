@@ -21,7 +21,7 @@ FAR = 12.0  # standard deviations of clearance; beyond, the chance of a collisio
 
 
 class Spread(NamedTuple):
-    """Distribution of the clearances to O obstacles at T+1 knots.
+    """Distribution of the clearances to O obstacles at T+1 knots; further axes are the first.
 
     Attributes:
       mean: mean in m, (T+1, O). std: standard deviation in m, (T+1, O). correlation: correlation of each clearance with
@@ -104,44 +104,47 @@ class Surroundings:
         return np.min(found, axis=0, initial=np.inf) if found else np.full(len(states), np.inf)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
-        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the previous knot."""
-        place = list(self.position)
-        clearance, normal, displaced = self.clearances(states)
-        variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
+        """Clearances at mean states (..., T+1, n); `across` (..., T, n, n) is the covariance with the previous knot."""
+        place, many = list(self.position), states.shape[:-1]
+        clearance, normal, displaced = self.clearances(states.reshape(-1, states.shape[-1]))
+        clearance, normal = clearance.reshape(*many, -1), normal.reshape(*many, -1, len(place))
+        covariance, across = (one[..., place, :][..., place] for one in (covariance, across))
+        ones = np.ones(len(place))  # a product with it is much faster than `sum` over a short axis
+        variance = (normal @ covariance * normal) @ ones + displaced
         std = np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
-        shared = np.einsum("toi,tij,toj->to", normal[1:], across[:, place][:, :, place], normal[:-1]) + displaced
-        return Spread(clearance, std, np.clip(shared / (std[1:] * std[:-1]), -1.0, 1.0))
+        shared = (normal[..., 1:, :, :] @ across * normal[..., :-1, :, :]) @ ones + displaced
+        return Spread(clearance, std, np.clip(shared / (std[..., 1:, :] * std[..., :-1, :]), -1.0, 1.0))
 
 
 def collision_chance(
     states: Array, covariance: Array, across: Array, surroundings: Surroundings
-) -> tuple[Array, float]:
-    """The chance of being in collision at each knot (T+1,), and of colliding at all.
+) -> tuple[Array, Array]:
+    """The chance of being in collision at each knot (..., T+1), and of colliding at all, (...).
 
     Args:
-      states: means, (T+1, n). covariance: (T+1, n, n). across: covariance of each state with the previous state, (T, n,
-        n).
+      states: means, (..., T+1, n). covariance: (..., T+1, n, n). across: covariance of each state with the previous
+        state, (..., T, n, n).
     """
     if not surroundings.kept:
-        return np.zeros(len(states)), 0.0
+        return np.zeros(states.shape[:-1]), np.zeros(states.shape[:-2])
     clearance, std, correlation = surroundings.spread(states, covariance, across)
     return chance_of_clearances(clearance / std, correlation)
 
 
-def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
-    """`collision_chance` of clearances in standard deviations (T+1, O) and their correlations with the knot before."""
-    expected = beginnings(margin, correlation).sum()
-    return np.minimum(ndtr(-margin).sum(axis=1), 1.0), float(-np.expm1(-expected))
+def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, Array]:
+    """`collision_chance` of clearances in std (..., T+1, O) and their correlations with the last knot (..., T, O)."""
+    expected = beginnings(margin, correlation).sum(axis=(-2, -1))
+    return np.minimum(ndtr(-margin).sum(axis=-1), 1.0), -np.expm1(-expected)
 
 
 def beginnings(margin: Array, correlation: Array) -> Array:
-    """The chance that a collision with each obstacle begins at each knot, (T+1, O)."""
-    each = ndtr(-margin)
-    begins, near = np.zeros_like(margin), margin < FAR
-    begins[0], near[0] = each[0], False
+    """The chance that a collision with each obstacle begins at each knot, (..., T+1, O)."""
+    each, here, last = ndtr(-margin), margin[..., 1:, :], margin[..., :-1, :]
+    begins, near = np.zeros_like(margin), here < FAR
+    begins[..., 0, :] = each[..., 0, :]
     # In collision at a knot, but not at the previous knot.
-    before = both_below(-margin[near], -margin[:-1][near[1:]], correlation[near[1:]])
-    begins[near] = np.maximum(each[near] - before, 0.0)
+    before = both_below(-here[near], -last[near], correlation[near])
+    begins[..., 1:, :][near] = np.maximum(each[..., 1:, :][near] - before, 0.0)
     return begins
 
 

@@ -4,8 +4,7 @@ The run predicts with the nonlinear dynamics. The export, an `OutputFeedbackPoli
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
 from lqrsim.errors import Array
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Measurements, Policy
@@ -24,22 +23,29 @@ from lqrsim.results.plan import Plan
 
 @dataclass(frozen=True)
 class Design:
-    """A filter with the weights of the law that follows it.
+    """A filter with the law that follows it, or with C laws.
 
     Attributes:
       model: the model that the filter assumes.
       filter: its gains and covariances.
-      weights: of the law, or of C laws.
+      weights: of deviations from the plan.
+      laws: gain and offset of the law, as of `tracking_laws`.
     """
 
     model: PlanModel
     filter: KalmanFilter
     weights: Weights
+    laws: Laws
 
-    @cached_property
-    def laws(self) -> tuple[Array, Array]:
-        """Gain and offset, as of `tracking_laws`."""
-        return tracking_laws(self.model, self.weights)
+    @classmethod
+    def of(cls, model: PlanModel, kalman: KalmanFilter, weights: Weights) -> "Design":
+        """The design with the laws of these weights."""
+        return cls(model, kalman, weights, tracking_laws(model, weights))
+
+    def pick(self, i: int) -> "Design":
+        """The design with one of the C laws."""
+        gain, offset = self.laws
+        return replace(self, weights=self.weights.pick(i), laws=(gain[i], offset[i]))
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class FilterLaw:
         unknowns = np.tile(granted, (trajectory.steps + 1, 1))
         nominal = np.concatenate([trajectory.states, model.reached, unknowns], axis=1)
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
-        return cls(plan, model, design.filter, design.weights, gain, offset, nominal)
+        return cls(plan, model, design.filter, design.weights, in_c_order(gain), offset, nominal)
 
     @property
     def coordinates(self) -> Spaces:

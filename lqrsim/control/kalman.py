@@ -10,9 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.uncertainty import triangular_root
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels import square_root_filter
+from lqrsim.kernels.records import FilterModel, FilterRoots, FilterSizes
 
 # The least noise of a measured number, relative to the standard deviation of its prediction. It makes the covariance of
 # exact or redundant sensors invertible. A decision on the rank would also be discontinuous.
@@ -33,7 +36,7 @@ class KalmanFilter(NamedTuple):
       gain: K, (T+1, Z, Y).
       predicted: covariance of the error of z before the measurement of each knot, (T+1, Z, Z).
       corrected: covariance of that error after the measurement, (T+1, Z, Z).
-      corrected_root: lower triangular square roots of `corrected`, (T+1, Z, Z).
+      corrected_root: lower triangular square roots of `corrected`, with nonnegative diagonals, (T+1, Z, Z).
       innovation: covariance of the measurement minus its prediction, (T+1, Y, Y).
       limit: largest correction of each state of the unknowns by one measurement, (T+1, D); see `PLAUSIBLE`.
     """
@@ -55,25 +58,15 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         model's start.
     """
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
-    learned, innovation_root = np.zeros((knots, size, measured)), np.empty((knots, measured, measured))
-    before, after = np.empty((knots, size, size)), np.empty((knots, size, size))
-    root = model.start_root if known is None else known
-    for t in range(knots):
-        before[t] = root
-        expected, noise = model.H[t] @ root[:n], model.measurement_root[t]
-        least = np.maximum(RESOLUTION * np.sqrt((expected**2).sum(axis=1) + (noise**2).sum(axis=1)), NOTHING)
-        # [noise H root; 0 root] times an orthogonal matrix is [S 0; K S root'], of which S S' is the innovation's.
-        array = np.zeros((measured + size, n + measured + root.shape[1]))
-        array[:measured, :n], array[:measured, n : n + measured] = noise, np.diag(least)
-        array[:measured, n + measured :], array[measured:, n + measured :] = expected, root
-        array = triangular_root(array)
-        innovation_root[t] = array[:measured, :measured]
-        if t or known is None:
-            learned[t] = array[measured:, :measured]
-            root = array[measured:, measured:]
-        after[t] = root
-        if t + 1 < knots:
-            root = triangular_root(np.concatenate([model.F[t] @ root, model.process_root[t]], axis=1))
+    disturbing = model.disturbing
+    before, after = np.empty((2, knots, size, size))
+    innovation_root, learned = np.empty((knots, measured, measured)), np.zeros((knots, size, measured))
+    sizes = FilterSizes(knots, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, NOTHING)
+    work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
+    root = np.array(model.start_root if known is None else known, order="C")
+    roots = FilterRoots(*map(np.ravel, (root, before, after, innovation_root, learned, work)))
+    given = FilterModel(*map(np.ravel, (model.F, model.H, model.measurement_root, disturbing)))
+    module_of(source_of(square_root_filter), "Kalman filters").filter_along(sizes, given, roots)
     limit = PLAUSIBLE * np.sqrt((learned[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (one @ one.transpose(0, 2, 1) for one in (before, after, innovation_root))
     return KalmanFilter(_gains(learned, innovation_root), predicted, corrected, after, innovation, limit)
@@ -94,14 +87,16 @@ def _gains(learned: Array, root: Array) -> Array:
 def check_observable(model: PlanModel) -> None:
     """Raise InputError, with the name, for an unknown that moves the robot but changes no measurement."""
     first = model.n + model.lagging
-    effect = np.eye(model.size)[:, first:]
+    effect, groups = np.eye(model.size)[:, first:], [list(own) for own in model.own_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
         seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
+        if all(seen[own].any() for own in groups):
+            return
         if t < model.plan.steps:
             effect = model.F[t] @ effect
-    for unknown, own in zip(model.remembered, model.own_states, strict=True):
+    for unknown, own in zip(model.remembered, groups, strict=True):
         if (unknown.std or unknown.drift) and moved[own].max() > 0 and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(

@@ -17,15 +17,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.control.filter_law import Design
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking import Prediction, StateMoments, narrowest, predictions, worth_of
+from lqrsim.control.tracking import Predictions, narrowest, predictions, worth_of
 from lqrsim.control.tracking_laws import Weights
-from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 
@@ -40,7 +38,7 @@ CLIFF = 0.1
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
 # The largest width of the tube with the lag, relative to the narrowest.
 WIDER = 1.25
-GONE = Prediction(chance=1.0, width=1e30, saturation=1.0)  # for a loop whose moments are not finite
+GONE = (1.0, 1e30, 1.0)  # the predictions for a loop whose moments are not finite
 
 
 def with_margin(
@@ -57,40 +55,35 @@ def with_margin(
     """
     told, space = stated.uncertainty.as_steady, solution.policy.control_coordinates
     limits = np.array(space.low), np.array(space.high)
-    present, absent = (replace(stated, uncertainty=replace(told, lag=lag)) for lag in (told.lag, 0.0))
+    # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
+    none = 0.0 if told.command_loss else np.finfo(np.float64).tiny
+    truths = [stated.under(replace(told, lag=lag)) for lag in (told.lag, none)]
 
-    def predicted(one: Design, laws: tuple[Array, Array]) -> tuple[list[Prediction], list[Prediction]]:
-        """The predictions for C laws, with the lag and without it."""
-        found = []
-        for truth in (present, absent):
-            moments, lost = _moments(LinearLoop(truth, *laws, one.filter.gain, *limits, one.model))
-            shown = predictions(problem, solution, told, stated, moments)
-            found.append([GONE if gone else own for gone, own in zip(lost, shown, strict=True)])
-        return found[0], found[1]
+    def predicted(one: Design) -> Predictions:
+        """The predictions for C laws, with the lag and without it: (2, C)."""
+        loops = LinearLoop(truths[0], *one.laws, one.filter.gain, *limits, one.model).in_systems(truths)
+        with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
+            found = loops.moments(stated.n)
+            lost = np.asarray(~np.isfinite(found.covariance).all(axis=(-3, -2, -1)))
+        for part in found:
+            part[lost] = 0.0
+        shown = predictions(problem, solution, told, stated, found)
+        return Predictions(*(np.where(lost, gone, own) for gone, own in zip(GONE, shown, strict=True)))
 
-    gain, offset = design.laws
-    with_lag, without = predicted(design, (gain[None], offset[None]))
-    least = narrowest(stated, with_lag)
-    if worth_of(without, least)[0] <= worth_of(with_lag, least)[0] + CLIFF:
+    found = predicted(design)
+    worth = worth_of(found, narrowest(stated, found.width[0]))
+    if worth[1, 0] <= worth[0, 0] + CLIFF:
         return design
     weights = tried()
     models = [assumed(share, doubt) for share, doubt in MILDER]
-    designs = [replace(design, weights=weights), *(Design(model, kalman_filter(model), weights) for model in models)]
-    found = [predicted(one, one.laws) for one in designs]
-    least = narrowest(stated, [one for with_lag, _ in found for one in with_lag])
-    worth = np.array([np.add(worth_of(one, least), ABSENT * np.array(worth_of(other, least))) for one, other in found])
-    worth[np.array([[each.width > WIDER * least for each in with_lag] for with_lag, _ in found])] = np.inf
+    designs = [
+        Design.of(design.model, design.filter, weights),
+        *(Design.of(model, kalman_filter(model), weights) for model in models),
+    ]
+    found = [predicted(one) for one in designs]
+    widths = np.array([one.width[0] for one in found])
+    least = narrowest(stated, widths)
+    worth = np.array([worth_of(one, least) for one in found])
+    worth = np.where(widths > WIDER * least, np.inf, worth[:, 0] + ABSENT * worth[:, 1])
     i, j = np.unravel_index(int(np.argmin(worth)), worth.shape)
-    return replace(designs[i], weights=weights.pick(int(j)))
-
-
-def _moments(loop: LinearLoop) -> tuple[StateMoments, npt.NDArray[np.bool_]]:
-    """Moments of the true system under C laws, and which of them are not finite, (C,): zeros instead."""
-    n = loop.model.n
-    with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-        found = loop.moments()
-        lost = np.asarray(~np.isfinite(found.covariance).all(axis=(1, 2, 3)))
-        parts = found.mean[..., :n], found.covariance[..., :n, :n], found.across, found.saturation.mean(axis=(1, 2))
-    for part in parts:
-        part[lost] = 0.0
-    return StateMoments(*parts), lost
+    return designs[i].pick(int(j))

@@ -1,46 +1,86 @@
 """Mean and covariance of a closed loop about its plan, by the recursion of LQG-MP.
 
-The true state and the estimate are jointly Gaussian: X = (z, zhat), with zhat before the measurement of the same knot.
-For a law without an estimate X = z. Control limits enter by statistical linearisation: for u normal with mean mu and
-std sigma, the limited control has the mean slope P(low < u < high), and the rest of its variance is noise.
+The true state and the estimate are jointly Gaussian. Their deviation from the plan is X = (y, d). Commands move
+y = (e, a, zhat), with zhat before the measurement of the same knot; for a law without an estimate, y = (e, a). Nothing
+moves the unknowns d, whose covariance is therefore the same for all laws.
+
+Control limits enter by statistical linearisation: for u normal with mean mu and std sigma, the limited control has the
+mean slope P(low < u < high), and the rest of its variance is noise.
 For lost commands the moments of the mixture are exact; the distribution itself is not Gaussian.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
+from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
+from lqrsim.kernels import loop_moments
+from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork
 
 
-class LoopMoments(NamedTuple):
-    """Moments of X about its plan.
+@dataclass(frozen=True)
+class ClosedLoop:
+    """C laws in L systems: y' = F X + G (u - planned) + c + w with the commands K X + command + r, limited to u.
 
     Attributes:
-      mean: mean of X, (T+1, X).
-      covariance: covariance of X, (T+1, X, X).
-      across: covariance of the states' deviation with their deviation at the previous knot, (T, n, n).
-      command: standard deviation of each command, before it is limited, (T, m).
-      saturation: fraction of the commands that are beyond the limits, (T, m).
+      arrays: F and the others, as defined there.
+      stated: number of the first entries of y that are the system's own. With losses, the last m of these are a.
+      lost: fraction of the commands that get lost.
     """
 
-    mean: Array
-    covariance: Array
-    across: Array
-    command: Array
-    saturation: Array
+    arrays: LoopArrays
+    stated: int
+    lost: float = 0.0
+
+    def moments(self, count: int) -> LoopMoments:
+        """The moments of the first entries of y in each system under each law, (L, C, ...)."""
+        loops, (steps, laws, m, width), (systems, own) = self.arrays, self.arrays.K.shape, self.arrays.F.shape[1:3]
+        many, lossy = (systems, laws), 0 < self.lost < 1
+        rows, columns = loops.noise.shape[2:]
+        sizes = LoopSizes(
+            steps, systems, laws, own, width, m, count, self.stated, rows, columns, bool(loops.jointly.size), lossy,
+            self.lost / (1 - self.lost) if lossy else 0.0,
+        )  # fmt: skip
+        P, M = np.zeros((2, *many, width, width))
+        M[..., own:, own:], moved = loops.transition, np.empty((*many, own, width))
+        given = np.empty((systems + 1, *loops.transition.shape))
+        response, law = np.empty((2, *many, m, width))
+        pushed, shaken, held = np.empty((3, *many, m, own))
+        slope, level, left = np.empty((3, *many, m))
+        work = LoopWork(
+            P, M, moved, given[1:], given[0], np.zeros((*many, own)), np.empty(own), response, law, pushed, shaken,
+            held, slope, level, left,
+        )  # fmt: skip
+        shapes = ((count,), (count, count), (count, count), (m,), (m,))
+        lengths = steps + 1, steps + 1, steps, steps, steps
+        found = LoopMoments(*(np.empty((length, *many, *shape)) for length, shape in zip(lengths, shapes, strict=True)))
+        arguments = sizes, *(type(one)(*map(np.ravel, one)) for one in (loops, work, found))
+        advance = kernels().lay_out("advance", 0, *arguments)
+        for t in range(steps + 1):
+            advance(t, *arguments)
+            if t < steps:
+                np.matmul(M[..., :own, :], P, out=moved)
+                np.matmul(moved, M.swapaxes(-1, -2), out=P[..., :own, :])
+        return LoopMoments(*(np.moveaxis(one, 0, 2) for one in found))
+
+
+def kernels() -> CompiledModule:
+    """`kernels/loop_moments.py`, which is compiled once for all sizes."""
+    return module_of(source_of(loop_moments), "moments of closed loops")
 
 
 @dataclass
 class LinearLoop:
-    """The matrices of a closed loop about a plan.
+    """A closed loop about a plan.
 
     Attributes:
-      model: model of the true system. gain, offset: the law's, (T, m, Z or n) and (T, m), in deviations from the plan.
-      filter_gain: K, (T+1, Z, Y); None for a law of the measured states.
+      model: model of the true system.
+      gain, offset: of a law, (T, m, Z or n) and (T, m), in deviations from the plan; or of C laws, (C, T, m, Z or n).
+      filter_gain: of a Kalman filter, (T+1, Z, Y); None for a law of the measured states.
       low, high: limits of the controls, (m,).
       assumed: the model that the filter assumes, by which Z is that of its estimates; by default that of the true
         system.
@@ -54,83 +94,47 @@ class LinearLoop:
     high: Array
     assumed: PlanModel | None = None
 
-    @property
-    def _assumed(self) -> PlanModel:
-        return self.assumed or self.model
+    def moments(self, count: int | None = None) -> LoopMoments:
+        """The moments of the first entries of y, or of all, from the start to the plan's end."""
+        loop = self.in_systems([self.model])
+        found = loop.moments(loop.arrays.F.shape[2] if count is None else count)
+        return LoopMoments(*(one[0, 0] if self.gain.ndim == 3 else one[0] for one in found))
 
-    def moments(self) -> LoopMoments:
-        """Prediction from the start to the plan's end, for C laws at once with gain (C, T, m, Z)."""
-        model, steps, n, m, size = self.model, self.model.plan.steps, self.model.n, self.model.m, self.model.size
-        first = 0 if self.filter_gain is None else size  # of the numbers on which the law acts
-        acts, width = slice(first, first + self.gain.shape[-1]), size if first == 0 else size + self._assumed.size
-        halves = [(slice(0, size), model)] + ([(slice(size, width), self._assumed)] if first else [])
-        many = self.gain.shape[:-3]
-        mean, covariance = np.zeros((*many, steps + 1, width)), np.zeros((*many, steps + 1, width, width))
-        across, std = np.empty((*many, steps, n, n)), np.empty((*many, steps, m))
-        saturation = np.empty((*many, steps, m))
-        covariance[..., 0, :size, :size] = model.start_root @ model.start_root.T
-        # A command u that arrives moves the true system by G (u - a) further than a lost one, after which a stays in
-        # force. The variance of that choice is s (1 - s) G E[(u - a) (u - a)'] G' for a share s that arrives.
-        arrives = model.steps_of_commands[0]
-        lossy = arrives.share * (1 - arrives.share)
-        for t in range(steps):
-            x, P = self._corrected(t, mean[..., t, :], covariance[..., t, :, :])
-            gain, planned = self.gain[..., t, :, :], model.plan.controls[t]
-            response = gain @ P[..., acts, :]
-            shown = 0.0 if first else gain**2 @ model.shown_std**2
-            std[..., t, :] = np.sqrt(np.maximum((response[..., acts] * gain).sum(axis=-1) + shown, 0.0))
-            answer = (gain @ x[..., acts, None])[..., 0]
-            slope, level, left = limited(planned + self.offset[..., t, :] + answer, std[..., t, :], self.low, self.high)
-            saturation[..., t, :] = 1 - slope
-            law, response = slope[..., None] * gain, slope[..., None] * response
-            noise = left[..., None] * np.eye(m)  # of the commands
-            if not first:
-                noise = noise + (law * model.shown_std**2) @ np.swapaxes(law, -1, -2)
-            # M P M', of which M has the rows F + G law of the true system and of the filter.
-            moved, ahead, onto = np.empty_like(P), np.empty_like(P), np.empty((width, m))
-            for own, one in halves:
-                moved[..., own, :] = one.F[t] @ P[..., own, :] + one.G[t] @ response
-                mean[..., t + 1, own] = x[..., own] @ one.F[t].T + (level - planned) @ one.G[t].T + one.c[t]
-                onto[own] = one.G[t]
-            pushed = moved[..., acts] @ np.swapaxes(law, -1, -2) + onto @ noise
-            for own, one in halves:
-                ahead[..., own] = moved[..., own] @ one.F[t].T + pushed @ one.G[t].T
-            across[..., t, :, :] = moved[..., :n, :n]
-            ahead[..., :size, :size] += model.process_noise[t]
-            if lossy:
-                force = slice(n, n + m)
-                apart, between = level - model.reached[t] - x[..., force], response - P[..., force, :]
-                square = between[..., acts] @ np.swapaxes(law, -1, -2) - between[..., force] + noise
-                square += apart[..., :, None] * apart[..., None, :]
-                ahead[..., :size, :size] += lossy * (arrives.G[t] @ square @ arrives.G[t].T)
-            covariance[..., t + 1, :, :] = 0.5 * (ahead + np.swapaxes(ahead, -1, -2))
-        return LoopMoments(mean, covariance, across, std, saturation)
-
-    def _corrected(self, t: int, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean (X,) and covariance (X, X) after a measurement. For losses, all measurements count less."""
+    def in_systems(self, models: Sequence[PlanModel]) -> ClosedLoop:
+        """The loops in several true systems, which differ in no sizes, and in neither sensors nor losses."""
+        first, steps, m = models[0], self.model.plan.steps, self.model.m
+        n, stated, unknown = first.n, first.n + first.lagging, len(first.transition)
+        gain = self.gain.reshape(-1, *self.gain.shape[-3:]).swapaxes(0, 1)
+        offset = self.offset.reshape(-1, steps, m).swapaxes(0, 1)
+        own = stated if self.filter_gain is None else stated + gain.shape[-1]
+        F, K = np.zeros((steps, len(models), own, own + unknown)), np.zeros((*gain.shape[:-1], own + unknown))
+        G, c = np.empty((steps, len(models), m, own)), np.empty((steps, len(models), own))
+        noise, jointly = np.zeros((steps + 1, len(models), own, own)), np.zeros(0)
+        fresh = np.empty((steps + 1, len(models), unknown, unknown))
         if self.filter_gain is None:
-            return mean, covariance
-        model, n, size = self.model, self.model.n, self.model.size
-        received = 1 - model.uncertainty.loss
-        K, H, x, P = received * self.filter_gain[t], model.H[t], mean.copy(), covariance.copy()
-        x[..., size:] += (x[..., :n] - x[..., size : size + n]) @ H.T @ K.T
-        P[..., size:, :] += K @ (H @ (P[..., :n, :] - P[..., size : size + n, :]))
-        P[..., size:] += (P[..., :n] - P[..., size : size + n]) @ H.T @ K.T
-        noise = K @ model.measurement_root[t]
-        P[..., size:, size:] += noise @ noise.T / max(received, 1e-12)
-        return x, P
-
-
-def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Mean slope, mean and remaining variance of a clipped normal number, elementwise (..., m)."""
-    sigma = np.maximum(std, 1e-12)
-    a, b = (low - centre) / sigma, (high - centre) / sigma
-    inside = ndtr(b) - ndtr(a)
-    below, above = ndtr(a), ndtr(-b)
-    density_a, density_b = (np.exp(-0.5 * np.minimum(x * x, 1500.0)) / np.sqrt(2 * np.pi) for x in (a, b))
-    a, b = np.where(np.isfinite(a), a, 0.0), np.where(np.isfinite(b), b, 0.0)
-    # Moments of min(max(x, a), b) of a standard normal x; a side without a limit contributes nothing.
-    first = density_a - density_b + a * below + b * above
-    second = inside + a * density_a - b * density_b + a * a * below + b * b * above
-    variance = np.maximum(second - first * first - inside * inside, 0.0) * sigma * sigma
-    return inside, centre + sigma * first, variance
+            K[..., :n], shaking = gain, gain * first.shown_std
+        else:
+            # F and K act on the corrected estimate. With losses, all measurements count less.
+            assumed, received = self.assumed or first, 1 - first.uncertainty.loss
+            seen = received * (self.filter_gain @ first.H)[:-1, None]
+            shown = np.sqrt(received) * (self.filter_gain @ first.measurement_root)[:-1, None]
+            for after, on in ((gain, K), (assumed.F[:, None], F[..., stated:, :])):
+                on[..., stated:own], on[..., :n] = after, after @ seen
+                on[..., stated : stated + n] -= on[..., :n]
+            G[..., stated:], c[..., stated:] = assumed.G[:, None].swapaxes(-1, -2), assumed.c[:, None]
+            shaking, shown = gain @ shown, assumed.F[:, None] @ shown
+            noise[1:, :, stated:, stated:] = shown @ shown.swapaxes(-1, -2)
+            jointly = np.zeros((*gain.shape[:-1], own))
+            jointly[..., stated:] = shaking @ shown.swapaxes(-1, -2)
+        for i, one in enumerate(models):
+            F[:, i, :stated, :stated], F[:, i, :stated, own:] = one.F[:, :stated, :stated], one.F[:, :stated, stated:]
+            G[:, i, :, :stated], c[:, i, :stated] = one.G[:, :stated].swapaxes(1, 2), one.c[:, :stated]
+            start, process = one.start_root @ one.start_root.T, one.process_noise
+            noise[0, i, :stated, :stated], fresh[0, i] = start[:stated, :stated], start[stated:, stated:]
+            noise[1:, i, :stated, :stated], fresh[1:, i] = process[:, :stated, :stated], process[:, stated:, stated:]
+        planned, reached = first.plan.controls, np.stack([one.reached for one in models], axis=1)
+        arrays = LoopArrays(
+            F, G, c, noise, fresh, first.transition, K, planned[:, None] + offset, planned,
+            shaking @ shaking.swapaxes(-1, -2), jointly, reached, self.low, self.high,
+        )  # fmt: skip
+        return ClosedLoop(arrays, stated, first.uncertainty.command_loss)

@@ -16,16 +16,16 @@ from lqrsim.control.plan_model import Lag, PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.tracking import (
-    StateMoments,
     choose_tolerances,
     reach_of,
     tolerances_to_try,
     unit_means,
     with_filter,
 )
-from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
+from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, PerEntry
@@ -130,7 +130,7 @@ class OffsetFree(Controller):
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
-        design = Design(self.model, self.filter, self._weights(tolerate, efforts, at_end))
+        design = self._design(tolerate, efforts, at_end)
         if uncertainty.lag > 0 and memory < np.inf:
             design = self._with_margin(design, stated, memory, tolerate, efforts, at_end)
         self.model, self.filter, self.weights = design.model, design.filter, design.weights
@@ -145,16 +145,17 @@ class OffsetFree(Controller):
         problem = replace(self.problem, dynamics=self.model.dynamics)
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
-    def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
-        """The weights of the given tolerances, or of chosen ones."""
+    def _design(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Design:
+        """The design with the given tolerances, or with chosen ones."""
         if tolerate is not None:
-            return Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
+            weights = Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
+            return Design.of(self.model, self.filter, weights)
 
-        def moments(tried: Weights, limits: tuple[Array, Array]) -> StateMoments:
-            return with_filter(self.model, self.filter, tried, limits)
+        def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
+            return with_filter(self.model, self.filter, laws, limits)
 
         told = self.problem, self.solution, self.uncertainty
-        return choose_tolerances(*told, self.model, effort, at_end, moments)
+        return Design(self.model, self.filter, *choose_tolerances(*told, self.model, effort, at_end, moments))
 
     def _with_margin(
         self, design: Design, stated: PlanModel, memory: float, tolerate: PerEntry | None, effort: Array, at_end: float
@@ -201,7 +202,7 @@ class OffsetFree(Controller):
         met = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", met, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         met.check(self.problem.dynamics)
-        truth = replace(self.model, uncertainty=met.as_steady)
+        truth = self.model.under(met.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits, self.model)
@@ -239,7 +240,7 @@ class OffsetFree(Controller):
 def _told_of(model: PlanModel, share: float) -> PlanModel:
     """The model with a share of its lag."""
     told = model.uncertainty
-    return replace(model, uncertainty=replace(told, lag=share * told.lag))
+    return model.under(replace(told, lag=share * told.lag))
 
 
 def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.0) -> PlanModel:
@@ -253,7 +254,7 @@ def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.
     """
     stated, space, controls = model.uncertainty, model.dynamics.state_coordinates, model.dynamics.control_coordinates
     told = stated.as_steady if memory == np.inf else stated.steady(memory)
-    moved = unit_means(space.units, reach_of(model, effort, 2)[2])
+    moved = unit_means(space.units, reach_of(model, effort, 2)[-1])
     control = per_entry("Uncertainty: control", stated.control, controls)
     lost = stated.command_loss
     control = np.hypot(control, np.sqrt(lost * (1 - lost)) * HELD * effort)  # the filter expects the mean
@@ -268,4 +269,4 @@ def for_filter(model: PlanModel, memory: float, effort: Array, doubt: float = 0.
         told, unknowns=(*told.unknowns, *directly), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
         model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
     )  # fmt: skip
-    return replace(model, uncertainty=assumed)
+    return model.under(assumed)

@@ -12,7 +12,7 @@ actuators stay as they are.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -140,13 +140,12 @@ class Lag:
 
 
 class Step(NamedTuple):
-    """The linear model of all steps, for commands of one kind.
+    """The linear model of all steps.
 
     Attributes:
-      share: fraction of commands of this kind. F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
+      F: (T, Z, Z). G: (T, Z, m). c: (T, Z).
     """
 
-    share: float
     F: Array
     G: Array
     c: Array
@@ -174,6 +173,13 @@ class PlanModel:
         """Raises InputError if the uncertainty does not fit the dynamics."""
         uncertainty.check(dynamics)
         return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
+
+    def under(self, uncertainty: Uncertainty) -> "PlanModel":
+        """The model for another uncertainty, with the derivatives along the plan that are known already."""
+        other = replace(self, uncertainty=uncertainty)
+        same = ["compiled_dynamics", "jacobian", "H"] + ["effects"] * (self.parameters == other.parameters)
+        vars(other).update((name, getattr(self, name)) for name in same)
+        return other
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -346,16 +352,15 @@ class PlanModel:
 
     @cached_property
     def _mean_step(self) -> Step:
-        return self._step(1.0, self.lag)
+        return self._step(self.lag)
 
     @cached_property
-    def steps_of_commands(self) -> list[Step]:
-        """The model for a command that arrives; and for a lost command, if commands get lost."""
-        lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
-        kinds = [(1 - lost, arrived), (lost, Lag(1.0, 1.0))] if lost else [(1.0, arrived)]
-        return [self._step(share, lag) for share, lag in kinds]
+    def arriving(self) -> Step:
+        """The model for a command that arrives. A lost one is as if the command had been the actuators' states."""
+        lost = self.uncertainty.command_loss
+        return self._step(Lag.of(self.uncertainty.lag, self.plan.dt)) if lost else self._mean_step
 
-    def _step(self, share: float, lag: Lag) -> Step:
+    def _step(self, lag: Lag) -> Step:
         n, a, steps = self.n, self.lagging, self.plan.steps
         F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
         F[:, :n, :n] = self.jacobian[:, :, :n]
@@ -370,16 +375,16 @@ class PlanModel:
             behind = self.reached[:-1] - self.plan.controls
             c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
             c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return Step(share, F, G, c)
+        return Step(F, G, c)
 
     @cached_property
     def reached(self) -> Array:
         """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
         plan, a = self.plan, self.lagging
         reached = np.zeros((plan.steps + 1, a))
-        reached[0] = plan.controls[0, :a]
-        for t in range(plan.steps if a else 0):
-            reached[t + 1] = plan.controls[t] + self.lag.left * (reached[t] - plan.controls[t])
+        reached[0] = last = plan.controls[0, :a]
+        for t, control in enumerate(plan.controls if a else ()):
+            reached[t + 1] = last = control + self.lag.left * (last - control)
         return reached
 
     @cached_property
@@ -401,9 +406,20 @@ class PlanModel:
     @cached_property
     def process_root(self) -> Array:
         """Square root of the covariance of w, (T, Z, Z), lower triangular."""
+        return triangular_root(self.disturbing)
+
+    @cached_property
+    def disturbing(self) -> Array:
+        """Effects on z of independent standard normal numbers that add up to w: another square root, (T, Z, any)."""
+        varying, constant = self._disturbing
+        return np.concatenate([varying, np.broadcast_to(constant, (len(varying), *constant.shape))], axis=2)
+
+    @cached_property
+    def _disturbing(self) -> tuple[Array, Array]:
+        """The effects that vary along the plan, and those that do not, (Z, any)."""
         n, first, steps = self.n, self.n + self.lagging, self.plan.steps
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
-        commanded = self.steps_of_commands[0].G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
+        commanded = self.arriving.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
         if self.uncertainty.lag == 0:
             commanded[:, n:first] = 0.0  # the command that stays in force after a loss has new noise
         white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
@@ -414,13 +430,13 @@ class PlanModel:
         error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
         fresh = np.zeros((self.size, self.size - first))
         fresh[first:] = _diagonal([part.noise for part in self._filters])
-        own = [np.tile(one, (steps, 1, 1)) for one in (error, fresh)]
-        return triangular_root(np.concatenate([commanded, pushed, *own], axis=2))
+        return np.concatenate([commanded, pushed], axis=2), np.concatenate([error, fresh], axis=1)
 
     @cached_property
     def process_noise(self) -> Array:
         """Covariance of w, (T, Z, Z)."""
-        return self.process_root @ self.process_root.transpose(0, 2, 1)
+        varying, constant = self._disturbing
+        return varying @ varying.transpose(0, 2, 1) + constant @ constant.T
 
     @cached_property
     def shown_std(self) -> Array:

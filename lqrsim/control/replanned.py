@@ -116,10 +116,8 @@ class ReplannedRun(ControllerRun):
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
-        run.law, run.first = (
-            FilterLaw.of(solution, Design(about, kalman, replace(law.weights, emphasis=None)), granted),
-            step,
-        )
+        weights = replace(law.weights, emphasis=None)  # that of another plan
+        run.law, run.first = FilterLaw.of(solution, Design.of(about, kalman, weights), granted), step
 
 
 def _constant_parameters(model: PlanModel) -> npt.NDArray[np.bool_]:

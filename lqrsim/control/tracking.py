@@ -12,7 +12,6 @@ If collisions are what makes a law fail, laws with an emphasis on the deviations
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,11 +20,12 @@ from scipy.special import ndtr
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.emphasis import emphasis_of
 from lqrsim.control.kalman import KalmanFilter
-from lqrsim.control.linear_loop import limited
+from lqrsim.control.linear_loop import ClosedLoop, LinearLoop
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking_laws import AT_END, Averse, Weights, check_plan, effort_of, tracking_laws
+from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.kernels.records import LoopArrays, LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.goal import Target, scale_of
@@ -35,7 +35,7 @@ from lqrsim.results.solution import Solution
 PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control periods in which a deviation may decay
 WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
 # By how much the emphasis may count: deviations at the most critical knot count this many times as much.
-EMPHASIS = (100.0, 30.0, 10.0, 5.0, 2.0, 0.0)
+EMPHASIS = (100.0, 30.0, 10.0, 5.0, 2.0)
 # The largest fraction of commands beyond the limits with which there is an emphasis. With more, the linear model
 # promises fewer collisions than there are, because more trials leave their plan for good.
 MODELLED = 0.12
@@ -48,59 +48,49 @@ NARROW = 0.02
 FRAGILE = 5.0
 
 
-class StateMoments(NamedTuple):
-    """Moments of the states' deviations from the plan under C laws, as in `collision_chance`.
+class Predictions(NamedTuple):
+    """Predictions for laws: chance of failure, mean width of the tube, fraction of commands beyond the limits."""
 
-    Attributes:
-      mean: (C, T+1, n). covariance: (C, T+1, n, n). across: (C, T, n, n).
-      saturation: fraction of the commands beyond the limits, (C,).
-    """
-
-    mean: Array
-    covariance: Array
-    across: Array
+    chance: Array
+    width: Array
     saturation: Array
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Prediction for a law: chance of failure, mean width of the tube, fraction of commands beyond the limits."""
-
-    chance: float
-    width: float
-    saturation: float
 
 
 def choose_tolerances(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
-    moments: Callable[[Weights, tuple[Array, Array]], StateMoments],
-) -> Weights:  # fmt: skip
-    """Choose the tolerances whose law is predicted to fail least often.
+    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments],
+) -> tuple[Weights, Laws]:  # fmt: skip
+    """Choose the tolerances whose law is predicted to fail least often, and that law.
 
     Args:
+      model: the model on which the laws are based.
       effort: largest change of each control, (m,).
       at_end: as in `track`.
-      moments: predicts the moments under the laws of C weights and the limits of the controls.
+      moments: predicts the states' moments under C laws and the limits of the controls.
     """
     tried, space = tolerances_to_try(model, effort, at_end, solution.target), solution.policy.control_coordinates
     limits = np.array(space.low), np.array(space.high)
-    found = moments(tried, limits)
+    gain, offset = tracking_laws(model, tried)
+    found = moments((gain, offset), limits)
     told = predictions(problem, solution, uncertainty, model, found)
-    least = narrowest(model, told)
-    best = gentlest_of_best(worth_of(told, least))
-    weights, (mean, covariance, across, _) = tried.pick(best), (one[best] for one in found)
+    least = narrowest(model, told.width)
+    worth = worth_of(told, least)
+    best = len(worth) - 1 - int(np.argmin(worth[::-1]))  # of equals the gentlest
+    weights, laws = tried.pick(best), (gain[best], offset[best])
+    # The same with emphasis, if it is predicted to fail less often.
+    if told.saturation[best] > MODELLED:
+        return weights, laws
+    mean, covariance, across = found.mean[best], found.covariance[best], found.across[best]
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     emphasis = emphasis_of(surroundings, model.plan.states + mean, covariance, across, weights.state)
-    if told[best].saturation > MODELLED or not emphasis.any():
-        return weights
+    if not emphasis.any():
+        return weights, laws
     stressing = weights.stressing(emphasis, EMPHASIS)
-    told = predictions(problem, solution, uncertainty, model, moments(stressing, limits))
-    return stressing.pick(gentlest_of_best(worth_of(told, least)))
-
-
-def gentlest_of_best(worth: list[float]) -> int:
-    """The index of the smallest number; of equals the last."""
-    return min(reversed(range(len(worth))), key=worth.__getitem__)
+    gain, offset = tracking_laws(model, stressing)
+    told = predictions(problem, solution, uncertainty, model, moments((gain, offset), limits))
+    stressed = worth_of(told, least)
+    i = int(np.argmin(stressed))
+    return (stressing.pick(i), (gain[i], offset[i])) if stressed[i] < worth[best] else (weights, laws)
 
 
 def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Target) -> Weights:
@@ -110,8 +100,9 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     unplanned spin can only do so by other speeds of its wheels.
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
-    reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
-    tried = [unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest]
+    periods = [one for one in PERIODS if one <= longest]
+    reach = reach_of(model, effort, periods[-1])[np.array(periods) - 1]
+    tried = list(unit_means(model.dynamics.state_coordinates.units, reach))
     if (free := np.isnan(target.state)).any():
         tried += [np.where(free, WIDE * one, one) for one in tried]
     each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried]
@@ -119,167 +110,91 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
 
 
 def predictions(
-    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, moments: StateMoments
-) -> list[Prediction]:
-    """The predictions for C laws with these moments."""
-    surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    return [prediction_of(model, *one, surroundings, solution) for one in zip(*moments, strict=True)]
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, moments: LoopMoments
+) -> Predictions:
+    """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
+    surroundings, plan = Surroundings.of(problem, uncertainty.obstacles), model.plan.states
+    mean, covariance = moments.mean, moments.covariance
+    collide = collision_chance(plan + mean, covariance, moments.across, surroundings)[1]
+    place = list(model.dynamics.state_coordinates.position)
+    counts = np.array(place) if place else np.flatnonzero(np.isfinite(solution.target.state))
+    scale = np.ones(len(place)) if place else scale_of(plan)[counts]
+    squares = (np.diagonal(covariance, axis1=-2, axis2=-1)[..., counts] + mean[..., counts] ** 2) / scale**2
+    width = np.sqrt(squares.sum(axis=-1).mean(axis=-1))
+    miss = _miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
+    return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
 
-def narrowest(model: PlanModel, told: list[Prediction]) -> float:
+def narrowest(model: PlanModel, widths: Array) -> float:
     """The width of the narrowest tube; a thousandth of the plan's extent is narrow enough."""
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
-    return max(min(one.width for one in told), 1e-3 * extent)
+    return max(float(widths.min()), 1e-3 * extent)
 
 
-def worth_of(told: list[Prediction], least: float) -> list[float]:
+def worth_of(told: Predictions, least: float) -> Array:
     """How bad each law is: its chance to fail, more with saturation and with a tube wider than `least`."""
-    return [one.chance + FRAGILE * one.saturation**2 + NARROW * max(one.width / least, 1.0) for one in told]
+    return told.chance + FRAGILE * told.saturation**2 + NARROW * np.maximum(told.width / least, 1.0)
 
 
-def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
-    """The motion of each state, (n,), by random controls of an effort, in each number of periods: rms over the plan."""
+def reach_of(model: PlanModel, effort: Array, periods: int) -> Array:
+    """The motion of each state by random controls of an effort, in 1 to P periods: rms over the plan, (P, n)."""
     n, steps = model.n, model.plan.steps
     A, B = model.jacobian[:, :, :n], model.jacobian[:, :, n:]
-    moved, total, reach = B * effort, np.zeros(n), dict[int, Array]()
-    for k in range(1, periods + 1):
-        if len(moved):
-            total = total + (moved**2).sum(axis=2).mean(axis=0)
-        reach[k] = np.sqrt(np.maximum(total, 1e-24))
-        moved = A[k:] @ moved[: max(steps - k, 0)]
-    return reach
+    moved, squares = B * effort, np.zeros((periods, n))
+    for k in range(min(periods, steps)):
+        squares[k] = np.vecdot(moved, moved).mean(axis=0)
+        moved = A[k + 1 :] @ moved[:-1]
+    return np.sqrt(np.maximum(squares.cumsum(axis=0), 1e-24))
 
 
 def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
-    """Replace numbers (n,) by the rms over all states of the same unit."""
-    squares = {unit: [number**2 for number, own in zip(numbers, units, strict=True) if own == unit] for unit in units}
-    return np.array([np.sqrt(np.mean(squares[unit])) for unit in units])
+    """Replace numbers (..., n) by the rms over all states of the same unit."""
+    same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
+    return np.sqrt(numbers**2 @ same / same.sum(axis=0))
 
 
-def prediction_of(
-    model: PlanModel, mean: Array, covariance: Array, across: Array, saturation: float, surroundings: Surroundings,
-    solution: Solution,
-) -> Prediction:  # fmt: skip
-    """The prediction for a law's moments."""
-    plan = model.plan.states
-    place = list(model.dynamics.state_coordinates.position)
-    collide = collision_chance(plan + mean, covariance, across, surroundings)[1]
-    counts = np.array(place) if place else np.flatnonzero(np.isfinite(solution.target.state))
-    scale = np.ones(len(place)) if place else scale_of(plan)[counts]
-    squares = (np.diagonal(covariance, axis1=1, axis2=2)[:, counts] + mean[:, counts] ** 2) / scale**2
-    width = float(np.sqrt(squares.sum(axis=1).mean()))
-    return Prediction(collide + _miss(mean[-1], covariance[-1], solution), width, float(saturation))
-
-
-def _miss(mean: Array, covariance: Array, solution: Solution) -> float:
+def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
     """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
 
     Of a position it is that of its most uncertain direction. Without one, each state that counts has its own bound.
     """
     target, radius = solution.target, solution.goal_radius
     if place := target.places:
-        widest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[place][:, place])[-1], 0.0)))
-        off = float(np.linalg.norm(mean[place]))
-        return 0.0 if radius is None else float(_beyond(radius, off, widest))
+        widest = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1], 0.0))
+        off = np.linalg.norm(mean[..., place], axis=-1)
+        return np.zeros(off.shape) if radius is None else _beyond(radius, off, widest)
     radius = target.radius(None, None, None) if radius is None else radius
-    counts = np.isfinite(target.state)
-    bounds, std = radius * scale_of(solution.trajectory.states), np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    return float(1 - np.prod(1 - _beyond(bounds, np.abs(mean), std)[counts]))
+    counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
+    bounds, std = radius * scale_of(solution.trajectory.states), np.sqrt(np.maximum(variance, 0.0))
+    return 1 - np.prod(1 - _beyond(bounds, np.abs(mean), std)[..., counts], axis=-1)
 
 
-def _beyond(bound: Array | float, off: Array | float, std: Array | float) -> Array:
+def _beyond(bound: Array | float, off: Array, std: Array) -> Array:
     """The chance that normal numbers with these means exceed a bound in size."""
     std = np.maximum(std, 1e-12)
     return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
-def with_filter(model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array]) -> StateMoments:
-    """Moments under the laws of C weights that follow a filter's estimates.
+def with_filter(model: PlanModel, kalman: KalmanFilter, laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
+    """Moments of the states under C laws that follow a filter's estimates.
 
-    The filter is assumed to be right about the noise. Its error is then independent of its estimate, which needs less
-    computation than `linear_loop.py`.
+    The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
+    from a measurement is noise that moves the estimate. The unknowns' estimates are moved by no law.
     """
-    n, own, steps, count = model.n, model.n + model.lagging, model.plan.steps, len(weights.state)
-    gain, offset = tracking_laws(model, weights)
+    n, own = model.n, model.n + model.lagging
     learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
-    unlearned = model.F[:, :n] @ kalman.corrected[:-1, :, :n]
-    # Covariance and mean of the estimate's deviation from the plan. As in `of_states`, no law moves the unknowns.
-    size, transition = model.size, model.transition
-    estimate, mean = np.zeros((count, size, size)), np.zeros((count, own))
-    covariance, across = np.empty((count, steps + 1, n, n)), np.empty((count, steps, n, n))
-    means, beyond = np.empty((count, steps + 1, n)), np.zeros((count, model.m))
-    for t in range(steps + 1):
-        covariance[:, t], means[:, t] = estimate[:, :n, :n] + kalman.predicted[t, :n, :n], mean[:, :n]
-        estimate += learned[t]
-        if t == steps:
-            break
-        law, F, G, planned = gain[:, t], model.F[t, :own], model.G[t, :own], model.plan.controls[t]
-        response = law @ estimate
-        std = np.sqrt(np.maximum((response * law).sum(axis=2), 0.0))
-        centre = planned + offset[:, t] + (law[:, :, :own] @ mean[:, :, None])[:, :, 0]
-        slope, level, left = limited(centre, std, *limits)
-        beyond += (1 - slope) / steps
-        # M estimate M' of M = F + G slope law. The estimate is symmetric, so one product serves all laws.
-        moved = np.ascontiguousarray((estimate.reshape(-1, size) @ F.T).reshape(count, size, own).swapaxes(1, 2))
-        moved += G @ (slope[:, :, None] * response)
-        pushed = moved @ (slope[:, :, None] * law).transpose(0, 2, 1) + G * left[:, None, :]
-        # The true state is the estimate plus its error; the control moves only the estimate.
-        across[:, t] = moved[:, :n, :n] + unlearned[t]
-        meet = moved[:, :, own:] @ transition.T
-        estimate[:, own:, own:] = transition @ estimate[0, own:, own:] @ transition.T
-        estimate[:, :own, :own] = (moved.reshape(-1, size) @ F.T).reshape(count, own, own) + pushed @ G.T
-        estimate[:, :own, own:], estimate[:, own:, :own] = meet, meet.transpose(0, 2, 1)
-        mean = mean @ F[:, :own].T + model.c[t, :own] + (level - planned) @ G.T
-    return StateMoments(means, covariance, across, beyond.mean(axis=1))
-
-
-def of_states(model: PlanModel, gain: Array, offset: Array, limits: tuple[Array, Array]) -> StateMoments:
-    """Moments under C laws of the measured states, (C, T, m, n) and (C, T, m), in deviations from the plan.
-
-    `linear_loop.py` defines the moments. No law moves the unknowns: their rows are the same for all, and of the
-    covariance's next one only the rows for the state and the actuators are computed.
-    """
-    n, own, steps, count, size = model.n, model.n + model.lagging, model.plan.steps, len(gain), model.size
-    covariance, mean = np.tile(model.start_root @ model.start_root.T, (count, 1, 1)), np.zeros((count, own))
-    states, across = np.empty((count, steps + 1, n, n)), np.empty((count, steps, n, n))
-    means, beyond = np.empty((count, steps + 1, n)), np.zeros((count, model.m))
-    shown, transition, unknowns = model.shown_std**2, model.transition, covariance[0, own:, own:]
-    arrives, *lost = model.steps_of_commands
-    for t in range(steps + 1):
-        states[:, t], means[:, t] = covariance[:, :n, :n], mean[:, :n]
-        if t == steps:
-            break
-        law, planned, noise = gain[:, t], model.plan.controls[t], model.process_noise[t]
-        F, G = arrives.F[t, :own], arrives.G[t, :own]
-        response = law @ covariance[:, :n]
-        std = np.sqrt(np.maximum((response[:, :, :n] * law).sum(axis=2) + law**2 @ shown, 0.0))
-        centre = planned + offset[:, t] + (law @ mean[:, :n, None])[:, :, 0]
-        slope, level, left = limited(centre, std, *limits)
-        beyond += (1 - slope) / steps
-        law, response = slope[:, :, None] * law, slope[:, :, None] * response
-        # M P for M = F + G law: the covariance with the previous deviation. P is symmetric, so one product serves all
-        # laws.
-        free = np.ascontiguousarray((covariance.reshape(-1, size) @ F.T).reshape(count, size, own).swapaxes(1, 2))
-        moved, base = free + G @ response, mean @ F[:, :own].T
-        pushed = moved[:, :, :n] @ law.swapaxes(1, 2)
-        pushed += G @ ((law * shown) @ law.swapaxes(1, 2))
-        pushed[:] += G * left[:, None, :]
-        ahead, spread = base + (level - planned) @ G.T + arrives.c[t, :own], 0.0
-        if lost:  # the command in force stays, as if the law requested it
-            (other,), kept = lost, slice(n, own)
-            moved_on, ahead_on = free + G @ covariance[:, kept], base + mean[:, kept] @ G.T + other.c[t, :own]
-            off = (ahead_on - ahead)[:, :, None]
-            spread = arrives.share * other.share * off * off.swapaxes(1, 2)
-            moved = arrives.share * moved + other.share * moved_on
-            pushed = arrives.share * pushed + other.share * moved_on[:, :, kept]
-            ahead = arrives.share * ahead + other.share * ahead_on
-        across[:, t], mean = moved[:, :n, :n], ahead
-        own_next = (moved.reshape(-1, size) @ F.T).reshape(count, own, own) + pushed @ G.T + spread
-        meet = moved[:, :, own:] @ transition.T + noise[:own, own:]
-        unknowns = transition @ unknowns @ transition.T + noise[own:, own:]
-        covariance[:, :own, :own], covariance[:, :own, own:] = own_next + noise[:own, :own], meet
-        covariance[:, own:, :own], covariance[:, own:, own:] = meet.swapaxes(1, 2), unknowns
-    return StateMoments(means, states, across, beyond.mean(axis=1))
+    F, G, c, noise = (one[:, None, :own] for one in (model.F, model.G, model.c, learned))
+    gain, offset = (one.swapaxes(0, 1) for one in laws)
+    planned = model.plan.controls
+    arrays = LoopArrays(
+        F, G.swapaxes(-1, -2), c, noise, learned[:, own:, own:], model.transition, gain, planned[:, None] + offset,
+        planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
+    )  # fmt: skip
+    found = LoopMoments(*(one[0] for one in ClosedLoop(arrays, own).moments(n)))
+    return found._replace(
+        covariance=found.covariance + kalman.corrected[:, :n, :n],
+        across=found.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],
+    )
 
 
 def track(
@@ -330,7 +245,7 @@ def track(
     model = PlanModel.of(dynamics, plan, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
     if tolerate is not None:
-        weights = Weights.of(tolerate, efforts, dynamics, at_end=at_end)
+        gain, offset = _laws(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
     elif uncertainty is None:
         raise InputError(
             "track: tolerate: got none, want how far each state may be off, such as {'m': 0.05, 'm/s': 0.2}, or"
@@ -339,12 +254,10 @@ def track(
     else:
         truth = PlanModel.of(dynamics, plan, uncertainty)
 
-        def moments(tried: Weights, limits: tuple[Array, Array]) -> StateMoments:
-            gain, offset = tracking_laws(model, tried)
-            return of_states(truth, gain[..., : model.n], offset, limits)
+        def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
+            return LinearLoop(truth, laws[0][..., : model.n], laws[1], None, *limits).moments(model.n)
 
-        weights = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments)
-    gain, offset = _laws(problem, solution, model, weights, risk)
+        _, (gain, offset) = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments)
     gain = gain[..., : model.n]  # the command in force has no effect on a command that arrives
     return AffinePolicy(
         gain=gain,
@@ -356,14 +269,14 @@ def track(
     )
 
 
-def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> tuple[Array, Array]:
+def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> Laws:
     """The laws, with the risk if it is not 0. If the risk is too high, raises InputError with the largest possible."""
     if not risk or problem.noise is None:
         return tracking_laws(model, weights)
     plan = solution.trajectory
     matrices = problem.noise.matrices(problem.dynamics, plan.states[:-1], plan.controls)
 
-    def laws(tried: float) -> tuple[Array, Array] | None:
+    def laws(tried: float) -> Laws | None:
         try:
             return tracking_laws(model, weights, Averse(matrices, tried))
         except np.linalg.LinAlgError:

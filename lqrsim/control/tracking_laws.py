@@ -18,14 +18,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.kernels import tracking_law
+from lqrsim.kernels.records import PassArrays, PassSizes, PassWork
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry, check_same_system, spaces_of
 from lqrsim.results.solution import Solution
 
+Laws = tuple[Array, Array]  # gain and offset, as of `tracking_laws`
 CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
 # The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
 # alone; controls that also bring the velocity to rest there have less effort left for it.
@@ -122,50 +127,63 @@ class Averse:
         return S + spread @ S, s + spread @ s
 
 
-def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> tuple[Array, Array]:
-    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z)."""
-    n, m, steps = model.n, model.m, model.plan.steps
-    own = n + model.lagging  # states that controls can move
-    (arrives, slopes, G, c), *lost = model.steps_of_commands
-    F, G, c, E = slopes[:, :own, :own], G[:, :own], c[:, :own], slopes[:, :own, own:]
-    many = weights.state.shape[:-1]
-    Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
-    Q[..., range(n), range(n)] = weights.state
-    undo = np.moveaxis(R @ _undoing(model, weights), -3, 0)
-    gain, offset = np.empty((*many, steps, m, model.size)), np.empty((*many, steps, m))
-    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a). The cost of d alone does not
-    # change the law. `ahead` is (D, s).
-    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, E.shape[2] + 1))
-    S[..., range(n), range(n)] = weights.end
-    stressed = np.zeros((steps + 1, 1, 1)) if weights.emphasis is None else np.moveaxis(weights.emphasis, -3, 0)
-    S[..., :n, :n] += stressed[steps]
+def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> Laws:
+    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z).
+
+    The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot. The cost
+    of d alone does not change the law.
+    """
+    n, m, steps, lost = model.n, model.m, model.plan.steps, model.uncertainty.command_loss
+    own, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
+    state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
+    # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
+    (F, G, c), onto = model.arriving, np.zeros((steps, width, width + m))
+    onto[:, :own, : width - 1], onto[:, :own, width - 1], onto[:, :own, width:] = F[:, :own], c[:, :own], G[:, :own]
+    onto[:, range(own, width), range(own, width)] = 1.0
+    back = np.concatenate([F[:, :own, :own], G[:, :own]], axis=2).transpose(0, 2, 1)
+    held = np.zeros((steps, m, width))
+    if lost:  # a lost command is that in force, which is a
+        held[:, range(m), range(n, own)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
+    undo = np.zeros((steps, len(state), m, width))
+    undo[..., own:-1] = weights.control[:, None] * _undoing(model, state).swapaxes(0, 1)
+    cost, products = np.zeros((len(state), own, width)), np.empty((len(state), own + m, width + m))
+    cost[:, range(n), range(n)] = end
+    emphasis = None if weights.emphasis is None else weights.emphasis.reshape(len(state), steps + 1, n, n)
+    if emphasis is not None:
+        cost[:, :n, :n] += emphasis[:, steps]
+    every = np.zeros((len(state), own))
+    every[:, :n] = state
+    sizes, laws = PassSizes(len(state), own, model.size, m, lost), np.empty(undo.shape)
+    given = PassArrays(weights.control, every.ravel(), undo.ravel(), held.ravel(), laws.ravel())
+    work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
+    improve = _kernels().lay_out("improve", 0, sizes, given, work)
     for t in range(steps - 1, -1, -1):
         if averse is not None:
-            S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
-        slope = S @ np.concatenate([F[t], E[t], c[t][:, None]], axis=1)
-        slope[..., own:] += ahead
-        right = G[t].T @ slope
-        right[..., own:-1] += undo[t]
-        law = -np.linalg.solve(R + G[t].T @ S @ G[t], right)
-        gain[..., t, :, :], offset[..., t, :] = law[..., :-1], law[..., -1]
-        left = arrives * (F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law)
-        for share, kept, _, drift in lost:
-            slope = S @ np.concatenate([kept[t, :own], drift[t, :own, None]], axis=1)
-            slope[..., own:] += ahead
-            left += share * (kept[t, :own, :own].T @ slope)
-        S, ahead = Q + left[..., :own], left[..., own:]
-        S[..., :n, :n] += stressed[t]
-        S = 0.5 * (S + np.swapaxes(S, -1, -2))
-    return gain, offset
+            cost[0, :, :own], cost[0, :, -1] = averse.worst(t, cost[0, :, :own], cost[0, :, -1])
+        np.matmul(back[t], cost @ onto[t], out=products)
+        improve(t, sizes, given, work)
+        if emphasis is not None:
+            cost[:, :n, :n] += emphasis[:, t]
+    gain, offset = laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1]
+    return (gain, offset) if weights.state.ndim == 2 else (gain[0], offset[0])
 
 
-def _undoing(model: PlanModel, weights: Weights) -> Array:
-    """M, (T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can."""
+def _kernels() -> CompiledModule:
+    """`kernels/tracking_law.py`, which is compiled once for all sizes."""
+    return module_of(source_of(tracking_law), "tracking laws")
+
+
+def _undoing(model: PlanModel, state: Array) -> Array:
+    """M, (C, T, m, D): the controls that cancel the unknowns' effect in one step, as far as they can.
+
+    Args:
+      state: diagonals of Q, (C, n).
+    """
     B = model.jacobian[:, :, model.n :]
-    weighed = B.transpose(0, 2, 1) * weights.state[..., None, None, :]
+    weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B
     least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
-    return np.linalg.solve(curve + least[..., None, None] * np.eye(model.m), weighed @ model.E)
+    return np.linalg.inv(curve + least[..., None, None] * np.eye(model.m)) @ (weighed @ model.E)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:

@@ -13,13 +13,14 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike, Feedback
-from lqrsim.control.linear_loop import LinearLoop, LoopMoments
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sampled_loop import SampledLoop, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import SHARE, check_fields
@@ -173,22 +174,24 @@ def _tube(
     loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings
 ) -> Tube:
     """The tube by the moments, or else by the moments of the trials."""
-    model, n, size, estimate = loop.model, loop.model.n, loop.model.size, None
+    model, n, estimate = loop.model, loop.model.n, None
     if moments is not None and loop.filter_gain is not None:
-        whole = moments.covariance
-        guess, both = whole[:, size : size + n, size : size + n], whole[:, :n, size : size + n]
-        estimate = whole[:, :n, :n] + guess - both - both.transpose(0, 2, 1)
+        whole, guess = moments.covariance, slice(n + model.lagging, 2 * n + model.lagging)
+        both = whole[:, :n, guess]
+        estimate = whole[:, :n, :n] + whole[:, guess, guess] - both - both.transpose(0, 2, 1)
     shown = moments or trials
     assert shown is not None
     mean, covariance = shown.mean[:, :n], shown.covariance[:, :n, :n]
-    chance, linear = collision_chance(model.plan.states + mean, covariance, shown.across, surroundings)
+    across = shown.across[:, :n, :n]
+    chance, linear = collision_chance(model.plan.states + mean, covariance, across, surroundings)
+    linear = float(linear)
     place, strays = list(model.dynamics.state_coordinates.position), 0.0
     if trials is not None and place:
         widest = np.sqrt(max(np.linalg.eigvalsh(covariance[:, place][:, :, place]).max(), 0.0))
         strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
-        across=shown.across, estimate_covariance=estimate, command=shown.command, saturation=shown.saturation,
+        across=across, estimate_covariance=estimate, command=shown.command, saturation=shown.saturation,
         step_chance=chance, linear_chance=linear, strays=strays,
         collision_chance=linear if trials is None else trials.chance(linear),
         samples=0 if trials is None else len(trials.collided),

@@ -315,6 +315,204 @@ class SmootherArrays(NamedTuple):
     certificate: Arrays
 
 
+class FilterSizes(NamedTuple):
+    """Sizes of a Kalman filter; see `square_root_filter.py`.
+
+    Attributes:
+      knots: T+1. entries: Z. measured: Y. states: n. disturbing: D, number of columns of the process noise's root.
+      used: whether the filter begins after the first measurement.
+      resolution, nothing: the least noise of a measurement, relative to its std and absolute.
+    """
+
+    knots: int
+    entries: int
+    measured: int
+    states: int
+    disturbing: int
+    used: bool
+    resolution: float
+    nothing: float
+
+
+class FilterModel(NamedTuple):
+    """F (T, Z, Z), H (T+1, Y, n), and roots of the noise: of measurements (T+1, Y, n), of the process (T, Z, D)."""
+
+    F: Arrays
+    H: Arrays
+    noise: Arrays
+    disturbing: Arrays
+
+
+class FilterRoots(NamedTuple):
+    """Square roots of a Kalman filter's covariances; the first is given, the others are written.
+
+    Attributes:
+      root: (Z, Z) at the start; overwritten. before, after: before and after each measurement, (T+1, Z, Z).
+      innovation: S, (T+1, Y, Y). learned: K S, (T+1, Z, Y). work: ((Y+Z) (n+Y+Z),) and at least (Z (Z+D),).
+    """
+
+    root: Arrays
+    before: Arrays
+    after: Arrays
+    innovation: Arrays
+    learned: Arrays
+    work: Arrays
+
+
+class LoopSizes(NamedTuple):
+    """Sizes of C laws in L systems; see `loop_moments.py`.
+
+    Attributes:
+      steps: T. systems: L. laws: C. moved: Y. entries: X. controls: m. shown: number of entries of y whose moments are
+        written.
+      stated: number of the first entries of y that are the system's own. With losses, the last m of these are the
+        actuators' states.
+      rows, columns: of the noise.
+      correlated: whether noise of the commands is correlated with that of y. lossy: whether commands get lost.
+      lost: number of lost commands for each that arrives.
+    """
+
+    steps: int
+    systems: int
+    laws: int
+    moved: int
+    entries: int
+    controls: int
+    shown: int
+    stated: int
+    rows: int
+    columns: int
+    correlated: bool
+    lossy: bool
+    lost: float
+
+
+class LoopArrays(NamedTuple):
+    """The loops y' = F X + G' (u - planned) + c + w under the commands K X + command + r, which are limited to u.
+
+    X = (y, d) are Y numbers that commands move, and X - Y that they do not.
+
+    Attributes:
+      F: (T, L, Y, X). G: (T, L, m, Y). c: (T, L, Y).
+      noise: covariance of the first entries of y with the first entries of X: at the start, and then of w, (T+1, L,
+        rows, columns).
+      fresh: covariance of d at the start, and then of its noise, (T+1, L, X - Y, X - Y).
+      transition: d' is this times d and noise, (X - Y, X - Y).
+      K: (T, C, m, X). command: (T, C, m). planned: (T, m).
+      shaking: covariance of r, (T, C, m, m). jointly: covariance of r with w, (T, C, m, Y); empty if it is zero.
+      reached: nominal actuators' states, (T+1, L, m). low, high: limits of the controls, (m,).
+    """
+
+    F: Arrays
+    G: Arrays
+    c: Arrays
+    noise: Arrays
+    fresh: Arrays
+    transition: Arrays
+    K: Arrays
+    command: Arrays
+    planned: Arrays
+    shaking: Arrays
+    jointly: Arrays
+    reached: Arrays
+    low: Arrays
+    high: Arrays
+
+
+class LoopWork(NamedTuple):
+    """Work arrays of closed loops.
+
+    Attributes:
+      P: covariance of X, (L, C, X, X). M: of X' = M X and noise, (L, C, X, X). moved: M P for y alone, (L, C, Y, X).
+      given: covariance of d, (L, X - Y, X - Y). half: the transition times it, (X - Y, X - Y).
+      mean: of y, (L, C, Y). ahead: of y at the next knot, (Y,).
+      response: K P, (L, C, m, X). law: K times the slopes, (L, C, m, X).
+      pushed, shaken, held: G times the noise of the commands, their correlation with w, and G times the change by
+        a loss, (L, C, m, Y).
+      slope, level, left: of the limited commands, (L, C, m).
+    """
+
+    P: Arrays
+    M: Arrays
+    moved: Arrays
+    given: Arrays
+    half: Arrays
+    mean: Arrays
+    ahead: Arrays
+    response: Arrays
+    law: Arrays
+    pushed: Arrays
+    shaken: Arrays
+    held: Arrays
+    slope: Arrays
+    level: Arrays
+    left: Arrays
+
+
+class LoopMoments(NamedTuple):
+    """Moments of the first N entries of y about the plan; of several loops, by axes before these or after that of time.
+
+    Attributes:
+      mean: mean of y, (T+1, N).
+      covariance: covariance of y, (T+1, N, N).
+      across: covariance of y with y at the previous knot, (T, N, N).
+      command: standard deviation of each command, before it is limited, (T, m).
+      saturation: fraction of the commands that are beyond the limits, (T, m).
+    """
+
+    mean: Arrays
+    covariance: Arrays
+    across: Arrays
+    command: Arrays
+    saturation: Arrays
+
+
+class PassSizes(NamedTuple):
+    """Sizes of the backward pass of C tracking laws; see `tracking_law.py`.
+
+    Attributes:
+      laws: C. moved: Y, the states that controls move. entries: Z, of z = (y, d). controls: m.
+      lost: fraction of the commands that get lost. The last m of y are then the actuators' states.
+    """
+
+    laws: int
+    moved: int
+    entries: int
+    controls: int
+    lost: float
+
+
+class PassArrays(NamedTuple):
+    """What tracking laws are of, by columns for (y, d, 1).
+
+    Attributes:
+      control: diagonal of R, (m,). state: diagonals of Q, (C, Y).
+      undo: R times the controls that cancel the unknowns, (T, C, m, Z+1). held: a lost command, (T, m, Z+1).
+      laws: the laws, written, (T, C, m, Z+1).
+    """
+
+    control: Arrays
+    state: Arrays
+    undo: Arrays
+    held: Arrays
+    laws: Arrays
+
+
+class PassWork(NamedTuple):
+    """Work arrays of the backward pass.
+
+    Attributes:
+      cost: the cost-to-go (S, D, s), (C, Y, Z+1).
+      products: [F G]' (S [F E c G] + (0, D, s, 0)), (C, Y+m, Z+1+m).
+      curve: R + G'SG, then its elimination, (C, m, m). mean: a mean of laws, (m, Z+1).
+    """
+
+    cost: Arrays
+    products: Arrays
+    curve: Arrays
+    mean: Arrays
+
+
 class RiccatiArrays(NamedTuple):
     """Results of the passes of a linear-quadratic problem; x_hats (T+1, N) are the smoothed states."""
 

@@ -143,10 +143,9 @@ class ShapeInWorld:
         """
         knots, count, size = np.arange(len(states))[:, None], len(self.radii), states.shape[1]
         if self.centers is None:
-            places, move = self.places(states), np.eye(size)[list(self.moved_by)]
-            slopes = np.broadcast_to(move, (len(states), 1, *move.shape))
-        else:
-            places, slopes = evaluate_slopes(self.centers, count, states)
+            distances, normals = distances_with_normals(self.world, states[:, list(self.moved_by)])
+            return distances - self.radii, normals @ np.eye(size)[np.ix_(self.moved_by, along)]
+        places, slopes = evaluate_slopes(self.centers, count, states)
         distances, normals = distances_with_normals(self.world, places.reshape(-1, places.shape[-1]))
         clearance = distances.reshape(len(states), count, -1) - self.radii[:, None]
         nearest, obstacle = clearance.argmin(axis=1), np.arange(len(self.world))
