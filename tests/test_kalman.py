@@ -87,6 +87,9 @@ def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstab
     off = 0.05 * rng.normal(size=(steps + 1, 2))
     inputs = np.array([run.control(t, (plan.states[t] + off[t])[None])[0] for t in range(steps + 1)])[:steps]
     assert run.estimates is not None
+    assert run.innovations is not None
+    corrections = np.einsum("tzy,ty->tz", law.filter.gain, run.innovations[:, 0])[:, law.model.n + law.model.lagging :]
+    hypothesis.assume((np.abs(corrections) <= law.filter.limit).all())  # larger ones are limited
     for t in range(steps + 1):
         mean, covariance = conditional(law.model, inputs - plan.controls, off, t)
         estimate = run.estimates[t, 0] - law.nominal[t]
