@@ -188,6 +188,21 @@ def test_what_an_exclude_keeps_apart_never_collides(swing: ls.Solution, kind: Ca
     assert rollout.clearance.min() == np.inf
 
 
+@pytest.mark.parametrize("kind", [Arm, Handed])
+def test_a_pedestal_does_not_collide_with_the_arm_that_it_carries(
+    swing: ls.Solution, kind: Callable[[], Robot]
+) -> None:
+    """They overlap in every position. A fist that the pedestal does not carry can still hit it."""
+    pedestal = '<geom name="pedestal" type="cylinder" size="0.1 0.25" pos="0 0 -0.24"/>'
+    fist = '<geom type="sphere" pos="1 0 0" size="0.04" mass="1e-9"/>'
+    xml = ARM.replace('<body name="arm">', f'{pedestal}<body name="arm">{fist}')
+    plant = Plant(kind(), scene_from_xml(xml.replace('pos="0.5 0.5 0"', 'pos="5 5 0"'), "bench"))
+    assert "pedestal" in plant.obstacles
+    rollout = ls.simulate(plant, swing)
+    assert rollout.outcome == ("reached",)
+    assert rollout.contacts[0] == 0
+
+
 def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant, swing: ls.Solution) -> None:
     problem = ls.Problem(
         dynamics=arm.robot.dynamics, dt=0.05, steps=40, initial=ls.FixedState((0.0, 0.0)),

@@ -30,7 +30,7 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
-from lqrsim.scenes.mjcf_obstacles import in_the_way
+from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
@@ -66,9 +66,9 @@ class MjcfRobot(Robot):
     If the file has no light, one is added. Without a camera named overview, pictures show the whole run.
 
     Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
-    and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
-    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are
-    MuJoCo's.
+    and what it stands on and moves over. They do not collide in the plan's physics: costs and constraints keep clear of
+    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. A pedestal that a link turns
+    on is no obstacle for that link: they touch in every position of the joints. All other contacts are MuJoCo's.
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
@@ -81,7 +81,8 @@ class MjcfRobot(Robot):
       outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
         it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
         balls are cheap bounds of the colliding geoms, and pictures follow them.
-      floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
+      floors: whether there is ground for standing on: level planes and height fields, if a joint lets the robot sink to
+        them, and all geoms on which it stands and that a free joint or a slide moves it over.
       obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
 
@@ -375,8 +376,19 @@ class MjcfRobot(Robot):
             *([f"  dry friction, in plans and runs: {_listed(dry)}"] if (dry := self._dry()) else []),
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",
+            *([f"  carried, without contacts, by: {_listed(mounts)}"] if (mounts := self._mounts()) else []),
         ]
         return "\n".join(lines)
+
+    def _mounts(self) -> list[str]:
+        """The obstacles that bodies touch in every position, with these bodies."""
+        model = self.scene.model
+        names = dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
+        pairs = [
+            (model.body(int(model.geom_bodyid[own])).name, names[other])
+            for own, other in mounting_pairs(model, list(self.scene.geoms)).tolist()
+        ]
+        return [f"{obstacle} ({body})" for body, obstacle in dict.fromkeys(pairs)]
 
     def _dry(self) -> list[str]:
         """The dry friction of joints and tendons, by name."""
