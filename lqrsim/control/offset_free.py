@@ -142,7 +142,7 @@ class OffsetFree(Controller):
         self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
 
-    def redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
+    def _redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
         """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution.
 
         Args:
