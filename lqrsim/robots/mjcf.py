@@ -38,6 +38,7 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS
 _AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
 _ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
+_PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
 _REST = 1e-6  # m/s^2, largest acceleration at rest
 _PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
 _LISTED = 12  # largest number of names in a printed line
@@ -316,11 +317,12 @@ class MjcfRobot(Robot):
           The Problem.
 
         Raises:
-          InputError: an argument is not as described.
+          InputError: an argument is not as described, or the goal moves a joint past its limits.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
+        self._check_goal(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(model, self._numbers) ** -2.0 if effort is None else effort
@@ -345,6 +347,20 @@ class MjcfRobot(Robot):
             control_limits=(controls.low, controls.high),
             constraints=kept,
         )  # fmt: skip
+
+    def _check_goal(self, start: Array, goal: Array) -> None:
+        """Raises InputError for a goal that moves a joint past its limits."""
+        names = self.dynamics.state_coordinates.names
+        for one in self._joints:
+            if one.limits is None or goal[one.dof] == start[one.dof]:
+                continue
+            least, most = one.limits
+            if not least - _PAST * (most - least) <= goal[one.dof] <= most + _PAST * (most - least):
+                unit, more = "m", ""
+                if one.kind == "hinge":
+                    unit, more = "rad", f" ({np.degrees(least):.4g} to {np.degrees(most):.4g} degrees)"
+                wanted = f"want the joint within its limits in the MJCF, {least:.4g} to {most:.4g} {unit}{more}"
+                raise InputError(f"goal: got {goal[one.dof]:.4g} {unit} for {names[one.dof]}, {wanted}")
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
         """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
