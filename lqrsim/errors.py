@@ -10,6 +10,7 @@ import inspect
 import itertools
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ if outdated():
 Array = npt.NDArray[np.floating]
 
 _FLOAT64 = np.dtype(np.float64)
+_ADDRESS = re.compile(r" at 0x[0-9A-Fa-f]+")
+_OBJECT = re.compile(r"<(?:[\w.]|<locals>)*?(\w+) object>")
 _LARGE = 10**7  # entries above which the memory for an array is checked first
 LONGEST = 1010  # largest number of characters of a message
 LARGEST_COUNT = 10**9  # limit of counts without their own limit: a longer loop takes more than a day
@@ -344,7 +347,7 @@ def excerpt(value: object) -> str:
             return f"an int of {value.bit_length()} bits"
         elif dataclasses.is_dataclass(value):  # its repr may have megabytes
             return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
-        text = " ".join(repr(value).split())
+        text = " ".join(without_addresses(repr(value)).split())
     except Exception:  # a __repr__ that fails, or recurses without end
         return f"a {type(value).__name__}"
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
@@ -370,7 +373,17 @@ def brief(value: object) -> str:
             f"{listed[0]}, ... {len(listed)} times" if len(listed) > 3 and len(set(listed)) == 1 else ", ".join(listed)
         )
         return f"[{text}]" if isinstance(value, list) else f"({text})"
-    return getattr(value, "__qualname__", None) or repr(value)
+    return getattr(value, "__qualname__", None) or without_addresses(repr(value))
+
+
+def without_addresses(text: str) -> str:
+    """A repr with objects named by their kind, such as "a Replanner", in place of Python's name and address."""
+
+    def kind(found: re.Match[str]) -> str:
+        name = found[1]
+        return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
+
+    return _OBJECT.sub(kind, _ADDRESS.sub("", text))
 
 
 def format_error(error: BaseException) -> str:

@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from sampling import rarely
+from scipy.stats import norm
 
 import lqrsim as ls
+from lqrsim.control import chance_constrained
+from lqrsim.control.chance_constrained import chances_instead
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
@@ -138,6 +141,60 @@ def test_what_cannot_be_is_said_to_fail(problem: ls.Problem) -> None:
     assert plan.instead["no lag"] == plan.tube.collision_chance  # there is none
     assert plan.instead["exact sensors"] < plan.tube.collision_chance
     assert f"{plan.instead['exact sensors']:.3g} with exact sensors" in str(plan)
+
+
+def test_improvements_keep_the_laws_own_sensors_tolerances_and_memory(problem: ls.Problem) -> None:
+    """Each chance is that of a law which is designed by hand for the improved condition, to the last bit."""
+    settings: dict[str, Any] = {
+        "sensors": ("x", "y"), "tolerate": {"m": 0.3, "m/s": 2.0}, "effort": 2.0, "at_end": 3.0, "memory": np.inf,
+    }  # fmt: skip
+    met = Uncertainty(start=0.1, control=2.0, measurement=0.2, lag=0.2, loss=0.2)
+    designed, solution = replace(met, control=1.0), ls.smooth(problem)
+    law = ls.OffsetFree(problem, solution, designed, **settings)
+    tube = ls.predict_tube(problem, solution, met, law)
+    plan = ls.types.SafePlan(problem=problem, solution=solution, controller=law, tube=tube, asked=1e-3, rounds=())
+    found = chances_instead(plan, met)
+    space = solution.policy.control_coordinates
+    wider = replace(space, low=(-10.0, -10.0), high=(10.0, 10.0))  # ±5 m/s2, twice
+    strong = replace(solution, policy=replace(solution.policy, control_coordinates=wider))
+    expected = {}
+    for what, own, changes in (
+        ("no lag", solution, {"lag": 0.0}), ("twice the range of controls", strong, {}),
+        ("exact sensors", solution, {"measurement": 0.0, "loss": 0.0}),
+        ("all of these", strong, {"measurement": 0.0, "loss": 0.0, "lag": 0.0}),
+    ):  # fmt: skip
+        improved, better = replace(met, **changes), replace(designed, **changes)
+        by_hand = ls.OffsetFree(problem, own, better, **settings)
+        expected[what] = ls.predict_tube(problem, own, improved, by_hand).collision_chance
+    assert found == expected
+
+
+@pytest.mark.parametrize("linear", [*rarely(1e-3, 1e-9, 1e-60), 1e-300, *rarely(0.0)])
+def test_collisions_of_which_the_moments_know_nothing_widen_no_margin_beyond_twice(
+    problem: ls.Problem, monkeypatch: pytest.MonkeyPatch, linear: float
+) -> None:
+    """Such are collisions of trials that stray. The margins asked for are counted along a search."""
+    asked = 1e-3
+    margins: list[float] = []
+
+    def judged(*given: Any) -> ls.types.Tube:
+        tube = ls.predict_tube(*given)
+        return replace(tube, linear_chance=linear, collision_chance=0.01 / (len(margins) + 1))
+
+    real = chance_constrained._Search.solve
+
+    def solve(search: Any, deviations: float | None) -> None:
+        margins.append(deviations or 0.0)
+        real(search, deviations)
+
+    monkeypatch.setattr(chance_constrained, "predict_tube", judged)
+    monkeypatch.setattr(chance_constrained._Search, "solve", solve)
+    ls.smooth_chance_constrained(problem, UNCERTAINTY, chance=asked, controller=tracked, rounds=3)
+    assert margins[1] == pytest.approx(norm.isf(asked))  # of the normal distribution
+    assert len(margins) >= 4
+    growth = np.divide(margins[2:], margins[1:-1])
+    assert (growth <= 2.0 + 1e-12).all()
+    assert (growth > 1.0).all()
 
 
 def test_obstacles_become_heavier_where_margins_do_not_do(problem: ls.Problem) -> None:

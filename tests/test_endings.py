@@ -159,6 +159,26 @@ def test_an_arm_that_is_stuck_on_a_post_has_collided_with_it(arm: Plant, swing: 
     assert not arm.enclosed
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_lines_of_trials_name_the_worst_state_of_a_robot_without_a_position(
+    arm: Plant, swing: ls.Solution, seed: int
+) -> None:
+    """Relative to the ranges along the plan, here by NumPy; the goal counts for the angle alone."""
+    free = scene_from_xml(ARM.replace('pos="0.5 0.5 0"', 'pos="5 5 0"'), "bench")
+    noise = [ControlNoise(0.5), InitialStateError((0.1, 0.3))]
+    run = ls.simulate(Plant(Arm(), free), swing, disturbances=noise, seed=seed, trials=3)
+    plan = swing.trajectory.states
+    off = run.states - plan
+    off[..., 0] = (off[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    relative = np.abs(off) / np.maximum(np.ptp(plan, axis=0), 1.0)
+    for k, line in enumerate(run.summary().splitlines()[-3:]):
+        knot, state = np.unravel_index(int(relative[k].argmax()), relative[k].shape)
+        name, unit = (("angle", "rad"), ("rate", "rad/s"))[state]
+        said = f"max {relative[k].max():.3g} ({name} {off[k, knot, state]:+.3g} {unit} at {0.05 * knot:.2f} s), final"
+        assert said in line
+        assert f" from the goal (angle {off[k, -1, 0]:+.3g} rad); " in line
+
+
 @dataclass(frozen=True)
 class Handed(Arm):
     """The same with a ball, which goes over the middle of the post."""
@@ -186,6 +206,21 @@ def test_what_an_exclude_keeps_apart_never_collides(swing: ls.Solution, kind: Ca
     assert rollout.outcome == ("reached",)
     assert rollout.states[0, -1, 0] > np.pi / 2
     assert rollout.clearance.min() == np.inf
+
+
+@pytest.mark.parametrize("kind", [Arm, Handed])
+def test_a_pedestal_does_not_collide_with_the_arm_that_it_carries(
+    swing: ls.Solution, kind: Callable[[], Robot]
+) -> None:
+    """They overlap in every position. A fist that the pedestal does not carry can still hit it."""
+    pedestal = '<geom name="pedestal" type="cylinder" size="0.1 0.25" pos="0 0 -0.24"/>'
+    fist = '<geom type="sphere" pos="1 0 0" size="0.04" mass="1e-9"/>'
+    xml = ARM.replace('<body name="arm">', f'{pedestal}<body name="arm">{fist}')
+    plant = Plant(kind(), scene_from_xml(xml.replace('pos="0.5 0.5 0"', 'pos="5 5 0"'), "bench"))
+    assert "pedestal" in plant.obstacles
+    rollout = ls.simulate(plant, swing)
+    assert rollout.outcome == ("reached",)
+    assert rollout.contacts[0] == 0
 
 
 def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant, swing: ls.Solution) -> None:

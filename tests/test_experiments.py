@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency, MotorLag
@@ -380,6 +381,22 @@ def test_an_arm_is_fitted_to_a_run_that_failed() -> None:
     assert on_paper["reached"] == 0
     assert fitted["reached"] == true["reached"] == fitted["trials"] == 10
     assert max(fitted["off"], true["off"]) < 0.05 * on_paper["off"]
+
+
+@pytest.mark.parametrize(
+    ("winch", "load", "lifted"),
+    [("a motor, -60 to 0 N", "in the plane", 0.4), *rarely(
+        ("a motor, -60 to 0 N", "in space", -0.5), ("a rope of 1 m, no winch", "in space", 0.0),
+        ("a servo with a lag of 0.1 s, -60 to 0 N", "in the plane", 0.4),
+    )],
+)  # fmt: skip
+def test_a_crane_with_a_rope_converges(winch: str, load: str, lifted: float) -> None:
+    """As the page says: by a run in MuJoCo, the load hangs at its goal, to 2 cm."""
+    script: Any = import_module("mjcf_crane")
+    found = script.solved(winch, load, lifted, 20)
+    assert (found["status"], found["outcome"]) == ("CONVERGED", "reached")
+    assert found["off"] < 0.02
+    assert winch in script.report({"rows": [found]})
 
 
 @pytest.mark.long

@@ -1,5 +1,6 @@
 """The pictures that the pages show: they are there, small, and made by the commands beside them."""
 
+import inspect
 import re
 import shlex
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ import pytest
 import tyro
 from PIL import Image, ImageSequence
 
+import lqrsim as ls
 from lqrsim.commands import Command
 from lqrsim.view import gl
 
@@ -53,6 +55,15 @@ def test_what_pages_show_exists_and_is_small(page: Path) -> None:
     for picture in shown(page):
         assert picture.is_file(), picture
         assert picture.stat().st_size < 2e6, picture
+
+
+def test_the_gallery_names_the_calls_behind_its_commands() -> None:
+    """With keywords that the calls have."""
+    calls = {"ls.view.render_still": ls.view.render_still, "ls.render": ls.render}
+    text = " ".join(GALLERY.read_text(encoding="utf-8").split())
+    for name, call in calls.items():
+        (stated,) = re.findall(rf"`{re.escape(name)}\((.*?)\)`", text)
+        assert set(re.findall(r"(\w+)=", stated)) <= set(inspect.signature(call).parameters)
 
 
 def test_the_gallery_has_every_picture_with_the_commands_that_make_it(pictures: Mapping[str, tuple[str, ...]]) -> None:

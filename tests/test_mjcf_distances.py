@@ -316,6 +316,119 @@ def test_a_floor_is_for_who_can_sink_to_it(tmp_path: Path) -> None:
         assert scenario.plant().obstacles == found
 
 
+PEDESTALS = {"cylinder": 'size="0.09 0.2"', "box": 'size="0.09 0.08 0.2"', "capsule": 'size="0.09 0.11"'}
+TURNED = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler angle="radian"/><worldbody>
+  {pedestal}<body name="base" pos="0 0 {height}">{joint}<geom name="base" type="cylinder" size="0.06 0.05"/>
+    <body name="upper" pos="0 0 0.1"><joint name="b" axis="0 1 0" damping="0.3"/>
+      <geom name="upper" type="capsule" fromto="0 0 0 0 0 0.3" size="0.03"/>
+      <body name="fore" pos="0 0 0.35"><joint name="c" axis="0 1 0" damping="0.3"/>
+        <geom name="fore" type="box" pos="0 0 0.15" size="0.02 0.02 0.12"/></body></body></body></worldbody>
+  <actuator><motor joint="b" ctrlrange="-9 9"/><motor joint="c" ctrlrange="-9 9"/></actuator></mujoco>"""
+
+
+@settings(max_examples=examples(16), deadline=None, derandomize=True)
+@given(
+    kind=st.sampled_from(sorted(PEDESTALS)), gap=st.floats(-0.02, 9e-4), of_body=st.booleans(),
+    turns=st.booleans(),
+)  # fmt: skip
+def test_a_pedestal_is_no_obstacle_of_the_link_that_it_carries(
+    kind: str, gap: float, of_body: bool, turns: bool
+) -> None:
+    """It is one of all other links: in plans, in clearances, and in MuJoCo, which has no contact of the first link."""
+    pedestal = f'<geom name="pedestal" type="{kind}" {PEDESTALS[kind]} pos="0 0 0.2"/>'
+    pedestal = f"<body>{pedestal}</body>" if of_body else pedestal
+    moved = '<joint name="a" axis="0 0 1" damping="0.3"/>' if turns else ""
+    robot = ls.MjcfRobot(scene_from_xml(TURNED.format(pedestal=pedestal, height=0.45 + gap, joint=moved), "arm"))
+    plant, model = ls.Plant(robot, robot.scene), robot.scene.model
+    assert robot.scene.world.names == plant.obstacles == ("pedestal",)
+    assert ("carried, without contacts, by: pedestal (base)" in str(robot)) == turns
+    rng, data, sensed = np.random.default_rng(0), mujoco.MjData(model), mujoco.MjData(plant.model)
+    overlaps = 0
+    for _ in range(20):
+        state = robot.at(b=float(rng.uniform(-np.pi, np.pi)), c=float(rng.uniform(-np.pi, np.pi)))
+        data.qpos[:] = sensed.qpos[:] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_forward(plant.model, sensed)
+        ids = [model.geom(name).id for name in ("upper", "fore", "pedestal")]
+        expected = min(mujoco.mj_geomDistance(model, data, own, ids[2], 9.0, None) for own in ids[:2])
+        found = float(plant.clearance(state))
+        assert (found < 0) == (expected < 0)
+        assert found < 0 or found == pytest.approx(expected, abs=2e-6)  # depths are less exact
+        assert (sensed.sensordata[plant.contact[0]] > 0) == (expected < 0)
+        overlaps += expected < 0
+    assert 0 < overlaps < 20
+    # A plan that bends the arm converges, and its run touches nothing.
+    solution = ls.smooth(robot.problem(robot.at(), robot.at(b=0.6, c=0.5), steps=30, clearance=0.01), starts=1)
+    assert solution.success, solution
+    run = ls.simulate(plant, solution)
+    assert (run.outcome, run.contacts[0]) == (("reached",), 0)
+
+
+CARRIED = """<mujoco><option timestep="0.005"/><worldbody>{ground}
+  <geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>
+  <body name="sled" pos="0 0 {height}">{joint}<geom type="box" size="0.1 0.1 0.05" mass="1"/>
+    <body name="pole" pos="0 0 0.1"><joint name="pole" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="0.1"/></body></body></worldbody>
+  <actuator><motor joint="pole"/></actuator>{more}</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "ground",
+    [
+        '<geom name="plate" type="box" size="1 1 0.1" pos="0 0 -0.1"/>',
+        '<body><geom name="plate" type="cylinder" size="1 0.1" pos="0 0 -0.1"/></body>',
+        '<geom name="plate" type="capsule" fromto="-1 0 -0.1 1 0 -0.1" size="0.1"/>',
+    ],
+)
+@pytest.mark.parametrize("joint", ["<freejoint/>", '<joint type="slide" axis="1 0 0"/>'])
+@pytest.mark.parametrize("gap", [-0.003, 0.0, 5e-4])
+def test_what_a_robot_stands_on_and_moves_over_is_ground(ground: str, joint: str, gap: float) -> None:
+    """The plan's physics has its contacts, as MuJoCo has; what is above or beside the robot is an obstacle."""
+    robot = ls.MjcfRobot(scene_from_xml(CARRIED.format(ground=ground, height=0.05 + gap, joint=joint, more=""), "sled"))
+    assert robot.scene.world.names == ls.Plant(robot, robot.scene).obstacles == ("post",)
+    state, data = robot.at(), mujoco.MjData(robot.scene.model)
+    after = robot.dynamics.step(state, np.zeros(1), 0.1)
+    data.qpos[:] = robot.configuration(state)[0]
+    for _ in range(20):
+        mujoco.mj_step(robot.scene.model, data)
+    np.testing.assert_allclose(robot.state(data.qpos, data.qvel, near=after), after, rtol=0, atol=1e-6)
+    above = ground.replace('pos="0 0 -0.1"', 'pos="0 0 0.55"').replace("0 -0.1", "0 0.55")
+    under = ls.MjcfRobot(scene_from_xml(CARRIED.format(ground=above, height=0.05, joint=joint, more=""), "sled"))
+    assert set(under.scene.world.names) == {"plate", "post"}
+
+
+def test_a_keyframe_in_which_a_free_robot_stands_says_what_ground_is() -> None:
+    ground = '<geom name="plate" type="box" size="1 1 0.1" pos="0 0 -0.1"/>'
+    for z, found in ((0.05, ("post",)), (0.2, ("plate", "post"))):
+        key = f'<keyframe><key name="home" qpos="0 0 {z} 1 0 0 0 0"/></keyframe>'
+        scene = scene_from_xml(CARRIED.format(ground=ground, height=0.5, joint="<freejoint/>", more=key), "sled")
+        assert ls.MjcfRobot(scene).scene.world.names == found
+
+
+def test_a_rail_through_a_cart_is_no_obstacle_of_the_cart() -> None:
+    rail = '<geom name="rail" type="capsule" fromto="-4 0 0.05 4 0 0.05" size="0.01"/>'
+    slide = '<joint type="slide" axis="1 0 0" range="-2 1"/>'
+    robot = ls.MjcfRobot(scene_from_xml(CARRIED.format(ground=rail, height=0.05, joint=slide, more=""), "cart"))
+    plant = ls.Plant(robot, robot.scene)
+    assert robot.scene.world.names == plant.obstacles == ("rail", "post")
+    assert plant.clearance(robot.at()) == pytest.approx(0.1 - 0.02 - 0.01, abs=2e-6)  # of the pole to the rail
+
+
+def test_a_start_inside_an_obstacle_names_the_body_and_the_exclude(tmp_path: Path) -> None:
+    """The line that it states leaves out this pair, and the problem can be stated."""
+    ground = '<body name="bench"><geom name="plate" type="box" size="1 1 0.1" pos="0 0 0.2"/></body>'
+    xml = CARRIED.format(ground=ground, height=0.45, joint="{}", more="").format("")
+    robot = ls.MjcfRobot(scene_from_xml(xml, "pole"))
+    down, up = robot.at(pole=np.pi), robot.at()
+    with pytest.raises(InputError, match=r"a start with 'pole' 0.\d+ m inside obstacle 'plate', want it clear") as told:
+        robot.problem(down, up)
+    exclude = str(told.value).split("if they may overlap, ")[1].split(" in the MJCF")[0]
+    assert exclude == '<contact><exclude body1="bench" body2="pole"/></contact>'
+    other = ls.MjcfRobot(scene_from_xml(xml.replace("</mujoco>", f"{exclude}</mujoco>"), "pole"))
+    assert other.scene.world.names == ("post",)
+    other.problem(down, up)
+
+
 def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> None:
     file = arm_file(tmp_path)
     with pytest.raises(InputError, match=r"obstacles: got 'poost', want one of: .*post"):

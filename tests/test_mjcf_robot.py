@@ -672,6 +672,19 @@ def test_limits_cost_nothing_where_start_and_goal_are(seed: int) -> None:
     assert high == pytest.approx(max(1.9, start, goal))
 
 
+@pytest.mark.parametrize("past", [-1.0, -0.32, 2.1, 57.0])
+def test_a_goal_past_the_limits_of_a_joint_is_refused(past: float) -> None:
+    """At the limit, and for a joint that stays where it is, it is not."""
+    robot = elbow(1.0, -0.3)
+    degrees = f"{-0.3 * 180 / np.pi:.4g} to {360 / np.pi:.4g}"
+    wanted = rf"goal: got {past:.4g} rad for b, want .* -0.3 to 2 rad \({degrees} degrees\)$"
+    with pytest.raises(InputError, match=wanted):
+        robot.problem(robot.at(), robot.at(b=past))
+    for fine in (-0.3, 2.0):
+        robot.problem(robot.at(), robot.at(b=fine))
+    robot.problem(robot.at(b=past), robot.at(a=1.0, b=past))
+
+
 def test_what_is_amiss_at_rest_is_said() -> None:
     """Joints past their limits, and bodies that touch, but not those that MuJoCo lets through."""
     assert "past their limits at rest: b 0 (want 0.2 to 2)\n" in str(elbow(1.0, 0.2))

@@ -178,3 +178,51 @@ def test_a_free_body_is_loaded() -> None:
     rise = robot.dynamics.state_coordinates.names.index("drone_vz")
     for turned in (robot.at(), robot.at(drone_wx=1.0)):
         assert loaded.step(turned, [30.0], 0.01)[rise] == pytest.approx((30.0 / 2.0 - 10.0) * 0.01, rel=1e-9)
+
+
+SPRINGY = """
+<mujoco model="springy"><option timestep="0.005"/><compiler angle="radian" autolimits="true"/><worldbody>
+  <geom name="floor" type="plane" size="3 3 1"/>
+  <body name="box" pos="0 0 0.1"><freejoint name="f"/>
+    <inertial pos="0 0 0" mass="{box}" diaginertia="0.01 0.02 0.02"/><geom type="box" size="0.1 0.1 0.1"/>
+    <body name="arm" pos="0 0 0.15"><joint name="a" axis="0 1 0" range="-0.3 0.3" frictionloss="0.2" armature="0.01"/>
+      <inertial pos="0.05 0 0.1" mass="{arm}" diaginertia="0.002 0.002 0.001"/>
+      <body name="hand" pos="0 0 0.25"><joint name="h" type="slide" axis="1 0 0" range="-0.05 0.05" frictionloss="0.1"/>
+        <inertial pos="0 0 0" mass="{hand}" diaginertia="0.001 0.001 0.001"/></body></body></body></worldbody>
+  <tendon><fixed name="t" range="-0.2 0.2" frictionloss="0.05">
+    <joint joint="a" coef="1"/><joint joint="h" coef="2"/></fixed></tendon>
+  <equality><joint joint1="h" joint2="a" polycoef="0 0.1 0 0 0"/></equality>
+  <actuator><motor name="a" joint="a" ctrlrange="-5 5"/><motor name="h" joint="h" ctrlrange="-5 5"/></actuator></mujoco>
+"""
+MASSES = {"box": 1.0, "arm": 0.3, "hand": 0.2}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_contacts_limits_and_friction_are_as_soft_as_in_the_mjcf_with_that_mass(seed: int) -> None:
+    """By mj_step alone, to rounding: MuJoCo scales the softness of constraints by inverse inertias at rest."""
+    rng, robot = np.random.default_rng(seed), ls.MjcfRobot(scene_from_xml(SPRINGY.format(**MASSES), "springy"))
+    body = ("box", "arm", "hand")[seed % 3]
+    load, steps, dt = float(rng.uniform(0.3, 2.0)), 15, 0.02
+    model = mujoco.MjModel.from_xml_string(SPRINGY.format(**(MASSES | {body: MASSES[body] + load})))
+    data, controls = mujoco.MjData(model), rng.uniform(-2, 2, size=(steps, 2))
+    states = [robot.at(a=0.28, f_vx=0.5, a_velocity=1.0, f_wy=float(rng.uniform(-1, 1)))]
+    data.qpos[:], data.qvel[:] = robot.configuration(states[0])
+    kinds = set[int]()
+    for control in controls:
+        data.ctrl[:] = control
+        for _ in range(4):
+            mujoco.mj_step(model, data)
+            kinds |= set(data.efc_type.tolist())
+        states.append(robot.state(data.qpos, data.qvel, near=states[-1]))
+    assert len(kinds) >= 5  # equality, friction of joints and of the tendon, limits, contacts
+    loaded = robot.dynamics.disturbed.with_parameters(**{f"{body}_load": load})
+    for t in range(steps):
+        np.testing.assert_allclose(loaded.step(states[t], controls[t], dt), states[t + 1], rtol=0, atol=1e-10)
+    dynamics = robot.dynamics
+    pushed = ls.AffinePolicy(
+        gain=np.zeros((steps, 2, 16)), offset=controls, nominal=np.array(states[:-1]), dt=dt,
+        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
+    )  # fmt: skip
+    plan = ls.smooth(robot.problem(states[0], robot.at(), steps=steps, dt=dt), max_iterations=1, starts=1)
+    run = ls.simulate(ls.Plant(robot, robot.scene), plan, controller=pushed, disturbances=[Payload(load, body)])
+    np.testing.assert_allclose(run.states[0], states, rtol=0, atol=1e-10)

@@ -32,6 +32,7 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import memory
 from lqrsim.problem.costs import CostTerm
+from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress.statistics import rate
 
 api: Any = import_module("robustness.api")
@@ -68,7 +69,9 @@ def test_every_public_callable_is_tried(tmp_path: Path, monkeypatch: pytest.Monk
         assert name in tried
     for name, subject in tried.items():
         try:
-            api.exercise(subject.call(**subject.arguments))
+            made = subject.call(**subject.arguments)
+            api.exercise(made)
+            assert not api.printed_address(made), name
         except InputError as error:
             raise AssertionError(name) from error
 
@@ -117,7 +120,33 @@ class Raising:
     __len__ = __iter__ = __float__ = __array__ = __fspath__ = __index__ = __repr__  # type: ignore[assignment]
 
 
+class Named:
+    """Without a text of its own."""
+
+    def method(self) -> None: ...
+
+
 class TestChecks:
+    def test_objects_are_named_by_their_kind_not_by_their_address(self) -> None:
+        for value, text in (
+            (Named(), "a Named"), ([Named(), 1], "[a Named, 1]"), ({"law": object()}, "{'law': an object}"),
+            (Named().method, "<bound method Named.method of a Named>"), (refusal, "<function refusal>"),
+        ):  # fmt: skip
+            assert excerpt(value) == text
+
+    def test_a_replanner_for_which_there_is_no_tube_is_named(self) -> None:
+        scenario = ls.scenarios.quadrotor()
+        solution = ls.smooth(scenario.problem, max_iterations=1, stop="cost", starts=1)
+        replanner = ls.Replanner(scenario.problem, solution, every=1.0)
+        tube, told = tube_under(
+            scenario.problem, solution, scenario.plant(), [ls.disturbances.ControlNoise(0.1)], replanner
+        )
+        assert tube is None
+        assert (
+            told
+            == "no predicted tube: predict_tube: controller: got a Replanner, want an OffsetFree or an AffinePolicy"
+        )
+
     @pytest.mark.parametrize(
         "value",
         ["1", b"1", 1j, np.array([1j]), np.array("1"), ["1", "2"], {"a": 1}, (i for i in range(3)), [[1], [1, 2]], None,

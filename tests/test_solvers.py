@@ -392,6 +392,37 @@ class TestProgress:
         assert not [thread for thread in threading.enumerate() if thread.name == "progress"]
 
 
+@pytest.mark.parametrize("ended", ["time", "iterations"])
+def test_a_plan_that_is_not_finished_says_how_far_it_is_from_an_optimum(
+    differential_drive: ls.Scenario, ended: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The decrease that it predicts is the one to the optimum, to a factor of 3: its model is quadratic."""
+    problem = differential_drive.problem
+    optimum, near = ls.smooth(problem, starts=1), 0
+    for last in range(1, len(optimum.iterations)):
+        seen = list[ls.types.Iteration]()
+        with monkeypatch.context() as patch:
+            if ended == "time":
+                patch.setattr(budget.Stop, "due", property(lambda _, seen=seen, last=last: len(seen) >= last))
+            limit: dict[str, Any] = {} if ended == "time" else {"max_iterations": last}
+            found = ls.smooth(problem, starts=1, callback=seen.append, **limit)
+        assert found.status.name == ("TIME_LIMIT" if ended == "time" else "MAX_ITERATIONS")
+        left = (found.cost - optimum.cost) / found.cost
+        said = re.search(r"the plan can be used, .* could still fall by a relative (\S+), where 1e-08", found.detail)
+        if said:
+            near += 1
+            assert left / 3 < float(said[1]) < 3 * left
+        else:
+            assert "but is far from an optimum" in found.detail
+            assert left > 0.005
+    assert near >= 1
+    # A plan that misses a constraint is of no use, and says by how much.
+    kept = ls.Clearance(differential_drive.scene.world, **differential_drive.robot.shape, margin=0.2)
+    missed = ls.smooth(dataclasses.replace(problem, constraints=[kept]), max_iterations=2, starts=1)
+    assert missed.violation > 1e-6
+    assert "can be used" not in missed.detail
+
+
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:
     seen: list[ls.types.Iteration] = []
     solution = ls.smooth(differential_drive.problem, callback=seen.append)

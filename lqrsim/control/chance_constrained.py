@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import ndtri
 
-from lqrsim.control.collision_chance import Spread, Surroundings, chance_of_clearances
+from lqrsim.control.collision_chance import FAR, Spread, Surroundings, chance_of_clearances
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
@@ -40,6 +40,7 @@ from lqrsim.solvers.smoother import smooth
 ENOUGH = 0.5
 HELD = 1e-3  # m; a clearance that exceeds its margin by at most this is determined by the margin
 AIM = 0.8  # target for the next plan, relative to the requested chance
+WIDEN = 2.0  # largest growth of the margin from one plan to the next, in standard deviations
 PATIENCE = 2  # stop widening margins, or raising weights, after this many plans in a row without a safer one
 HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # factors of the weight of the obstacles' cost
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
@@ -185,8 +186,8 @@ def _weighing(problem: Problem, times: float) -> Problem:
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
     """Predicted chances of collision on a plan, with one improvement at a time, and with all of them.
 
-    In the place of an OffsetFree each prediction uses one made for it, which measures all states; a policy stays the
-    same.
+    In the place of an OffsetFree each prediction uses one that is designed for it, with the same sensors, tolerances
+    and memory; a policy stays the same.
     """
     policy = plan.solution.policy
     space = policy.control_coordinates
@@ -204,7 +205,7 @@ def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float
             solution = replace(solution, policy=replace(policy, control_coordinates=wider))
         law = plan.controller
         if isinstance(law, OffsetFree):
-            law = OffsetFree(plan.problem, solution, told)
+            law = law._redesigned(solution, replace(law.uncertainty, **changes))
         elif strong:
             law = replace(law, control_coordinates=wider)
         found[what] = predict_tube(plan.problem, solution, told, law).collision_chance
@@ -221,7 +222,7 @@ class _Search:
         self.problem, self.uncertainty, self.asked = problem, uncertainty, asked
         self.make, self.surroundings = make, surroundings
         self.plans: list[SafePlan] = []
-        self.margin = np.zeros((1, 1))  # margin of the last plan, (T+1, O)
+        self.margin, self.deviations = np.zeros((1, 1)), 0.0  # margin of the last plan, (T+1, O), and its multiple
         self.lines: list[tuple[float, float, float, float]] = []
         # Numbers of standard deviations: the largest that is too small, the smallest that is enough, and the smallest
         # for which no plan was found.
@@ -248,7 +249,7 @@ class _Search:
         if not solution.success and self.plans:
             self.impossible = min(self.impossible, deviations or 0.0)
             return
-        self.margin = margin
+        self.margin, self.deviations = margin, deviations or 0.0
         tube = self._keep(problem, solution, 1.0)
         if deviations is None:
             return
@@ -330,10 +331,11 @@ class _Search:
         return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
-        """The number of standard deviations at which the plan would be exactly as safe as requested.
+        """The number of standard deviations at which the plan would be as safe as requested; at most twice its own.
 
         Assumes that all smaller clearances grow to it, and that clearances that only just keep a larger margin shrink
-        to it.
+        to it. Where trials collide although the moments hardly know of a collision, with a chance of 1e-50 or 0, that
+        number says nothing, and only the limit holds.
         """
         clearance, std, correlation = self._spread(plan)
         clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
@@ -341,13 +343,13 @@ class _Search:
         wanted, tube = AIM * self.asked, plan.tube
         if tube.collision_chance > 0:
             wanted *= tube.linear_chance / tube.collision_chance
-        low, high = 0.0, 12.0
+        low, high = 0.0, FAR
         for _ in range(40):
             middle = (low + high) / 2
             moved = np.maximum(clearance, middle * std)
             safe = chance_of_clearances(moved / std, correlation)[1] <= wanted
             low, high = (low, middle) if safe else (middle, high)
-        return high
+        return min(high, WIDEN * self.deviations)
 
     def _best(self) -> SafePlan:
         """The cheapest plan that is safe enough, or else the safest."""

@@ -4,6 +4,7 @@ A Kalman filter estimates the state, the actuators' outputs and the unknowns. A 
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -121,6 +122,10 @@ class OffsetFree(Controller):
         memory = min(plan.horizon, MEMORY) if memory is None else memory
         memory = check_seconds("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
+        self._stated: dict[str, Any] = {
+            "tolerate": tolerate, "effort": effort, "at_end": at_end, "sensors": sensors, "memory": memory,
+            "record": record, "replan_every": replan_every, "replan_always": replan_always,
+        }  # fmt: skip
         self.record = check_flag("OffsetFree: record", record)
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
@@ -136,6 +141,18 @@ class OffsetFree(Controller):
         self.model, self.filter, self.weights = design.model, design.filter, design.weights
         self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
+
+    def _redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
+        """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution.
+
+        Args:
+          solution: a solution of the same problem.
+          uncertainty: uncertainty of the run.
+
+        Raises:
+          InputError: as for a new OffsetFree.
+        """
+        return OffsetFree(self.problem, solution, uncertainty, **self._stated)
 
     def _replan_rule(self, every: float) -> ReplanRule:
         late = self.uncertainty.latency, self.uncertainty.delay

@@ -38,17 +38,16 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # threads find their work, 0 without helpers; YIELD: the address of the function that yields to other threads;
 # KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
 # mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of bodies that may carry a load, and
-# address of the loads, in kg; the numbers of these bodies and their own masses follow. SIMPLE: number of degrees of
-# freedom whose constant inertia is the mass of such a body; for each, the number of the load, the degree of freedom and
-# its inertia without a load follow. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
+# address of the loads, in kg; the numbers of these bodies and their own masses follow. CONSTANTS: the address of
+# mj_setConst. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, SIMPLE, TABLE = 22, 23, 24, 25, 26, 27, 28, 29, 30
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29, 30
 
 # Addresses that a slot has for each of its two MjData.
-SLOT, SIZE = 30, 15
+SLOT, SIZE = 28, 14
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
-OWN_MODEL, MASSES, INERTIAS = 12, 13, 14
+OWN_MODEL, MASSES = 12, 13
 
 # The words that a team shares: whether it is in use, the next column, combined with the number of the job, the number
 # of finished columns, whether to stop, the number of helpers, and whether a signal came, after which all steps are NaN.
@@ -159,9 +158,9 @@ def job_columns(p):
 
 def run(z, p, wrench, substeps, two, out):
     """Write the state after this number of physics steps."""
+    write_loads(p, two)
     write_to(z, p, two)
     begin(p, wrench, two)
-    write_loads(p, two)
     for _ in range(substeps):
         call(p[STEP], at(two[OWN_MODEL]), at(two[DATA]))
     read_from(z, p, two, out)
@@ -170,9 +169,9 @@ def run(z, p, wrench, substeps, two, out):
 def linearize_here(z, p, wrench, address, warm):
     """Set the first MjData of a slot to the state that columns differ from, and write MuJoCo's accelerations there."""
     one = at(address)
+    write_loads(p, one)
     write_to(z, p, one)
     begin(p, wrench, one)
-    write_loads(p, one)
     call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(0), int32(1))
     accelerations = at(one[QACC])
     for i in range(int(p[NV])):
@@ -270,14 +269,19 @@ def begin(p, wrench, one):
 
 
 def write_loads(p, one):
-    """Add the loads to the bodies, at their centres of mass, in the model of the slot."""
+    """Add the loads to the bodies, at their centres of mass, in the model of the slot. Changes the MjData's positions.
+
+    MuJoCo's constants follow the masses: inertias of bodies that float freely, and the inverse inertias by which the
+    softness of contacts, limits, friction and equality constraints is scaled.
+    """
     count, first, masses = int(p[LOADED]), int(p[LOADS]), at(one[MASSES])
+    changed = False
     for k in range(count):
-        masses[int(p[first + count + k])] = p[first + 2 * count + k] + p[first + k]
-    inertias = at(one[INERTIAS])
-    for k in range(int(p[SIMPLE])):
-        row = first + 3 * (count + k)
-        inertias[int(p[row + 1])] = p[row + 2] + p[first + int(p[row])]
+        body, mass = int(p[first + count + k]), p[first + 2 * count + k] + p[first + k]
+        changed = changed or masses[body] != mass
+        masses[body] = mass
+    if changed:
+        call(p[CONSTANTS], at(one[OWN_MODEL]), at(one[DATA]))
 
 
 def start_from(p, one, guess):

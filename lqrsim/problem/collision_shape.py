@@ -79,6 +79,10 @@ class CollisionGeoms(abc.ABC):
         """Signed distances (K, O) in m to the obstacles at states (K, n), and their derivatives (K, O, n)."""
 
     @abc.abstractmethod
+    def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
+        """The names of the body and of the obstacle's body that are nearest to each other at a state (n,)."""
+
+    @abc.abstractmethod
     def of_scene(self, scene: Scene) -> bool:
         """Whether these geoms belong to that scene, with its obstacles."""
 
@@ -238,8 +242,11 @@ class GeomsInWorld(ShapeInWorld):
         distances = self.geoms.clearances(self.dynamics, self.world, state)
         if distances.min() >= -TOUCHING:
             return None
-        where = f"{-distances.min():.3g} m inside obstacle {self.world.names[int(distances.argmin())]!r}"
-        return where, "; or, if that geom is no obstacle, obstacles= of the robot without it"
+        obstacle = self.world.names[int(distances.argmin())]
+        body, other = self.geoms.nearest_bodies(self.dynamics, self.world, state)
+        where = f"with {body!r} {-distances.min():.3g} m inside obstacle {obstacle!r}"
+        exclude = f'<contact><exclude body1="{other}" body2="{body}"/></contact> in the MJCF'
+        return where, f"; or, if they may overlap, {exclude}; or obstacles= of the robot without it"
 
 
 def shape_in(

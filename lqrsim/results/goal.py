@@ -32,6 +32,12 @@ def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
     return np.max(np.abs(space.difference(states, plan)) / scale_of(plan), axis=-1)
 
 
+def worst_of(space: Coordinates, off: Array, scale: Array) -> str:
+    """The state with the largest of the differences (n,), relative to their scale (n,), as text: "elbow -0.1 rad"."""
+    worst = int(np.argmax(np.abs(off) / scale))
+    return f"{space.names[worst]} {off[worst]:+.3g} {space.units[worst]}".rstrip()
+
+
 def tracking_unit(space: Coordinates) -> str:
     """The unit of `tracking_error`: m, or OF_RANGE for robots without a position."""
     return "m" if space.position else OF_RANGE
@@ -157,21 +163,24 @@ class Target:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
         within = "" if radius is None else f", which is reached within {radius:.3g}{' m' if self.places else ''}"
-        lines = [f"the plan ends {self.describe(away)}{within}{self._worst()}"]
+        worst = self.worst(self.plan[-1])
+        lines = [f"the plan ends {self.describe(away)}{within}{f': {worst} off' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
             mend = "raise the weights of the final cost or the number of steps"
             lines.append(f"the plan MISSES the goal{by}; to mend that, {mend}")
         return lines
 
-    def _worst(self) -> str:
-        """Text that names the state at the plan's end that is farthest from a target without a position."""
+    def worst(self, state: Array) -> str:
+        """The state that is farthest from a target without a position, and by how much; empty for one with a position.
+
+        Args:
+          state: (n,), finite.
+        """
         if self.places:
             return ""
-        end = self.plan[-1]
-        off = self.space.difference(end, np.where(np.isfinite(self.state), self.state, end))
-        worst = int(np.argmax(np.abs(off) / scale_of(self.plan)))
-        return f": {self.space.names[worst]} is {off[worst]:+.3g} {self.space.units[worst]} off"
+        off = self.space.difference(state, np.where(np.isfinite(self.state), self.state, state))
+        return worst_of(self.space, off, scale_of(self.plan))
 
 
 def endings(

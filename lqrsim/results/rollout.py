@@ -12,7 +12,7 @@ from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields
-from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
+from lqrsim.results.goal import Target, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
 
@@ -358,7 +358,8 @@ class Rollout:
             what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
             how, final = f"{outcome}{what} {when}", ""
         else:
-            how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}"
+            worst = self.target.worst(self.states[k, -1])
+            how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}{f' ({worst})' if worst else ''}"
             final = f", final {self.tracking_error[k, -1]:.3g}"
         error, unit = self.tracking_error[k, counts], self.tracking_unit
         rms = float(np.sqrt(np.mean(error**2)))
@@ -367,9 +368,17 @@ class Rollout:
         clearance = self.least_clearance()[k]
         near = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
         return (
-            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{final} {unit}{near};"
+            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}{near};"
             f" {self.contacts[k]} periods in contact; {saturated:.0f} % saturated"
         )
+
+    def _worst(self, k: int) -> str:
+        """The state with the largest error from the plan in a trial, for a robot without a position; else empty."""
+        if self.state_coordinates.position:
+            return ""
+        knot = int(np.argmax(np.where(self.counts[k], self.tracking_error[k], -1.0)))
+        off = self.state_coordinates.difference(self.states[k, knot], self.plan.states[knot])
+        return f" ({worst_of(self.state_coordinates, off, scale_of(self.plan.states))} at {self.times[knot]:.2f} s)"
 
     __str__ = summary
 

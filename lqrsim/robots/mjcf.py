@@ -30,7 +30,7 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
-from lqrsim.scenes.mjcf_obstacles import in_the_way
+from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
@@ -38,6 +38,7 @@ from lqrsim.scenes.world import KINDS, OTHER_KINDS
 _AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
 _ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
+_PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
 _REST = 1e-6  # m/s^2, largest acceleration at rest
 _PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
 _LISTED = 12  # largest number of names in a printed line
@@ -66,9 +67,9 @@ class MjcfRobot(Robot):
     If the file has no light, one is added. Without a camera named overview, pictures show the whole run.
 
     Obstacles are the geoms that are fixed to the world and can touch the robot, except its own base, which carries it,
-    and the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of
-    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are
-    MuJoCo's.
+    and what it stands on and moves over. They do not collide in the plan's physics: costs and constraints keep clear of
+    them, at MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. A pedestal that a link turns
+    on is no obstacle for that link: they touch in every position of the joints. All other contacts are MuJoCo's.
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
@@ -81,7 +82,8 @@ class MjcfRobot(Robot):
       outline: whether the robot gets `balls`, fixed to its bodies, that cover the colliding geoms; by default only if
         it has no position. A sphere gets one ball, a capsule a chain of balls, any other geom its bounding ball. The
         balls are cheap bounds of the colliding geoms, and pictures follow them.
-      floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
+      floors: whether there is ground for standing on: level planes and height fields, if a joint lets the robot sink to
+        them, and all geoms on which it stands and that a free joint or a slide moves it over.
       obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
 
@@ -315,11 +317,12 @@ class MjcfRobot(Robot):
           The Problem.
 
         Raises:
-          InputError: an argument is not as described.
+          InputError: an argument is not as described, or the goal moves a joint past its limits.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
+        self._check_goal(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(model, self._numbers) ** -2.0 if effort is None else effort
@@ -344,6 +347,20 @@ class MjcfRobot(Robot):
             control_limits=(controls.low, controls.high),
             constraints=kept,
         )  # fmt: skip
+
+    def _check_goal(self, start: Array, goal: Array) -> None:
+        """Raises InputError for a goal that moves a joint past its limits."""
+        names = self.dynamics.state_coordinates.names
+        for one in self._joints:
+            if one.limits is None or goal[one.dof] == start[one.dof]:
+                continue
+            least, most = one.limits
+            if not least - _PAST * (most - least) <= goal[one.dof] <= most + _PAST * (most - least):
+                unit, more = "m", ""
+                if one.kind == "hinge":
+                    unit, more = "rad", f" ({np.degrees(least):.4g} to {np.degrees(most):.4g} degrees)"
+                wanted = f"want the joint within its limits in the MJCF, {least:.4g} to {most:.4g} {unit}{more}"
+                raise InputError(f"goal: got {goal[one.dof]:.4g} {unit} for {names[one.dof]}, {wanted}")
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
         """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
@@ -375,8 +392,19 @@ class MjcfRobot(Robot):
             *([f"  dry friction, in plans and runs: {_listed(dry)}"] if (dry := self._dry()) else []),
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",
+            *([f"  carried, without contacts, by: {_listed(mounts)}"] if (mounts := self._mounts()) else []),
         ]
         return "\n".join(lines)
+
+    def _mounts(self) -> list[str]:
+        """The obstacles that bodies touch in every position, with these bodies."""
+        model = self.scene.model
+        names = dict(zip(self.scene.geoms, self.scene.world.names, strict=True))
+        pairs = [
+            (model.body(int(model.geom_bodyid[own])).name, names[other])
+            for own, other in mounting_pairs(model, list(self.scene.geoms)).tolist()
+        ]
+        return [f"{obstacle} ({body})" for body, obstacle in dict.fromkeys(pairs)]
 
     def _dry(self) -> list[str]:
         """The dry friction of joints and tendons, by name."""

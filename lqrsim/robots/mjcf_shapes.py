@@ -78,7 +78,7 @@ class MjcfGeoms(CollisionGeoms):
         each = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
         out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
         if count:
-            data = self._to_each(own, numbers)
+            _, data = self._to_each(own, numbers)
             self._module(own).distances_of(len(flat), flat, each, away, int(moved), data, out, which, segments)
         return out[: len(flat) * count].reshape(*states.shape[:-1], count)
 
@@ -88,9 +88,20 @@ class MjcfGeoms(CollisionGeoms):
         out, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
         which, segments = np.empty(count + 1), np.empty((count + 1, 6))
         if count:
-            self._module(own).slopes_of(len(flat), flat, self._to_each(own, numbers), out, slopes, which, segments)
+            _, data = self._to_each(own, numbers)
+            self._module(own).slopes_of(len(flat), flat, data, out, slopes, which, segments)
         shape = len(flat), count
         return out[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
+
+    def nearest_bodies(self, dynamics: Dynamics, world: World, state: npt.ArrayLike) -> tuple[str, str]:
+        own, numbers = self._bound(dynamics, world)
+        flat, count = in_c_order(np.asarray(state, dtype=np.float64)[None]), len(numbers)
+        out, which, segments = np.empty(count), np.empty(count + 1), np.empty((count + 1, 6))
+        chosen, data = self._to_each(own, numbers)
+        self._module(own).distances_of(1, flat, 1, np.zeros(1), 0, data, out, which, segments)
+        pair = self._pairs[chosen[int(which[int(out.argmin())])]]
+        first, second = (self.scene.model.body(body).name for body in self.scene.model.geom_bodyid[pair].tolist())
+        return first, second
 
     def of_scene(self, scene: Scene) -> bool:
         return scene is self.scene or (scene.xml == self.scene.xml and scene.geoms == self.scene.geoms)
@@ -126,14 +137,14 @@ class MjcfGeoms(CollisionGeoms):
         table = np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)
         return np.concatenate([[count, len(chosen), check_number("reach", reach)], table.ravel()])
 
-    def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> Array:
-        """The kernel's data with the address of p, for all distances to each obstacle."""
+    def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.intp], Array]:
+        """The indices of the pairs, and the kernel's data with the address of p, for all distances to each obstacle."""
         place = np.full(len(self.scene.world), -1, dtype=np.int64)
         place[numbers] = np.arange(len(numbers))
         rows = np.asarray(place[self._number], dtype=np.int64)
         chosen = np.flatnonzero(rows >= 0)
         data = self._data(chosen, rows[chosen], len(numbers), _FAR)
-        return np.concatenate([[float(dynamics.physics.numbers.ctypes.data)], data])
+        return chosen, np.concatenate([[float(dynamics.physics.numbers.ctypes.data)], data])
 
     def _module(self, dynamics: MjcfDynamics) -> Any:
         n = len(dynamics.state_coordinates)

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import Source, source_of
-from lqrsim.errors import Array, InputError, check_array, check_name, check_text, check_weights
+from lqrsim.errors import Array, InputError, brief, check_array, check_name, check_text, check_weights
 from lqrsim.kernels import distance_constraint, mjcf_sites, residual_cost
 from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
 from lqrsim.problem.costs import Cost, CostTerm
@@ -27,12 +27,19 @@ class _Pose:
         if position is None and orientation is None:
             raise InputError(f"{what}: got neither position nor orientation, want at least one")
         self.position = None if position is None else check_array(f"{what}: position", position, (3,))
-        self.axes = None
+        self.axes: Array | None = None
+        self.orientation: Array | None = None
         if orientation is not None:
             quaternion = check_array(f"{what}: orientation", orientation, (4,))
             if not np.linalg.norm(quaternion) > 1e-9:
                 raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a nonzero (w, x, y, z)")
+            self.orientation = quaternion
             self.axes = axes_of(quaternion / np.linalg.norm(quaternion))
+
+    def __repr__(self) -> str:
+        placed = f" at {brief(self.position)}" if self.position is not None else ""
+        turned = f" turned to {brief(self.orientation)}" if self.orientation is not None else ""
+        return f"{self.site!r}{placed}{turned}"
 
     @property
     def rows(self) -> list[str]:

@@ -1,15 +1,21 @@
 """The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
 
+_FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 
-_NEAR = 1e-3  # m; a geom nearer to the floor stands on it
+_NEAR = 1e-3  # m; a geom nearer to another touches it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
+_LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
+_POSITIONS = 64  # random positions of joints in which a geom must touch what carries it
 
 
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
@@ -18,26 +24,52 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     They are those of `touchable`, except its own base, and a floor that it touches at rest.
 
     Args:
-      body: the robot's first that moves. floors: whether level planes and height fields may be for standing on.
+      body: the robot's first that moves. floors: whether there may be ground for standing on.
     """
-    data, base, bodies = _at_rest(model), _base(model), model.geom_bodyid.tolist()
-    ground = _ground(model, data) if floors else set[int]()
+    data, base, bodies, pairs = _at_rest(model), _base(model), model.geom_bodyid.tolist(), touching_pairs
+    level, stood_on = set[int](), set[int]()
+    if floors:
+        level, stood_on = _ground(model, data), _supports(model, pairs(model, candidates))
     return [
         geom
         for geom in touchable(model, candidates, body, floors=floors)
-        if bodies[geom] not in base and not (geom in ground and _touches(model, data, geom))
+        if bodies[geom] not in base
+        and geom not in stood_on
+        and not (geom in level and _touch(model, data, pairs(model, [geom])).any())
     ]
 
 
 def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
-    """The candidates that MuJoCo lets the robot touch, except a floor that it can sink to.
+    """The candidates that MuJoCo lets the robot touch, except ground and what only carries it.
+
+    Ground is a floor that the robot can sink to, and what it stands on and can move over.
 
     Args:
       body, floors: as of `in_the_way`. A free joint, or a slide that is not level, lets it sink.
     """
-    data, touched = _at_rest(model), set(touching_pairs(model, candidates)[:, 1].tolist())
-    ground = _ground(model, data) if floors and _sinks(model, data, body) else set[int]()
+    data, touched = _at_rest(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
+    ground = set[int]()
+    if floors:
+        pairs = touching_pairs(model, candidates)
+        own = model.body_rootid[model.geom_bodyid[pairs[:, 0]]] == model.body_rootid[body]
+        ground = (_ground(model, data) if _sinks(model, data, body) else ground) | _supports(model, pairs[own])
     return [geom for geom in candidates if geom in touched and geom not in ground]
+
+
+def avoidable_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs that MuJoCo lets collide, except those that touch in every position of the joints.
+
+    A link that turns on a pedestal touches it always: no plan can avoid that, and it is no collision.
+    """
+    pairs = touching_pairs(model, obstacles)
+    return pairs[~_always_touch(model, pairs)]
+
+
+def mounting_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs that touch in every position of the joints, of obstacles that another geom can also touch."""
+    pairs = touching_pairs(model, obstacles)
+    always = _always_touch(model, pairs)
+    return pairs[always & np.isin(pairs[:, 1], pairs[~always, 1])]
 
 
 def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
@@ -63,11 +95,11 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
-    """The pairs whose distances matter: pairs that can touch, and all pairs with an obstacle that nothing can touch.
+    """The pairs whose distances matter: `avoidable_pairs`, and all pairs with an obstacle that has none of these.
 
     The user has chosen such an obstacle by name or by a rule.
     """
-    pairs = touching_pairs(model, obstacles)
+    pairs = avoidable_pairs(model, obstacles)
     untouched = sorted(set(obstacles) - set(pairs[:, 1].tolist()))
     if untouched:
         moving = solid_geoms(model)
@@ -143,20 +175,81 @@ def _at_rest(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def _touches(model: mujoco.MjModel, data: mujoco.MjData, ground: int) -> bool:
-    """Whether a moving geom touches a geom, or is inside it."""
-    pairs = touching_pairs(model, [ground])[:, 0].tolist()
-    return any(mujoco.mj_geomDistance(model, data, geom, ground, 2 * _NEAR, None) < _NEAR for geom in pairs)
+def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs whose geoms touch or overlap."""
+    found, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
+    apart = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1) - sizes.sum(axis=1)
+    for k in np.flatnonzero((apart < _NEAR) | (sizes == 0).any(axis=1)):  # planes have no size
+        found[k] = mujoco.mj_geomDistance(model, data, *pairs[k].tolist(), 2 * _NEAR, None) < _NEAR
+    return found
+
+
+def _always_touch(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom."""
+    data = _at_rest(model)
+    always = _touch(model, data, pairs)
+    always &= ~_moved_by(model, pairs, _FREE)
+    rng, kept = np.random.default_rng(0), np.flatnonzero(always)
+    for _ in range(_POSITIONS):
+        if not len(kept):
+            break
+        data.qpos[:] = _random_position(model, rng)
+        mujoco.mj_kinematics(model, data)
+        always[kept] = _touch(model, data, pairs[kept])
+        kept = kept[always[kept]]
+    return always
+
+
+def _moved_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs whose moving geom is carried by a joint of one of these kinds."""
+    bodies = model.geom_bodyid[pairs[:, 0]].tolist()
+    moved = {body: any(kind in kinds for kind, _ in _joints(model, body)) for body in set(bodies)}
+    return np.array([moved[body] for body in bodies], dtype=bool)
+
+
+def _random_position(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
+    """Random positions (nq,) of all joints; slides without a range move up to 1 m."""
+    qpos = model.qpos0.copy()
+    for joint, kind in enumerate(model.jnt_type):
+        first = int(model.jnt_qposadr[joint])
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            turn = rng.standard_normal(4)
+            qpos[first : first + 4] = turn / np.linalg.norm(turn)
+        elif kind != _FREE:
+            span = 1.0 if kind == mujoco.mjtJoint.mjJNT_SLIDE else np.pi
+            low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-span, span)
+            qpos[first] = rng.uniform(low, high)
+    return qpos
+
+
+def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
+    """The obstacles of these pairs on which the other geom stands, if a free joint or a slide moves it over them.
+
+    It stands there at rest; with a free joint, in a keyframe also counts.
+    """
+    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
+    floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
+    for qpos, own in ((model.qpos0, pairs[moving]), *((one, pairs[floating]) for one in model.key_qpos)):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for one, other in own[_touch(model, data, own)].tolist():
+            before = mujoco.mj_geomDistance(model, data, one, other, far, None)
+            data.geom_xpos[other, 2] -= _LOWERED
+            if mujoco.mj_geomDistance(model, data, one, other, far, None) - before > _CARRIES * _LOWERED:
+                found.add(other)
+            data.geom_xpos[other, 2] += _LOWERED
+    return found
+
+
+def _joints(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
+    """The kind and number of each joint between a body and the world."""
+    while body:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        yield from ((int(model.jnt_type[joint]), joint) for joint in range(first, first + count))
+        body = int(model.body_parentid[body])
 
 
 def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
-    while body:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        for joint in range(first, first + count):
-            kind = model.jnt_type[joint]
-            slides = kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(data.xaxis[joint, 2]) > 1e-9
-            if slides or kind == mujoco.mjtJoint.mjJNT_FREE:
-                return True
-        body = int(model.body_parentid[body])
-    return False
+    upward = np.abs(data.xaxis[:, 2]) > 1e-9
+    return any(kind == _FREE or (kind == _SLIDE and upward[joint]) for kind, joint in _joints(model, body))

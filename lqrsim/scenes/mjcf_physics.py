@@ -93,7 +93,7 @@ class MjcfPhysics:
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
             kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
             kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
-            kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass, kernel.INERTIAS: model.dof_M0,
+            kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass,
         }  # fmt: skip
         for place, array in fields.items():
             row[place] = array.ctypes.data
@@ -118,22 +118,8 @@ class MjcfPhysics:
         numbers[kernel.DISTANCE_MODEL], numbers[kernel.LOADED] = self._exact._address, len(carriers)
         numbers[kernel.LOADS] = kernel.TABLE + joints.size + len(actuators)
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
-        # MuJoCo does not compute the inertia of these from the mass again in each step.
-        simple = [
-            (carriers.index(body), dof, model.dof_M0[dof])
-            for dof, body in enumerate(model.dof_bodyid.tolist())
-            if body in carriers and model.dof_simplenum[dof] and _moves_straight(model, dof)
-        ]
-        numbers[kernel.SIMPLE] = len(simple)
-        return np.concatenate([numbers, joints.ravel(), actuators, *loads, np.ravel(simple)])
-
-
-def _moves_straight(model: mujoco.MjModel, dof: int) -> bool:
-    """Whether a degree of freedom is a translation."""
-    joint = int(model.dof_jntid[dof])
-    kind = mujoco.mjtJoint(model.jnt_type[joint])
-    free = kind == mujoco.mjtJoint.mjJNT_FREE and dof - int(model.jnt_dofadr[joint]) < 3
-    return free or kind == mujoco.mjtJoint.mjJNT_SLIDE
+        numbers[kernel.CONSTANTS] = functions["mj_setConst"]
+        return np.concatenate([numbers, joints.ravel(), actuators, *loads])
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:
@@ -219,6 +205,6 @@ def _functions() -> dict[str, int]:
     loaded = ctypes.CDLL(str(library))
     names = (
         "mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac",
-        "mj_geomDistance",
+        "mj_geomDistance", "mj_setConst",
     )  # fmt: skip
     return {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value or 0 for name in names}

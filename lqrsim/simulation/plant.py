@@ -5,7 +5,7 @@ With a `Simulator`, the simulator moves the robot. The MuJoCo model then provide
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_joints
-from lqrsim.scenes.mjcf_obstacles import touchable
+from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
 from lqrsim.scenes.scene import Scene, free_name
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
@@ -76,10 +76,13 @@ class Plant:
             self.shape = replace(self.shape, world=near)
         self.world = self.shape.world
         self.obstacles = self.world.names if bounded else near.names
+        self.body = int(scene.model.body(robot.body).id)
+        jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
+        self.bodies = _attached(scene.model, [self.body, *jointed])
+        mounts = mounting_pairs(scene.model, [geom for geom, one in self._scenery() if one in self.obstacles])
+        self._mounts = mounts[np.isin(scene.model.geom_bodyid[mounts[:, 0]], self.bodies)]
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
-        self.body = int(self.model.body(robot.body).id)
-        self.bodies = _attached(self.model, [self.body, *(int(joint.bodyid[0]) for joint in joints)])
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
         self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
         self.ctrl = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
@@ -278,6 +281,10 @@ class Plant:
             geom = self.model.geom(name)
             places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
 
+    def _scenery(self) -> list[tuple[int, str]]:
+        """The ids and names of the scene's obstacles."""
+        return list(zip(self.scene.geoms, self.scene.world.names, strict=True))
+
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         try:
             spec = mujoco.MjSpec.from_string(self.scene.xml)
@@ -291,8 +298,9 @@ class Plant:
         if self._step is not None:
             spec.option.timestep = self._step
         geoms = {geom.id: geom for geom in spec.geoms}
-        for geom, obstacle in zip(self.scene.geoms, self.scene.world.obstacles, strict=True):
-            geoms[geom].name = obstacle.name
+        for geom, name in self._scenery():
+            geoms[geom].name = name
+        _separate(geoms, self._mounts, self.scene.model)
         taken = {sensor.name for sensor in spec.sensors}
         for name in self.obstacles:
             if not contacts:
@@ -361,6 +369,27 @@ def _near(robot: Robot, scene: Scene) -> World:
     """The obstacles that MuJoCo lets a robot touch, except what it stands on."""
     ids = set(touchable(scene.model, list(scene.geoms), int(scene.model.body(robot.body).id), floors=True))
     return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
+
+
+def _separate(geoms: Mapping[int, mujoco.MjsGeom], mounts: Pairs, model: mujoco.MjModel) -> None:
+    """Let no contact arise between obstacles and the geoms that they carry, by a bit of each obstacle's own.
+
+    Args:
+      geoms: by id. mounts: pairs of a robot's geom and the obstacle that carries it.
+
+    Raises:
+      InputError: all bits are taken.
+    """
+    used = int(np.bitwise_or.reduce(model.geom_contype | model.geom_conaffinity, initial=0))
+    free = [1 << bit for bit in range(31) if not used >> bit & 1]
+    for obstacle in np.unique(mounts[:, 1]).tolist():
+        if not free:
+            raise InputError("obstacles: got an MJCF that uses all bits of contype and conaffinity, want a free one")
+        bit, carried = free.pop(), mounts[mounts[:, 1] == obstacle, 0]
+        others = touching_pairs(model, [obstacle])[:, 0]
+        for other in np.setdiff1d(others, carried).tolist():
+            geoms[other].conaffinity |= bit
+        geoms[obstacle].contype, geoms[obstacle].conaffinity = bit, 0
 
 
 def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:

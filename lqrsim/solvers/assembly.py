@@ -14,9 +14,12 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers import compiled
+from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.settings import can_be_exact
 from lqrsim.versions import versions
+
+FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
 def assemble(
@@ -52,7 +55,7 @@ def assemble(
     return Solution._assembled(
         later,
         status=found.status,
-        detail=found.detail,
+        detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
         remedy=remedy_of(problem, found, log, options),
         policy=policy(*law, states[:-1]),
         cost_to_go=_copied(found.values.get("cost_to_go")),
@@ -68,6 +71,30 @@ def assemble(
         versions=versions(),
         goal=problem.weighed_goal,
         goal_radius=goal_radius_of(problem, states),
+    )
+
+
+def _usable(found: RunResult, options: dict[str, object]) -> str:
+    """What the certificate says of a plan that is finished but not optimal, because time or iterations ended; or empty.
+
+    It is empty for a plan that misses a constraint, which the detail names.
+    """
+    plan, tolerance, allowed = found.certificate, options.get("tolerance"), options.get("constraint_tolerance")
+    if found.status not in (Status.TIME_LIMIT, Status.MAX_ITERATIONS) or plan is None or not np.isfinite(plan.cost):
+        return ""
+    missed = plan.violation > (allowed if isinstance(allowed, float) else 0.0)
+    if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
+        return ""
+    if not np.isfinite(plan.optimality):
+        return (
+            "the plan can be used, for it keeps dynamics, limits and constraints; how far the optimum is is not known"
+        )
+    if plan.optimality > FAR:
+        return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
+    wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""
+    return (
+        "the plan can be used, for it keeps dynamics, limits and constraints; its cost could still fall by a relative"
+        f" {plan.optimality:.1e}{wanted}"
     )
 
 

@@ -28,6 +28,7 @@ from lqrsim.errors import (
     keep,
     real,
     shaped,
+    without_addresses,
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -98,12 +99,12 @@ class Disturbance(abc.ABC):
     _scales: ClassVar[str] = ""  # the field of a dataclass that is proportional to the effect
 
     def describe(self, plant: Plant) -> str:
-        """The disturbance in words and units, for records. By default this is its repr.
+        """The disturbance in words and units, for records. By default this is its repr, without addresses of objects.
 
         Args:
           plant: the plant that is run.
         """
-        return repr(self)
+        return without_addresses(repr(self))
 
     def scaled(self, strength: float) -> "Disturbance":
         """The disturbance with `strength` times the effect, for a sweep over strengths.

@@ -13,6 +13,7 @@ import dataclasses
 import inspect
 import multiprocessing
 import os
+import re
 import signal
 import tempfile
 import traceback
@@ -35,6 +36,7 @@ MEMORY = 6 << 30  # bytes that a call may come to use beyond what is used before
 PATIENCE = 120.0  # seconds of the processor that a call may take: with what it compiles
 WALL = 400.0  # seconds after which a call that takes none of the processor counts as hung, too
 HERE = Path(__file__).parent
+ADDRESS = re.compile(r"0x[0-9a-fA-F]{6,}")
 FAILURES = ("raw", "hang", "death")
 
 
@@ -75,10 +77,12 @@ class Caller:
                 with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
                     arguments = self._arguments(rng, subject)
                     what = shown(arguments, subject.arguments)
-                    exercise(subject.call(**arguments))
+                    made = subject.call(**arguments)
+                    exercise(made)
+                    addressed = printed_address(made)
         except InputError as error:
             line = str(error)
-            good = 0 < len(line) <= LONGEST and len(line.splitlines()) == 1
+            good = 0 < len(line) <= LONGEST and len(line.splitlines()) == 1 and not ADDRESS.search(line)
             return Verdict(number, name, "refused" if good else "raw", what, line)
         except Deliberate:
             return Verdict(number, name, "deliberate", what)
@@ -90,7 +94,7 @@ class Caller:
                 or Path(traceback.extract_tb(error.__traceback__)[-1].filename).parent == HERE
             )
             return Verdict(number, name, "deliberate" if own else "raw", what, where(error))
-        return Verdict(number, name, "accepted", what)
+        return Verdict(number, name, "raw" if addressed else "accepted", what, addressed)
 
     def _arguments(self, rng: np.random.Generator, subject: Subject) -> dict[str, Any]:
         arguments = dict(subject.arguments)
@@ -99,6 +103,17 @@ class Caller:
         for name in rng.choice(names, size=several, replace=False) if names else ():
             arguments[name] = spoilt(rng, arguments[name], self._others)
         return arguments
+
+
+def printed_address(made: Any) -> str:
+    """The text of a result that names an object by its address in memory; empty if it does not.
+
+    What Python or a dataclass prints by itself is not the package's text.
+    """
+    own = type(made).__module__.partition(".")[0] == "lqrsim" and not isinstance(made, type)
+    plain = dataclasses.is_dataclass(made) or type(made).__repr__ is object.__repr__
+    texts = [str(made)] * (own and not (plain and type(made).__str__ is object.__str__))
+    return next((text[:400] for text in texts if ADDRESS.search(text)), "")
 
 
 def exercise(made: Any) -> None:
