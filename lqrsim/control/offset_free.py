@@ -91,7 +91,7 @@ class OffsetFree(Controller):
     Attributes:
       model: the linear model about the plan, with z = (state, actuator outputs, unknowns).
       filter: the filter's gains and covariances.
-      weights: the law's weights of deviations from the plan.
+      weights: the law's weights of deviations from the plan; `weights.emphasis` is None with given tolerances.
       gain: gain of the law, (T, m, Z).
       offset: offset of the law, (T, m).
       nominal: z in an undisturbed run, (T+1, Z).

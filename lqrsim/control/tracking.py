@@ -218,7 +218,7 @@ def track(
       solution: its solution, or another solution with a plan of the same system.
       tolerate: the tolerated deviation of each state, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s":
         0.2}. Only the ratios to one another and to `effort` matter. By default, the tolerances with which the robot is
-        least likely to fail under the uncertainty.
+        least likely to fail under the uncertainty, and an emphasis on deviations that lead to a collision.
       effort: the largest change of each control for returning to the plan; by default a quarter of its range.
       at_end: factor on the tolerances of the position at the end of the plan; on the tolerances of all states if there
         is no position.
