@@ -962,7 +962,7 @@ class TestParts:
         for wanted in (pose, {"position": pose["position"]}, {"orientation": pose["orientation"]}):
             of_term(ls.SiteCost("tip", **wanted).bind(robot.dynamics), x, u)
             of_constraint(ls.SiteConstraint("tip", **wanted).bind(robot.dynamics), 1, x, u)
-        data = robot.geoms._to_each(robot.dynamics, np.arange(2))
+        _, data = robot.geoms._to_each(robot.dynamics, np.arange(2))
         source, sizes, states = source_of(mjcf_distances), {"N": n, "M": m, "W": n + m}, np.stack([x, 1.1 * x])
         scratch = np.zeros(3), np.zeros((3, 6))
         for moved in (0, 1):
