@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pillars
 import pytest
+from pillars import RADIUS, STEPS
 from sampling import rarely
 from scipy.stats import norm
 
@@ -17,53 +19,20 @@ from lqrsim.control.chance_constrained import chances_instead
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
-STEPS, DT = 40, 0.1
-PILLAR = ls.World([ls.Obstacle("pillar", "cylinder", np.array([0.0, 0.1, 0.0]), np.eye(3), np.array([0.4, 2.0, 0.0]))])
-RADIUS = 0.2
-UNCERTAINTY = Uncertainty(start=0.05, control=1.5, measurement=0.03)
+PLACE = (0.0, 0.1)
+PILLAR = pillars.pillars(PLACE)
+NOISE = pillars.Noise(start=0.05, control=1.5, measurement=0.03)
+UNCERTAINTY = NOISE.told
 TOLERATE = {"m": 0.5, "m/s": 1.0}
-
-
-def moves(x, u, p):
-    return [x[2], x[3], u[0], u[1]]
 
 
 @pytest.fixture(scope="module")
 def problem() -> ls.Problem:
-    dynamics = ls.Dynamics(
-        moves, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s2", "ay": "m/s2"},
-        position=("x", "y"), control_limits=(-5.0, 5.0),
-    )  # fmt: skip
-    return ls.Problem(
-        dynamics=dynamics, dt=DT, steps=STEPS, initial=ls.FixedState((-1.5, 0.0, 0.0, 0.0)),
-        stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=10.0),
-        final_cost=ls.QuadraticCost(np.full(4, 500.0), about=(1.5, 0.0, 0.0, 0.0)),
-    )  # fmt: skip
+    return pillars.problem(ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=10.0))
 
 
 def tracked(problem: ls.Problem, solution: ls.Solution) -> ls.AffinePolicy:
     return ls.track(problem, solution, tolerate=TOLERATE)
-
-
-def collisions(plan: ls.types.SafePlan, trials: int) -> float:
-    """The share of collisions at the knots, by Monte Carlo with the exact discrete double integrator."""
-    assert isinstance(plan.controller, ls.AffinePolicy)
-    rng, policy = np.random.default_rng(1), plan.controller
-    A = np.eye(4) + DT * np.eye(4, k=2)
-    B = np.concatenate([DT**2 / 2 * np.eye(2), DT * np.eye(2)])
-    x = plan.solution.trajectory.states[0] + 0.05 * rng.standard_normal((trials, 4))
-    hit = np.zeros(trials, dtype=bool)
-    for t in range(STEPS + 1):
-        hit |= np.hypot(x[:, 0], x[:, 1] - 0.1) < 0.4 + RADIUS
-        if t < STEPS:
-            shown = x + 0.03 * rng.standard_normal(x.shape)
-            u = np.clip(shown @ policy.gain[t].T + policy.offset[t], -5, 5) + 1.5 * rng.standard_normal((trials, 2))
-            x = x @ A.T + np.clip(u, -5, 5) @ B.T
-    return float(hit.mean())
-
-
-def clearances(states: Array) -> Array:
-    return np.hypot(states[:, 0], states[:, 1] - 0.1) - 0.4 - RADIUS
 
 
 @pytest.mark.parametrize("asked", [0.1, 0.01, 1e-3])
@@ -73,7 +42,8 @@ def test_a_plan_collides_as_often_as_predicted_and_no_more_than_asked(problem: l
     plan = ls.smooth_chance_constrained(problem, UNCERTAINTY, chance=asked, controller=tracked)
     assert plan.success
     assert 0.3 * asked <= plan.tube.collision_chance <= asked
-    measured = collisions(plan, 200_000)
+    assert isinstance(plan.controller, ls.AffinePolicy)
+    measured = pillars.collisions(plan.controller, NOISE, [PLACE], 200_000)
     assert plan.tube.collision_chance / 1.5 < measured < plan.tube.collision_chance * 1.5
     assert "as asked" in str(plan)
 
@@ -81,7 +51,7 @@ def test_a_plan_collides_as_often_as_predicted_and_no_more_than_asked(problem: l
 def test_less_chance_costs_more_and_keeps_farther(problem: ls.Problem) -> None:
     plans = [ls.smooth_chance_constrained(problem, UNCERTAINTY, chance=c, controller=tracked) for c in (0.1, 1e-3)]
     assert plans[0].solution.cost < plans[1].solution.cost
-    nearest = [float(clearances(plan.solution.trajectory.states).min()) for plan in plans]
+    nearest = [float(pillars.clearances(plan.solution.trajectory.states, PLACE).min()) for plan in plans]
     assert nearest[0] < nearest[1]
 
 
@@ -240,7 +210,7 @@ def test_a_margin_of_each_knot_is_kept(problem: ls.Problem) -> None:
         kept = ls.Clearance(PILLAR, radius=RADIUS, margin=given)
         plan = ls.smooth(ls.Problem(**fields(problem), constraints=[kept]))
         assert plan.success
-        assert (clearances(plan.trajectory.states)[1:] > margin[1:] - 1e-6).all()
+        assert (pillars.clearances(plan.trajectory.states, PLACE)[1:] > margin[1:] - 1e-6).all()
     np.testing.assert_array_equal(kept.ahead(3).margin, margin[3:, None])
 
 

@@ -4,44 +4,27 @@ from dataclasses import replace
 
 import hypothesis
 import numpy as np
+import pillars
 import pytest
 from hypothesis import strategies as st
+from pillars import RADIUS, THICK
 from sampling import examples
 
 import lqrsim as ls
 from lqrsim.control import tracking
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.emphasis import emphasis_of
-from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 
-STEPS, DT, RADIUS, START, CONTROL, SENSORS = 40, 0.1, 0.2, 0.05, 3.0, 0.05
 PLACES = ((0.0, 0.1), (0.9, -1.2))
-WORLD = ls.World(
-    [
-        ls.Obstacle(f"pillar {i}", "cylinder", np.array([x, y, 0.0]), np.eye(3), np.array([0.4, 2.0, 0.0]))
-        for i, (x, y) in enumerate(PLACES)
-    ]
-)
-UNCERTAINTY = Uncertainty(start=START, control=CONTROL, measurement=SENSORS)
-
-
-def moves(x, u, p):
-    return [x[2], x[3], u[0], u[1]]
+NOISE = pillars.Noise(start=0.05, control=3.0, measurement=0.05)
+UNCERTAINTY = NOISE.told
 
 
 @pytest.fixture(scope="module")
 def problem() -> ls.Problem:
-    """A point mass that passes between two pillars with 0.1 m of room."""
-    dynamics = ls.Dynamics(
-        moves, states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}, controls={"ax": "m/s2", "ay": "m/s2"},
-        position=("x", "y"), control_limits=(-5.0, 5.0),
-    )  # fmt: skip
-    return ls.Problem(
-        dynamics=dynamics, dt=DT, steps=STEPS, initial=ls.FixedState((-1.5, 0.0, 0.0, 0.0)),
-        stage_cost=ls.ControlCost((1.0, 1.0)), constraints=[ls.Clearance(WORLD, radius=RADIUS, margin=0.1)],
-        final_cost=ls.QuadraticCost(np.full(4, 500.0), about=(1.5, 0.0, 0.0, 0.0)),
-    )  # fmt: skip
+    """Between two pillars, with 0.1 m of room."""
+    return pillars.problem(None, ls.Clearance(pillars.pillars(*PLACES), radius=RADIUS, margin=0.1))
 
 
 @pytest.fixture(scope="module")
@@ -58,30 +41,11 @@ def without(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def collisions(policy: ls.AffinePolicy, start: Array, trials: int) -> float:
-    """The share of collisions at the knots, by Monte Carlo with the exact discrete double integrator."""
-    rng = np.random.default_rng(1)
-    A = np.eye(4) + DT * np.eye(4, k=2)
-    B = np.concatenate([DT**2 / 2 * np.eye(2), DT * np.eye(2)])
-    x = start + START * rng.standard_normal((trials, 4))
-    hit = np.zeros(trials, dtype=bool)
-    for t in range(STEPS + 1):
-        for place in PLACES:
-            hit |= np.linalg.norm(x[:, :2] - place, axis=1) < 0.4 + RADIUS
-        if t < STEPS:
-            shown = x + SENSORS * rng.standard_normal(x.shape)
-            u = shown @ policy.gain[t].T + policy.offset[t]
-            u = np.clip(u, -5, 5) + CONTROL * rng.standard_normal((trials, 2))
-            x = x @ A.T + np.clip(u, -5, 5) @ B.T
-    return float(hit.mean())
-
-
 def test_laws_with_it_collide_less_often(problem: ls.Problem, solution: ls.Solution, without) -> None:
     """20,000 trials of each law; with it 3 % collide, which has a standard error of 4 %, without it 7 %."""
-    start = solution.trajectory.states[0]
-    before = collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), start, 20_000)
+    before = pillars.collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), NOISE, PLACES, 20_000)
     without.undo()
-    after = collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), start, 20_000)
+    after = pillars.collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), NOISE, PLACES, 20_000)
     assert after < 0.7 * before
 
 
@@ -111,9 +75,9 @@ def test_it_is_the_slope_of_the_chance(problem: ls.Problem, seed: int, margin: f
     surroundings = Surroundings.of(problem, 0.0)
     states = np.zeros((4, 4))
     angle = rng.uniform(0, 2 * np.pi, 4)
-    away = 0.4 + RADIUS + deviation * margin * rng.uniform(1.0, 1.2, 4)
+    away = THICK + RADIUS + deviation * margin * rng.uniform(1.0, 1.2, 4)
     states[:, :2] = PLACES[0] + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    far = np.linalg.norm(states[:, :2] - PLACES[1], axis=1) - 0.4 - RADIUS
+    far = np.linalg.norm(states[:, :2] - PLACES[1], axis=1) - THICK - RADIUS
     hypothesis.assume((far > 8 * deviation).all())  # one pillar alone matters
     factor = rng.normal(size=(4, 4, 4)) * deviation
     covariance = factor @ factor.transpose(0, 2, 1) + 1e-6 * np.eye(4)
@@ -134,7 +98,7 @@ def test_it_is_the_slope_of_the_chance(problem: ls.Problem, seed: int, margin: f
         change[t, :2, :2] = 1e-5 * deviation**2 * np.outer(direction, direction)
         slope = (expected(covariance + change) - expected(covariance - change)) / 2
         slopes.append(slope / np.sum(found[t] * change[t]))
-    z = (away[1:] - 0.4 - RADIUS) / deviation
+    z = (away[1:] - THICK - RADIUS) / deviation
     low, high = np.array(slopes) / (1 + 1 / z**2), np.array(slopes)
     assert low.max() <= 1.01 * high.min()
 

@@ -40,7 +40,7 @@ from lqrsim.solvers.smoother import smooth
 ENOUGH = 0.5
 HELD = 1e-3  # m; a clearance that exceeds its margin by at most this is determined by the margin
 AIM = 0.8  # target for the next plan, relative to the requested chance
-WIDEN = 2.0  # largest growth of the margin from one plan to the next, in standard deviations
+WIDEN = 2.0  # largest factor on the margin, in standard deviations, from one plan to the next
 PATIENCE = 2  # stop widening margins, or raising weights, after this many plans in a row without a safer one
 HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # factors of the weight of the obstacles' cost
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
@@ -298,7 +298,7 @@ class _Search:
         return OffsetFree(problem, solution, self.uncertainty)
 
     def _spread(self, plan: SafePlan) -> Spread:
-        """Standard deviations of the clearances along the plan, (T+1, O)."""
+        """The distribution of the clearances along the plan."""
         tube = plan.tube
         return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
@@ -337,7 +337,7 @@ class _Search:
         to it. Where trials collide although the moments hardly know of a collision, with a chance of 1e-50 or 0, that
         number says nothing, and only the limit holds.
         """
-        clearance, std, correlation = self._spread(plan)
+        clearance, std, correlation, _ = self._spread(plan)
         clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
         # The moments are assumed to misjudge the next plan's chance by the same factor as this plan's.
         wanted, tube = AIM * self.asked, plan.tube

@@ -25,12 +25,14 @@ class Spread(NamedTuple):
 
     Attributes:
       mean: mean in m, (T+1, O). std: standard deviation in m, (T+1, O). correlation: correlation of each clearance with
-        the same clearance at the previous knot, (T, O).
+        the same clearance at the previous knot, (T, O). normal: derivative of each clearance by the position, (T+1, O,
+        p).
     """
 
     mean: Array
     std: Array
     correlation: Array
+    normal: Array
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class Surroundings:
         variance = (normal @ covariance * normal) @ ones + displaced
         std = np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
         shared = (normal[..., 1:, :, :] @ across * normal[..., :-1, :, :]) @ ones + displaced
-        return Spread(clearance, std, np.clip(shared / (std[..., 1:, :] * std[..., :-1, :]), -1.0, 1.0))
+        return Spread(clearance, std, np.clip(shared / (std[..., 1:, :] * std[..., :-1, :]), -1.0, 1.0), normal)
 
 
 def collision_chance(
@@ -127,8 +129,8 @@ def collision_chance(
     """
     if not surroundings.kept:
         return np.zeros(states.shape[:-1]), np.zeros(states.shape[:-2])
-    clearance, std, correlation = surroundings.spread(states, covariance, across)
-    return chance_of_clearances(clearance / std, correlation)
+    spread = surroundings.spread(states, covariance, across)
+    return chance_of_clearances(spread.mean / spread.std, spread.correlation)
 
 
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, Array]:

@@ -43,8 +43,8 @@ MODELLED = 0.12
 # the plan is far from all obstacles, or collides with any law.
 NARROW = 0.02
 # Factor of the squared fraction of commands beyond the limits, as an addition to the chance of failing. The linear
-# model knows nothing of trials that stay at their limits and leave the plan. This value is our choice: with a smaller
-# one, under moderate disturbances, the emphasis causes more such trials than it prevents collisions.
+# model knows nothing of trials that stay at their limits and leave the plan. This value is our choice: the larger it
+# is, the gentler the laws are, and the weaker their emphasis.
 FRAGILE = 5.0
 
 
