@@ -42,7 +42,7 @@ def without(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 
 def test_laws_with_it_collide_less_often(problem: ls.Problem, solution: ls.Solution, without) -> None:
-    """20,000 trials of each law; with it 3 % collide, which has a standard error of 4 %, without it 7 %."""
+    """20,000 trials of each law: with it 9.7 % collide, with a standard error of 0.2 %, and without it 18.1 %."""
     before = pillars.collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), NOISE, PLACES, 20_000)
     without.undo()
     after = pillars.collisions(ls.track(problem, solution, uncertainty=UNCERTAINTY), NOISE, PLACES, 20_000)
