@@ -82,6 +82,7 @@ def test_limited_moments_are_those_of_quadrature(
         return sum(
             quad(lambda x: norm.pdf(x, centre, std) * function(x, np.clip(x, lowest, highest)), a, b, epsabs=1e-12)[0]
             for a, b in pairwise(edges)
+            if b - a > 1e-12  # quad warns of shorter pieces, which add nothing
         )
 
     first = expected(lambda x, y: y)
