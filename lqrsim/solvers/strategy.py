@@ -115,30 +115,12 @@ def solve(
     with stop.reporting("smooth", attentive):
         with problem.dynamics.solving(threads if len(runs) == 1 else 1):
             search.run()
-            default = settings.start is None and settings.starts is None
-            # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-            poor, tried = search.says_infeasible or (default and search.is_unacceptable), not settings.safeguard
-            if settings.safeguard and not stop.due and poor:
-                search.widen()
-                tried = not stop.due
-            if settings.start is None and search.best[0].second_order and not stop.due:
-                search.look_aside()
-            if problem.risk > 0 and settings.safeguard and not stop.due:
-                search.retry_without_risk()
-        if default and settings.safeguard and not stop.due and not search.best[1].success:
-            search.soften()
-            if not search.best[1].success and not stop.due:
-                search.alternate()
-    chosen, found = search.best
-    if found.status is Status.INFEASIBLE and not tried and stop.error is None:
-        untried = "no time was left for other starts, which may keep the constraints"
-        found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
-    detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
-    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
-    solution = assemble(
-        problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
-        options=settings.options(chosen.initial_guess) | tolerances, candidates=search.candidates(),
-    )  # fmt: skip
+            search.widen()
+            search.look_aside()
+            search.retry_without_risk()
+        search.soften()
+        search.alternate()
+    solution = search.solution()
     for run in runs:
         run.give_back()
     return stop.finish(solution)
@@ -190,7 +172,10 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs, the most promising of which are finished. The methods are in the order in which `solve` calls them.
+    """Several runs, the most promising of which are finished.
+
+    The methods are in the order in which `solve` calls them. Each does nothing if it is not needed, or not permitted by
+    the settings, or if no time is left.
 
     Attributes:
       best: the run with the best result so far, and that result.
@@ -201,6 +186,8 @@ class Search:
         self._callback, self._threads, self._known = callback, threads, Known()
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
+        self._default = self._settings.start is None and self._settings.starts is None
+        self._tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._softer: list[Candidate] = []  # plans for softer contacts
         self._soft: list[tuple[str, Problem]] = []  # the problem with contacts of each softness, the widest first
@@ -224,7 +211,11 @@ class Search:
             self._offer(run, self._finish(run))
 
     def widen(self) -> None:
-        """Try other starts: other routes, or, if there is nothing to go round, other controls and paths."""
+        """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
+        # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
+        poor = self._says_infeasible or (self._default and self._is_unacceptable)
+        if not (poor and self._may_go_on):
+            return
         if pull(self._problem) > 0:
             for times in HEAVIER:
                 self._try_reweighted(times)
@@ -232,6 +223,7 @@ class Search:
             self._try_elsewhere()
         else:
             self._try_sinusoidal_controls()
+        self._tried = not self._budget.stop.due
 
     def _try_reweighted(self, times: float) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
@@ -304,6 +296,8 @@ class Search:
 
     def look_aside(self) -> None:
         """Finish plans from paths aside, if the best plan touches a constraint that may be passed on another side."""
+        if self._settings.start is not None or not self.best[0].second_order:
+            return
         problem, tried = self._problem, {name for name, _ in self._named}
         touched = any(one.values.any() for one in itertools.compress(self.best[1].multipliers, passable(problem)))
         if touched and pull(problem) == 0:
@@ -314,7 +308,8 @@ class Search:
 
     def retry_without_risk(self) -> None:
         """If the risk was too high for an intermediate plan: solve without risk, and continue from that plan."""
-        if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
+        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
+        if self._problem.risk <= 0 or not too_high or not self._may_go_on:
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
@@ -328,13 +323,15 @@ class Search:
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
     def soften(self) -> None:
-        """Plan for softer contacts and limits, with decreasing softness, and then for the true ones.
+        """If no plan has converged: plan for contacts and limits of decreasing softness, and then for the true ones.
 
         Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
         earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
         softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
         are good, and a third of the plans goes on at each.
         """
+        if not self._may_soften:
+            return
         problem = self._problem
         self._soft = [
             (name, dataclasses.replace(problem, dynamics=dynamics))
@@ -351,11 +348,13 @@ class Search:
         self._stiffen(found, harder, [name], self._budget.left)
 
     def alternate(self) -> None:
-        """Make the cheapest plan cheaper: soften its contacts a little, stiffen them again, and keep the modes.
+        """If none has converged yet: soften the cheapest plan's contacts a little, stiffen them, and keep its modes.
 
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
         again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
         """
+        if not self._may_soften:
+            return
         optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
         for _ in range(ROUNDS):
             before = self._cheapest
@@ -425,8 +424,7 @@ class Search:
         search = Search([name for name, _ in given], runs, self._callback, self._threads)
         with soft.dynamics.solving(self._threads if len(runs) == 1 else 1):
             search.run()
-            if search.is_unacceptable and not self._budget.stop.due:
-                search.widen()
+            search.widen()
         return search.best
 
     def _keep_softer(self, name: str, run: SolveRun, found: RunResult) -> RunResult:
@@ -455,7 +453,21 @@ class Search:
         self._offer(run, replace(found, detail=detail), better=found.rank <= self.best[1].rank)
         return True
 
-    def candidates(self) -> tuple[Candidate, ...]:
+    def solution(self) -> Solution:
+        """The best result as a Solution."""
+        chosen, found = self.best
+        problem, settings, stop = self._problem, self._settings, self._budget.stop
+        if found.status is Status.INFEASIBLE and not self._tried and stop.error is None:
+            untried = "no time was left for other starts, which may keep the constraints"
+            found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
+        detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
+        tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
+        return assemble(
+            problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
+            options=settings.options(chosen.initial_guess) | tolerances, candidates=self._candidates(),
+        )  # fmt: skip
+
+    def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
         results = {id(run): found for run, found in self._finished}
         found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
@@ -486,7 +498,16 @@ class Search:
             self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
 
     @property
-    def is_unacceptable(self) -> bool:
+    def _may_go_on(self) -> bool:
+        """Whether other starts may be tried: by default, as long as there is time."""
+        return self._settings.safeguard and not self._budget.stop.due
+
+    @property
+    def _may_soften(self) -> bool:
+        return self._default and self._may_go_on and not self.best[1].success
+
+    @property
+    def _is_unacceptable(self) -> bool:
         """Whether the best plan so far is unacceptable: far from the goal, or through an obstacle.
 
         Far means farther than the robot's radius, or, without a position, than the tolerance of a goal. Through means
@@ -518,7 +539,7 @@ class Search:
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
-    def says_infeasible(self) -> bool:
+    def _says_infeasible(self) -> bool:
         """Whether the best result is INFEASIBLE, which other starts may disprove."""
         return self._stuck and self.best[1].status is Status.INFEASIBLE
 
