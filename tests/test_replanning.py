@@ -21,6 +21,18 @@ from lqrsim.errors import Array
 STEPS, DT = 20, 0.1
 
 
+def car(x, u, p):
+    from sympy import cos, sin
+
+    return [x.speed * cos(x.heading), x.speed * sin(x.heading), x.speed * u.bend, u.push]
+
+
+CAR = ls.Dynamics(
+    car, states={"x": "m", "y": "m", "heading": "rad", "speed": "m/s"}, controls={"bend": "1/m", "push": "m/s^2"},
+    position=("x", "y"), angles=("heading",), control_limits=((-0.5, -2), (0.5, 2)),
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def stated() -> ls.Problem:
     return problem(weight=1.0)
@@ -119,6 +131,33 @@ class TestPreparedSolver:
         assert left.trajectory.steps == STEPS - 4
         solver.solve(solution.trajectory.states[4], found.shifted(2), problem=changed)
         assert len(compiled_module.compilations) == before
+
+    def test_an_obstacle_that_comes_into_the_way_is_gone_round(self) -> None:
+        """A car on a plan 6 m long meets a ball whose centre is on it; there is a way round each of them.
+
+        Where the solver looked for plans next to its own alone, it found none for three of these.
+        """
+
+        def met(x: float, y: float, size: float) -> ls.Problem:
+            world = ls.World([ls.Obstacle("ball", "sphere", np.array([x, y, 0.0]), np.eye(3), np.array([size, 0, 0]))])
+            return ls.Problem(
+                dynamics=CAR, dt=0.1, steps=40, initial=ls.FixedState([0, 0, 0, 1]),
+                stage_cost=ls.ControlCost([1, 0.3]), final_cost=ls.QuadraticCost([100.0] * 4, about=[6, 1, 0, 1]),
+                constraints=[ls.Clearance(world, radius=0.2), ls.StateBounds(speed=(0, 3))],
+            )  # fmt: skip
+
+        far = met(3, 9, 0.3)
+        planned = ls.smooth(far)
+        solver, compiled = ls.prepare(far), len(compiled_module.compilations)
+        for seed in range(36, 46):
+            rng = np.random.default_rng(seed)
+            x, y = planned.trajectory.states[rng.integers(22, 32), :2] + 0.1 * rng.normal(size=2)
+            size = rng.uniform(0.5, 1.6)
+            start = planned.shifted(1, horizon="shrinking")
+            found = solver.solve(planned.trajectory.states[1], start, problem=met(x, y, size), after=1)
+            assert found.success
+            assert np.linalg.norm(found.trajectory.states[1:, :2] - (x, y), axis=1).min() >= size + 0.2
+        assert len(compiled_module.compilations) == compiled
 
     def test_another_structure_is_refused(
         self, stated: ls.Problem, solver: ls.types.PreparedSolver, solution: Any

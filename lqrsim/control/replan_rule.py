@@ -249,6 +249,7 @@ class ReplanRule:
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
         self.changes, self._who = changes, who
         self.solver = prepare(problem)
+        solution.shifted(0)  # makes the parts of a Solution that are otherwise made at the first solve
 
     def problem_at(self, step: int, problem: Problem) -> Problem:
         """A problem as known in a control period, with the result of `changes`."""

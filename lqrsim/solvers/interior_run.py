@@ -40,14 +40,16 @@ class InteriorRun:
     """The interior point for the problem of a run.
 
     Attributes:
-      stages: stages of the problem. allowed: tolerance of its constraints.
+      stages: stages of the problem; by default they are made here. allowed: tolerance of its constraints.
     """
 
-    def __init__(self, run: SolveRun) -> None:
+    def __init__(self, run: SolveRun, stages: Stages | None = None) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self.allowed = run.settings.violation_tolerance(run.problem)
-        with run.budget.stop.not_counting():  # compiling
-            self.stages = Stages(run.problem)
+        if stages is None:
+            with run.budget.stop.not_counting():  # compiling
+                stages = Stages(run.problem)
+        self.stages = stages
 
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
         """The result from a plan if it converges; else None, so that smoothing can continue."""

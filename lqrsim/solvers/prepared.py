@@ -18,18 +18,22 @@ from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajec
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
-from lqrsim.solvers.assembly import goal_radius_of
+from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
+from lqrsim.solvers.constrained import Known, Ladder
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
+from lqrsim.solvers.restoration import restore
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
-BEGINNING = 15.0  # duration of the interior point's first iteration, relative to the time for the models about a plan
+# Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be time;
+# relative to the time for the models about a plan.
+BEGINNING, ELSEWHERE = 15.0, 200.0
 
 
 def prepare(
@@ -38,7 +42,7 @@ def prepare(
     tolerance: float | None = None,
     gap_tolerance: float = 1e-3,
     constraint_tolerance: float | None = None,
-    max_iterations: int = 100,
+    max_iterations: int = 300,
     finish: str | None = "newton",
 ) -> "PreparedSolver":
     """Compile everything that problems of this structure need, so that nothing is compiled while a robot runs.
@@ -95,6 +99,7 @@ class PreparedSolver:
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
         compiled.rollout(self.problem, *law, state)
+        clearance_of(self.problem, run.work.last.states)  # a solution that is shifted has it
         run.work.constraint_values(*run.work.best)
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, control, 0)
@@ -108,6 +113,10 @@ class PreparedSolver:
                 InteriorPoint(self.problem, plan, stages=stages).run(
                     tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
                 )
+                restore(
+                    stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True,
+                    stationary=lambda *_: False,
+                )  # fmt: skip
 
     def _stages_of(self, problem: Problem) -> Stages:
         try:
@@ -170,10 +179,15 @@ class PreparedSolver:
                 stages = self._stages_of(problem)
                 neighbour = _Neighbour(run, stages, _plan_of(start, best), best, self._closing)
                 found, ended = neighbour.find(), neighbour.laps.ended
+                if neighbour.may_be_far:
+                    best.consider(found)
+                    found, ended = Ladder(run, Known(), stages).climb(), time.perf_counter()
                 self._idle.append(stages)
             else:
                 found = _solve(run, best)
                 ended = time.perf_counter()
+        if stop.error is not None:
+            raise stop.error
         seconds = [one.seconds for one in budget.log]
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(found)
@@ -251,13 +265,15 @@ class _Neighbour:
 
     Attributes:
       laps: the times of its iterations; the last iteration may be an abandoned step.
+      may_be_far: whether it found nothing, and there is time to look for a plan that is not next to the given one, as
+        when an obstacle has come into its way.
     """
 
     def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._run, self._stages, self._plan, self._best = run, stages, plan, best
         self._closing, self._budget = closing, run.budget
         self._allowed = run.settings.violation_tolerance(run.problem)
-        self.laps, self._out_of_time = Laps(run.budget), False
+        self.laps, self.may_be_far, self._out_of_time = Laps(run.budget), False, False
 
     def find(self) -> RunResult:
         """Run until it converges or has to stop."""
@@ -289,6 +305,8 @@ class _Neighbour:
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
                     solved = self._solve(active)
             self.laps.ended = time.perf_counter()
+            in_time = self.laps.ended + ELSEWHERE * active.looking + self._closing < budget.stop.deadline
+            self.may_be_far = not solved and in_time and budget.left > 1
             return self._result(active, solved)
 
     def _solve(self, active: ActiveSet) -> bool:
