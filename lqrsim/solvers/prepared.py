@@ -31,8 +31,8 @@ from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
-# Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be time;
-# relative to the time for the models about a plan.
+# Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be
+# time; relative to the time for the models about a plan.
 BEGINNING, ELSEWHERE = 15.0, 200.0
 
 
