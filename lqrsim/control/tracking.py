@@ -6,12 +6,15 @@ state may deviate by as much as random controls of the tolerated effort move it 
 matter, and no state is held much more tightly than the controls permit. Weights that are tuned one by one can have
 better predictions, but only with the linear model for which they are tuned.
 
-The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law.
+The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law. And
+it says nothing of dynamics that bend within the tube: a tight law can turn a sailboat into the wind, from where it does
+not return. A law must therefore bring the nonlinear model back from a few likely deviations.
 
 If collisions are what makes a law fail, laws with an emphasis on the deviations that lead to them compete with it.
 """
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +34,9 @@ from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.goal import Target, scale_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
+from lqrsim.solvers.compiled import law_about, rollout
 
+_log = logging.getLogger("lqrsim")
 PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control periods in which a deviation may decay
 WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
 # By how much the emphasis may count: deviations at the most critical knot count this many times as much.
@@ -46,6 +51,9 @@ NARROW = 0.02
 # model knows nothing of trials that stay at their limits and leave the plan. This value is our choice: the larger it
 # is, the gentler the laws are, and the weaker their emphasis.
 FRAGILE = 5.0
+# The deviations from which a law must bring the model back: pairs drawn from the tube at this number of knots. It does
+# not if the model gets farther from the plan than LOST times the widest part of the tube.
+KNOTS, PAIRS, LOST = 3, 3, 6.0
 
 
 class Predictions(NamedTuple):
@@ -75,7 +83,21 @@ def choose_tolerances(
     told = predictions(problem, solution, uncertainty, model, found)
     least = narrowest(model, told.width)
     worth = worth_of(told, least)
-    best = len(worth) - 1 - int(np.argmin(worth[::-1]))  # of equals the gentlest
+
+    def lost(found: LoopMoments, laws: Laws, i: int) -> int:
+        return runs_lost(problem, solution, (laws[0][i], laws[1][i]), found.mean[i], found.covariance[i])
+
+    left = dict[int, int]()
+    for best in sorted(range(len(worth)), key=lambda i: (worth[i], -i)):  # of equals the gentlest first
+        left[best] = lost(found, (gain, offset), best)
+        if not left[best]:
+            break
+    else:
+        best = min(left, key=lambda i: left[i])
+        _log.warning(
+            "each law that was tried loses the plan from some deviations of the predicted size; the plan's own policy"
+            " or tolerances of your own (tolerate=) may do better"
+        )
     weights, laws = tried.pick(best), (gain[best], offset[best])
     # The same with emphasis, if it is predicted to fail less often.
     if told.saturation[best] > MODELLED:
@@ -87,10 +109,11 @@ def choose_tolerances(
         return weights, laws
     stressing = weights.stressing(emphasis, EMPHASIS)
     gain, offset = tracking_laws(model, stressing)
-    told = predictions(problem, solution, uncertainty, model, moments((gain, offset), limits))
-    stressed = worth_of(told, least)
+    found = moments((gain, offset), limits)
+    stressed = worth_of(predictions(problem, solution, uncertainty, model, found), least)
     i = int(np.argmin(stressed))
-    return (stressing.pick(i), (gain[i], offset[i])) if stressed[i] < worth[best] else (weights, laws)
+    better = stressed[i] < worth[best] and lost(found, (gain, offset), i) <= left[best]
+    return (stressing.pick(i), (gain[i], offset[i])) if better else (weights, laws)
 
 
 def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Target) -> Weights:
@@ -116,13 +139,31 @@ def predictions(
     surroundings, plan = Surroundings.of(problem, uncertainty.obstacles), model.plan.states
     mean, covariance = moments.mean, moments.covariance
     collide = collision_chance(plan + mean, covariance, moments.across, surroundings)[1]
-    place = list(model.dynamics.state_coordinates.position)
-    counts = np.array(place) if place else np.flatnonzero(np.isfinite(solution.target.state))
-    scale = np.ones(len(place)) if place else scale_of(plan)[counts]
+    counts, scale = _counted(solution, model.dynamics.state_coordinates.position)
     squares = (np.diagonal(covariance, axis1=-2, axis2=-1)[..., counts] + mean[..., counts] ** 2) / scale**2
     width = np.sqrt(squares.sum(axis=-1).mean(axis=-1))
     miss = _miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
     return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
+
+
+def runs_lost(problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array) -> int:
+    """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
+
+    The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n).
+    """
+    plan, n, rng, lost = solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
+    gain, offset = law_about(plan.states, plan.controls + law[1], law[0][..., :n])
+    counts, scale = _counted(solution, problem.dynamics.state_coordinates.position)
+    widest = np.sqrt((np.diagonal(covariance, axis1=1, axis2=2)[:, counts] / scale**2).sum(axis=1).max())
+    for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
+        variances, axes = np.linalg.eigh(covariance[t])
+        off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
+        for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
+            states, _ = rollout(problem, gain[t:], offset[t:], start)
+            with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
+                away = np.linalg.norm((states - plan.states[t:])[:, counts] / scale, axis=1)
+            lost += not (away <= LOST * widest).all()
+    return lost
 
 
 def narrowest(model: PlanModel, widths: Array) -> float:
@@ -151,6 +192,14 @@ def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
     """Replace numbers (..., n) by the rms over all states of the same unit."""
     same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
     return np.sqrt(numbers**2 @ same / same.sum(axis=0))
+
+
+def _counted(solution: Solution, position: Sequence[int]) -> tuple[list[int], Array]:
+    """The states in which a tube is measured, and their scales: the position, or else what the goal asks for."""
+    if position:
+        return list(position), np.ones(len(position))
+    counts = np.flatnonzero(np.isfinite(solution.target.state)).tolist()
+    return counts, scale_of(solution.trajectory.states)[counts]
 
 
 def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
