@@ -1,8 +1,13 @@
 """Each disturbance does what its numbers say, in their units, and refuses what does not fit."""
 
+import pickle
+from typing import Any
+
+import hypothesis
 import numpy as np
 import pytest
 from comparing import assert_white
+from hypothesis import strategies as st
 from scipy import stats
 from tracking import hover, weave
 
@@ -10,7 +15,16 @@ import lqrsim as ls
 from lqrsim.errors import InputError
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import ControlNoise, ControlOffset, ForceNoise, MeasurementNoise, Push
+from lqrsim.simulation.disturbances import (
+    ControlNoise,
+    ControlOffset,
+    ForceNoise,
+    InitialStateError,
+    MeasurementBias,
+    MeasurementNoise,
+    Push,
+)
+from lqrsim.stress.specification import disturbances_as_json, disturbances_from_json
 
 TRIALS = 40
 
@@ -127,8 +141,40 @@ def test_a_preset_has_no_disturbance_of_size_zero(gravity: str) -> None:
     assert "ControlNoise" not in found
 
 
-def test_numbers_by_name_are_refused_with_what_is_wanted() -> None:
-    with pytest.raises(
-        InputError, match=r"^MeasurementNoise: std: got numbers by name, want one number, or one for each"
-    ):
-        ls.disturbances.MeasurementNoise({"m": 0.01})  # pyright: ignore[reportArgumentType]
+@hypothesis.given(
+    st.dictionaries(st.sampled_from(["m", "rad", "x", "y", "heading"]), st.floats(0, 1), min_size=1),
+    st.sampled_from([MeasurementNoise, MeasurementBias, InitialStateError]),
+    st.floats(0, 2),
+)
+def test_numbers_by_name_or_unit_are_those_in_order(arena, named: dict[str, float], kind: Any, strength: float) -> None:
+    """A name comes before a unit; what is not named is 0. The same bits, words, record and description for filters."""
+    units = {"x": "m", "y": "m", "heading": "rad"}
+    in_order = kind([named.get(name, named.get(unit, 0.0)) for name, unit in units.items()])
+    one, other = kind(named).scaled(strength), in_order.scaled(strength)
+    assert one.describe(arena) == other.describe(arena)
+    assert one.uncertainty(arena) == other.uncertainty(arena)
+    assert pickle.loads(pickle.dumps(one)) == one
+    first, second = (simulate(arena, weave(4), disturbances=[each], seed=3).measured for each in (one, other))
+    np.testing.assert_array_equal(first, second)
+    (again,) = disturbances_from_json(disturbances_as_json([one]))
+    assert again == one
+
+
+any_kind: Any = MeasurementNoise  # for what its types do not allow
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda: ControlNoise({"m": 0.1}), "ControlNoise: std: got 'm', want"),
+        (lambda: MeasurementNoise({"z": 0.1}), "MeasurementNoise: std: got 'z', want"),
+        (lambda: MeasurementNoise({}), "MeasurementNoise: std: got no numbers"),
+        (lambda: MeasurementNoise({"m": -1.0}), "MeasurementNoise: std: m: got -1"),
+        (lambda: any_kind({"m": "wide"}), "MeasurementNoise: std: m: got 'wide'"),
+        (lambda: any_kind({3: 1.0}), "MeasurementNoise: std: name: got 3"),
+        (lambda: ForceNoise({"x": 0.1}), "ForceNoise: std: got numbers by name, want one number, or one for each"),
+    ],
+)
+def test_names_that_are_not_there_are_refused(arena, made, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        simulate(arena, weave(30), disturbances=[made()])

@@ -221,8 +221,8 @@ class Campaign:
             return cls(
                 **{
                     **fields,
-                    "sweeps": {name: _disturbances_from_json(some) for name, some in fields["sweeps"].items()},
-                    "design_disturbances": None if design is None else _disturbances_from_json(design),
+                    "sweeps": {name: disturbances_from_json(some) for name, some in fields["sweeps"].items()},
+                    "design_disturbances": None if design is None else disturbances_from_json(design),
                 }
             )
         except InputError:
@@ -258,7 +258,8 @@ def _as_json(value: Any) -> Any:
     raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
 
 
-def _disturbances_from_json(items: Iterable[Mapping[str, Any]]) -> tuple[Disturbance, ...]:
+def disturbances_from_json(items: Iterable[Mapping[str, Any]]) -> tuple[Disturbance, ...]:
+    """The inverse of `disturbances_as_json`."""
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
     return tuple(
         kinds[check_name("disturbance", item["kind"], sorted(kinds))](

@@ -100,7 +100,9 @@ class Saturation(Disturbance):
             limits = f"{100 * self.share:g} % of the robot's own"
         else:
             sides = {"from": self.lowest, "to": self.highest}
-            limits = " ".join(f"{word} {with_units(self, v, space)}" for word, v in sides.items() if v is not None)
+            limits = " ".join(
+                f"{word} {with_units(fit(self, v, space), space)}" for word, v in sides.items() if v is not None
+            )
         return f"controls limited {'to ' if self.share is not None else ''}{limits}" + (
             f", strength {self.strength:g}" if self.strength != 1 else ""
         )

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.control.uncertainty import Uncertainty, Unknown, possible_unknowns
+from lqrsim.control.uncertainty import Uncertainty, Unknown, per_entry, possible_unknowns
 from lqrsim.errors import (
     Array,
     InputError,
@@ -24,13 +23,14 @@ from lqrsim.errors import (
     check_kind,
     check_name,
     check_number,
+    check_text,
     excerpt,
     keep,
     real,
     shaped,
     without_addresses,
 )
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import PARAMETERS
@@ -165,13 +165,14 @@ class GaussianDisturbance(Disturbance):
       std: standard deviation; one number, or one per component.
     """
 
-    std: Numbers
+    std: PerEntry
 
     _scales = "std"
     along: ClassVar[str] = ""  # the components, if they are the same for every plant
+    by_name: ClassVar[bool] = False  # whether numbers may have the names or units of the components
 
     def __post_init__(self) -> None:
-        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0))
+        keep(self, std=check_numbers(self, "std", self.std, at_least=0.0, by_name=self.by_name))
         if self.along:
             fit(self, self.std, self.along)
 
@@ -209,13 +210,23 @@ def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) ->
     return np.stack([generator.random((steps, size)) for generator in generators])
 
 
-def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
-    """A field as a number or a tuple. Raises InputError for no numbers, and for too small or infinite numbers."""
-    field = f"{type(disturbance).__name__}: {name}"
+def check_numbers(
+    disturbance: Disturbance, name: str, numbers: PerEntry, *, at_least: float = -np.inf, by_name: bool = False
+) -> Any:
+    """A field as a number, a tuple or, if it may have them, numbers by name or unit.
+
+    Raises InputError for no numbers, and for too small or infinite numbers.
+    """
+    field, lowest = f"{type(disturbance).__name__}: {name}", at_least if np.isfinite(at_least) else None
     if isinstance(numbers, Mapping):
-        raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
+        if not by_name:
+            raise InputError(f"{field}: got numbers by name, want one number, or one for each component in order")
+        if not numbers:
+            raise InputError(f"{field}: got no numbers, want at least one")
+        keys = [check_text(f"{field}: name", key, "a name or a unit") for key in numbers]
+        return {key: check_number(f"{field}: {key}", numbers[key], at_least=lowest) for key in keys}
     if real(field, numbers).ndim == 0:
-        return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
+        return check_number(field, numbers, at_least=lowest)
     values = check_array(field, numbers, (None,))
     if not len(values):
         raise InputError(f"{field}: got no numbers, want at least one")
@@ -229,8 +240,10 @@ def check_strength(disturbance: Disturbance, strength: float) -> float:
     return check_number(f"{type(disturbance).__name__}: strength", strength, at_least=0.0)
 
 
-def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
-    """A number or a tuple of numbers times the strength. Raises InputError if the strength is negative or too large."""
+def times(disturbance: Disturbance, numbers: PerEntry, strength: float) -> Any:
+    """Numbers times the strength. Raises InputError if the strength is negative or too large."""
+    if isinstance(numbers, Mapping):
+        return {name: times(disturbance, one, strength) for name, one in numbers.items()}
     with np.errstate(over="ignore"):
         product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
     if not np.isfinite(product).all():
@@ -238,8 +251,14 @@ def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
     return float(product) if product.ndim == 0 else tuple(product.tolist())
 
 
-def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], field: str = "std") -> Array:
-    """A field as one number for each of `names`. Raises InputError unless it has one number, or one per name."""
+def fit(
+    disturbance: Disturbance, numbers: PerEntry, components: Coordinates | Sequence[str], field: str = "std"
+) -> Array:
+    """A field as one number for each component. Raises InputError if it has neither one number, nor one for each."""
+    names = components.names if isinstance(components, Coordinates) else components
+    if isinstance(numbers, Mapping):
+        assert isinstance(components, Coordinates)
+        return per_entry(f"{type(disturbance).__name__}: {field}", numbers, components)
     values = np.asarray(numbers, dtype=np.float64)
     if values.ndim and len(values) != len(names):
         raise InputError(
@@ -249,17 +268,16 @@ def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], 
     return np.broadcast_to(values, len(names))
 
 
-def with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates) -> str:
-    """The numbers grouped by unit, each group as one number if all are the same: `0.01 m, 0.02 rad`."""
-    values = fit(disturbance, std, coordinates.names)
+def with_units(values: Array, coordinates: Coordinates) -> str:
+    """One number for each entry, grouped by unit; a group is one number if all are the same: `0.01 m, 0.02 rad`."""
     of_unit = {
         unit: [v for v, u in zip(values, coordinates.units, strict=True) if u == unit] for unit in coordinates.units
     }
     return ", ".join(f"{words(v if len(set(v)) > 1 else v[0])} {unit}".rstrip() for unit, v in of_unit.items())
 
 
-def words(numbers: Numbers) -> str:
-    """Numbers as text: 0.1, or (0.1, 0.2)."""
-    values = np.atleast_1d(numbers)
+def words(numbers: PerEntry) -> str:
+    """Numbers in order as text: 0.1, or (0.1, 0.2)."""
+    values = np.atleast_1d(np.asarray(numbers))
     text = ", ".join(f"{value:g}" for value in values)
-    return text if np.ndim(numbers) == 0 else f"({text})"
+    return text if np.ndim(np.asarray(numbers)) == 0 else f"({text})"

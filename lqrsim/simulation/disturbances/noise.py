@@ -32,6 +32,7 @@ class AddedError(GaussianDisturbance):
     what: ClassVar[str]
     hook: ClassVar[Literal["measure", "actuate", "initial_states"]]  # the field of an `Effect`
     lasts: ClassVar[bool] = True
+    by_name = True
 
     def _coordinates(self, plant: Plant) -> Coordinates:
         """The quantity to which the error is added."""
@@ -39,11 +40,11 @@ class AddedError(GaussianDisturbance):
         return dynamics.control_coordinates if self.hook == "actuate" else dynamics.state_coordinates
 
     def describe(self, plant: Plant) -> str:
-        return f"{self.what}, std {with_units(self, self.std, self._coordinates(plant))}"
+        return f"{self.what}, std {with_units(self._deviations(plant), self._coordinates(plant))}"
 
     def _deviations(self, plant: Plant) -> Array:
         """One standard deviation for each coordinate."""
-        return fit(self, self.std, self._coordinates(plant).names)
+        return fit(self, self.std, self._coordinates(plant))
 
     def _std_for_filters(self, plant: Plant) -> float | tuple[float, ...]:
         """The standard deviations in the form of an Uncertainty: 0 for none."""
@@ -63,7 +64,8 @@ class ControlNoise(AddedError):
     """White noise on each control, redrawn each control period.
 
     Args:
-      std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, or one per control.
+      std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, one per control, or
+        numbers by name or unit, 0 for the others.
     """
 
     what, hook, lasts = "control noise", "actuate", False
@@ -76,7 +78,8 @@ class ControlOffset(AddedError):
     """A constant error of each control, drawn for each trial from a normal distribution.
 
     Args:
-      std: standard deviation in the control's unit; one number, or one per control.
+      std: standard deviation in the control's unit; one number, one per control, or numbers by name or unit, 0 for the
+        others.
     """
 
     what, hook = "control offset", "actuate"
@@ -90,7 +93,8 @@ class MeasurementNoise(AddedError):
     """White noise on each measured state.
 
     Args:
-      std: standard deviation in the state's unit; one number, or one per state.
+      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
+        0.01, "rad": 0.02}, 0 for the others.
     """
 
     what, hook, lasts = "measurement noise", "measure", False
@@ -103,20 +107,23 @@ class MeasurementBias(AddedError):
     """A constant error of each measured state, drawn for each trial from a normal distribution.
 
     Args:
-      std: standard deviation in the state's unit; one number, or one per state.
+      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
+        0.01, "rad": 0.02}, 0 for the others.
     """
 
     what, hook = "measurement bias", "measure"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return left_out(self, plant, "measurements cannot distinguish it from the state", acts=bool(np.any(self.std)))
+        acts = bool(self._deviations(plant).any())
+        return left_out(self, plant, "measurements cannot distinguish it from the state", acts=acts)
 
 
 class InitialStateError(AddedError):
     """The robot begins in a state that differs from the first state of the plan.
 
     Args:
-      std: standard deviation in the state's unit; one number, or one per state.
+      std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
+        0.01, "rad": 0.02}, 0 for the others.
     """
 
     what, hook = "initial state off", "initial_states"

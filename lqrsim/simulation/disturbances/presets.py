@@ -79,7 +79,7 @@ def _light(plant: Plant) -> list[Disturbance]:
 
 def _acts(disturbance: Disturbance) -> bool:
     """Whether it is not zero for this robot, as a share of the weight is where there is no gravity."""
-    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(disturbance.std))
+    return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(np.asarray(disturbance.std)))
 
 
 def _can_have(plant: Plant, disturbance: Disturbance) -> bool:
