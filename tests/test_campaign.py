@@ -80,10 +80,10 @@ CAMPAIGN = Campaign(
     sweeps={"scenario": ls.scenarios.quadrotor().disturbances},
     strengths=(1.0,),
     policies=("smooth", "open_loop"),
-    trials=30,
+    trials=18,
     shard=4,
 )
-OPTIONS = "--sweep scenario --strengths 1 --policies smooth open_loop --trials 30 --shard 4"
+OPTIONS = "--sweep scenario --strengths 1 --policies smooth open_loop --trials 18 --shard 4"
 COMMAND = ["quadrotor", *OPTIONS.split()]  # the same
 LINUX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
 
@@ -144,12 +144,12 @@ def test_rows_are_those_of_one_rollout(reference: Results, quadrotor: ls.Scenari
     cell = Cell("smooth", "scenario", 1.0)
     table = reference.outcomes(cell)
     rollout = ls.simulate(
-        quadrotor.plant(), reference.solution("smooth"), disturbances=CAMPAIGN.disturbances(cell), trials=30,
+        quadrotor.plant(), reference.solution("smooth"), disturbances=CAMPAIGN.disturbances(cell), trials=18,
         contacts=False, frames=False,
     )  # fmt: skip
-    assert table.trial.tolist() == list(range(30))
+    assert table.trial.tolist() == list(range(18))
     assert tuple(table.outcome) == rollout.outcome
-    assert reference.tally(cell).total() == 30
+    assert reference.tally(cell).total() == 18
     assert reference.complete
     assert reference.campaign == CAMPAIGN
 
@@ -347,10 +347,10 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(trials.Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     nan = Cell("open_loop", "scenario", 1.0)
-    assert results.tally(nan)["error"] > 27  # the others collide before
-    assert results.tally(nan)["error"] + results.tally(nan)["collided"] == 30
+    assert results.tally(nan)["error"] > 15  # the others collide before
+    assert results.tally(nan)["error"] + results.tally(nan)["collided"] == 18
     assert set(results.reasons(nan).values()) == {"controller at 0.6667 s: got nan for rotor_1, want a finite number"}
-    assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 25
+    assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 13
 
 
 def test_a_simulation_that_blows_up_is_diverged(tmp_path: Path) -> None:
@@ -367,10 +367,10 @@ def test_a_simulation_that_blows_up_is_diverged(tmp_path: Path) -> None:
 def test_a_damaged_shard_is_named_and_repaired(reference: Results, tmp_path: Path, how: str) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(reference.folder, folder)
-    shard = folder / "shards" / "0001-000000016.parquet"
+    shard = folder / "shards" / "0001-000000012.parquet"
     damage(shard, how)
     with pytest.raises(
-        InputError, match=r"0001-000000016\.parquet, which is damaged .* lqrsim stress quadrotor --resume"
+        InputError, match=r"0001-000000012\.parquet, which is damaged .* lqrsim stress quadrotor --resume"
     ):
         Results(folder).outcomes(Cell("open_loop", "scenario", 1.0))
     Results(folder).outcomes(Cell("smooth", "scenario", 1.0))
@@ -455,7 +455,7 @@ def test_a_full_disk_stops_it_until_there_is_room(
     monkeypatch.undo()
     assert not multiprocessing.active_children()
     partial = Results(tmp_path)
-    assert len(partial.missing) == 16 - 3
+    assert len(partial.missing) == 10 - 3
     assert len(partial.outcomes(CAMPAIGN.cells[0], partial=True)) in (4, 8, 12)
     with pytest.raises(InputError, match="without trials"):
         partial.outcomes(CAMPAIGN.cells[0])
@@ -492,7 +492,7 @@ def test_a_file_system_without_locks_is_not_another_writer(tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"trials": 31}, "trials: got 31, want 30"),
+        ({"trials": 19}, "trials: got 19, want 18"),
         ({"seed": 1}, "seed: got 1, want 0"),
         ({"sweeps": {"scenario": (ControlNoise(0.1),)}}, "sweeps: scenario: got"),
         ({"scenario": "quadrotor,query=1"}, "scenario: got 'quadrotor,query=1', want 'quadrotor'"),
@@ -549,7 +549,7 @@ def test_what_is_no_campaign_is_not_opened(tmp_path: Path, make: Callable[[Path]
         ("stress {own}:malformed", ["MJCF"]),
         ("replay {out} --cell 0 --trial 0", ["with a manifest.json"]),
         ("replay {reference} --cell smooth,gusts,1 --trial 0", ["cell: got 'smooth,gusts,1'", "smooth,scenario,1"]),
-        ("replay {reference} --cell 0 --trial 30", ["trial: got 30"]),
+        ("replay {reference} --cell 0 --trial 18", ["trial: got 18"]),
     ],
 )
 def test_bad_input_is_one_line(
@@ -592,7 +592,7 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     results = Results(folder)
     printed = capsys.readouterr().out
     for cell in results.cells:
-        assert f"{results.tally(cell)['reached']}/30" in printed
+        assert f"{results.tally(cell)['reached']}/18" in printed
     assert f"wrote {folder}" in printed
     cell = results.cells[1]
     collided = int(np.flatnonzero(results.outcomes(cell).outcome == "collided")[0])
@@ -618,7 +618,7 @@ def test_a_replay_says_how_often_it_planned_again(tmp_path: Path, capsys: pytest
 
 def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None:
     for cell in reference.cells:
-        for trial in (0, 17, 29):
+        for trial in (0, 9, 17):
             free, solid = (
                 replay(reference, cell, trial, frames=contacts, contacts=contacts) for contacts in (False, True)
             )

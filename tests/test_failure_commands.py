@@ -47,7 +47,7 @@ class Shift(Disturbance):
         return Effect(initial_states=lambda states: states + offset)
 
 
-def shifted(std: float = 0.1, most: float = 9.0, steps: int = 3) -> ls.Scenario:
+def shifted(std: float = 0.1, most: float = 9.0, steps: int = 1) -> ls.Scenario:
     given = ls.scenarios.differential_drive()
     here = ls.QuadraticCost((5000.0, 5000.0, 50.0), about=given.problem.start)
     problem = dataclasses.replace(given.problem, steps=steps, final_cost=here)
@@ -332,7 +332,7 @@ sys.exit(main())
     ("command", "at", "says"),
     [
         ("rare --particles 20 --repetitions 500", "2 of 500", r"stopped after \d+ of 500 repetitions"),
-        ("funnel --rate 0.6 --knots 0 1 2 --disturbances light", "1 of 3", "stopped before this knot was done"),
+        ("funnel,steps=3 --rate 0.6 --knots 0 1 2 --disturbances light", "1 of 3", "stopped before this knot was done"),
         *rarely(("break --rounds 900 --strength 3", "1 of 900", r"stopped after \d+ of 900 rounds")),
     ],
 )
@@ -340,8 +340,10 @@ def test_ctrl_c_keeps_what_there_is_and_says_how_far_it_came(
     command: str, at: str, says: str, own: str, tmp_path: Path
 ) -> None:
     """SIGINT to a process that has done some of its work, but not all: it ends with 130, and its files can be used."""
-    name, *more = command.split()
-    words = [sys.executable, "-c", TELLING, name, f"{own}:shifted", *more, *OPEN, "--out", str(tmp_path)]
+    asked, *more = command.split()
+    name, *settings = asked.split(",")
+    scenario = ",".join([f"{own}:shifted", *settings])
+    words = [sys.executable, "-c", TELLING, name, scenario, *more, *OPEN, "--out", str(tmp_path)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while not (line := process.stdout.readline()).startswith(at):

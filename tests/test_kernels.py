@@ -94,8 +94,9 @@ from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
-MADE: dict[Any, Entry] = {}  # what was compiled, by all that it depends on
-LOADED: dict[str, Loaded] = {}  # the same, by a hash of its IR: much of what problems differ in, kernels do not see
+MADE: dict[Any, Any] = {}  # types, hash of the IR, and returned type of what was compiled, by all that it depends on
+ADDRESSES: dict[str, int] = {}  # by that hash: much of what problems differ in, kernels do not see
+LOADED: list[Loaded] = []  # kept alive
 PLAIN: dict[Any, Callable[..., Any]] = {}  # kernels as plain Python, and whom their calls are told to
 CALLERS: list[Callable[..., Any]] = []
 EACH = 1  # calls of a kernel that are compared, of each entry
@@ -163,8 +164,14 @@ def kind_of(value: Any) -> Any:
 
 
 def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, but: tuple[str, ...] = ()) -> Any:
-    """Call a kernel in plain Python, and compare every kernel that it calls, but those; returns what it returns."""
+    """Call a kernel in plain Python, and compare every kernel that it calls, but those; returns what it returns.
+
+    They are compiled together and compared when all is done; where MuJoCo is among them all is done once more then, and
+    each compared at once, for its memory changes.
+    """
     seen: Counter[tuple[str, str]] = Counter()
+    calls: list[Recorded] = []
+    at_once = False
 
     def caller(function: ScopedFunction, run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
         key = function.scope.source.what, function.node.name
@@ -180,7 +187,9 @@ def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, bu
             before, after, value = (*before, np.zeros(shape)), (*after, np.array(returned[: shape[0]])), None
         if function.node.name == "take_slot":
             let_go(given[0], int(returned))
-        compare(Recorded(name, function, types, before, after, snapshot(value, {})))
+        calls.append(Recorded(name, function, types, before, after, snapshot(value, {})))
+        if at_once:
+            compare(calls[-1:])
         return returned
 
     key = source, tuple(sorted(sizes.items())), name
@@ -189,9 +198,17 @@ def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, bu
     CALLERS.append(caller)
     try:
         with np.errstate(all="ignore"):
-            return PLAIN[key](*arguments)
+            returned = PLAIN[key](*arguments)
+            at_once = any("mjcf_" in one.name for one in calls)
+            if at_once:
+                entries(calls)
+                seen.clear()
+                returned = PLAIN[key](*arguments)
     finally:
         CALLERS.pop()
+    if not at_once:
+        compare(calls)
+    return returned
 
 
 def writing_out(function: ScopedFunction, count: int) -> ScopedFunction:
@@ -206,26 +223,38 @@ def let_go(p: Array, slot: int) -> None:
     ctypes.c_int64.from_address(int(p[mjcf_dynamics.FLAGS]) + 8 * slot).value = 0
 
 
-def compare(one: Recorded) -> None:
-    """Compile the function for these types, once, and have it do the same; at once, for memory may change."""
-    scope = one.function.scope
-    key = scope.source, tuple(sorted(scope.sizes.items())), one.function.node.name, one.types
-    if key not in MADE:
+def compare(calls: list[Recorded]) -> None:
+    """Have compiled code make the same calls, in the same order."""
+    for one, entry in zip(calls, entries(calls), strict=True):
+        size = max(map(size_of, arrays_of(one.before)), default=0.0)
+        returned = Call(entry, one.before)()
+        size *= 1 + 1e12 * DIVIDED.get(one.name, 0.0)
+        same(returned, one.returned, size, f"what {one.name} returns")
+        for found, wanted in zip(arrays_of(one.before), arrays_of(one.after), strict=True):
+            same(found, wanted, size, one.name)
+        COMPARED[one.name] += 1
+
+
+def entries(calls: list[Recorded]) -> list[Entry]:
+    """An entry of each function for its types; what is not there yet is compiled together, and what it shares once."""
+    keys, together, new = [], Program(), {}
+    for one in calls:
+        scope = one.function.scope
+        keys.append((scope.source, tuple(sorted(scope.sizes.items())), one.function.node.name, one.types))
+        if keys[-1] in MADE:
+            continue
         program = Program()
         returns = program.entry(one.function, one.types, "entry")
-        text = program.text
-        digest = sha256(text)
-        if digest not in LOADED:
-            LOADED[digest] = Loaded(object_code(text), tuple(program.libraries))
+        digest = sha256(program.text)
+        if digest not in ADDRESSES and digest not in new:
+            new[digest] = f"entry{len(new)}"
+            together.entry(one.function, one.types, new[digest])
         laid_out = tuple(StructArray(kind.fields) if isinstance(kind, Struct) else kind for kind in one.types)
-        MADE[key] = Entry(laid_out, LOADED[digest].address("entry"), returns)
-    size = max(map(size_of, arrays_of(one.before)), default=0.0)
-    returned = Call(MADE[key], one.before)()
-    size *= 1 + 1e12 * DIVIDED.get(one.name, 0.0)
-    same(returned, one.returned, size, f"what {one.name} returns")
-    for found, wanted in zip(arrays_of(one.before), arrays_of(one.after), strict=True):
-        same(found, wanted, size, one.name)
-    COMPARED[one.name] += 1
+        MADE[keys[-1]] = laid_out, digest, returns
+    if new:
+        LOADED.append(Loaded(object_code(together.text), tuple(together.libraries)))
+        ADDRESSES.update({digest: LOADED[-1].address(symbol) for digest, symbol in new.items()})
+    return [Entry(types, ADDRESSES[digest], returns) for types, digest, returns in map(MADE.__getitem__, keys)]
 
 
 def flat(value: Any) -> list[Any]:

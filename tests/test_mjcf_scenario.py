@@ -52,11 +52,17 @@ def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     assert not ls.scenarios.mjcf(str(file), start={"z": 1.0}, obstacles=False).problem.obstacle_costs
 
 
+SLIDER = """<mujoco><option gravity="0 0 0"/><worldbody>
+  <geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>
+  <body name="slider"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="slider" type="box" size="0.1 0.1 0.1"/></body></worldbody>
+  <actuator><motor name="x" joint="x"/><motor name="z" joint="z"/></actuator></mujoco>"""
+
+
 @pytest.mark.parametrize("margin", [0.0, 0.02, 0.3])
 def test_a_clearance_is_the_same_in_python_in_a_setting_and_as_an_option(tmp_path: Path, margin: float) -> None:
-    file = tmp_path / "box.xml"
-    post = '<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/></worldbody>'
-    file.write_text(mjcf_files.draw("box", 3, "Euler").xml.replace("</worldbody>", post), encoding="utf-8")
+    file = tmp_path / "slider.xml"
+    file.write_text(SLIDER, encoding="utf-8")
     robot = ls.MjcfRobot(file)
     start, goal = robot.at(z=1.0), robot.at(x=3.0, z=1.0)
     problem = robot.problem(start, goal, steps=5, clearance=margin)

@@ -5,6 +5,7 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
+from linear_plans import by_hand
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, Payload, Unknown
@@ -223,6 +224,6 @@ def test_contacts_limits_and_friction_are_as_soft_as_in_the_mjcf_with_that_mass(
         gain=np.zeros((steps, 2, 16)), offset=controls, nominal=np.array(states[:-1]), dt=dt,
         state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
     )  # fmt: skip
-    plan = ls.smooth(robot.problem(states[0], robot.at(), steps=steps, dt=dt), max_iterations=1, starts=1)
-    run = ls.simulate(ls.Plant(robot, robot.scene), plan, controller=pushed, disturbances=[Payload(load, body)])
+    plan = by_hand(ls.Trajectory(np.array(states), controls, dt), pushed)
+    run = ls.simulate(ls.Plant(robot, robot.scene), plan, disturbances=[Payload(load, body)])
     np.testing.assert_allclose(run.states[0], states, rtol=0, atol=1e-10)

@@ -137,7 +137,7 @@ from lqrsim import process
 
 process.handle_signals("stopped")
 process.GRACE, rounds, took = 0.3, 100_000, 0.0
-while took < 5 * process.GRACE:  # compiled code for longer than a second signal is ignored
+while took < 2 * process.GRACE:  # compiled code for longer than a second signal is ignored
     rounds, began = 2 * rounds, time.monotonic()
     hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
     took = time.monotonic() - began

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl
 ROBOTS = ("quadrotor", "differential_drive")
 # Metres; the first as the packaged robots are verified, rms and at worst, the second of videos.
 BOUNDS = {"quadrotor": (0.005, 0.010), "differential_drive": (0.003, 0.005)}
-HALF = 75  # control periods
+BEGINNING = 50  # control periods, a third of all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +44,11 @@ class Case:
     metadata: VideoMetadata
 
     def beginning(self, frames: np.ndarray | None = None) -> ls.Rollout:
-        """The first half of the run, as if it had diverged then, which is as good for faults; or with other frames."""
+        """The beginning of the run, as if it had diverged then, which is as good for faults; or with other frames."""
         frames = (self.run.frames if frames is None else frames[None]).copy()
         states = self.run.states.copy()
-        frames[:, self.run.frame_times > self.run.times[HALF] + 1e-9], states[:, HALF + 1 :] = np.nan, np.nan
-        return dataclasses.replace(self.run, states=states, frames=frames, diverged_at=self.run.times[[HALF + 1]])
+        frames[:, self.run.frame_times > self.run.times[BEGINNING] + 1e-9], states[:, BEGINNING + 1 :] = np.nan, np.nan
+        return dataclasses.replace(self.run, states=states, frames=frames, diverged_at=self.run.times[[BEGINNING + 1]])
 
 
 @pytest.fixture(scope="module", params=[ROBOTS[0], *rarely(ROBOTS[1])])
@@ -313,7 +313,7 @@ def test_the_command_says_it_with_its_exit_code(case: Case, tmp_path: Path, caps
 def test_a_trial_that_diverged_is_verified_up_to_there(case: Case) -> None:
     found = ls.verify_run(case.beginning())
     assert found.passed
-    assert found.times[-1] == pytest.approx(case.run.times[HALF])
+    assert found.times[-1] == pytest.approx(case.run.times[BEGINNING])
 
 
 @pytest.fixture(scope="module")

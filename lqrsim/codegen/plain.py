@@ -2,8 +2,10 @@
 
 import ast
 import ctypes
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -46,13 +48,13 @@ def _run(
     key = id(function.scope), function.node.name
     if key in made:
         return made[key]
-    code = ast.Module([_Plain().visit(ast.parse(ast.unparse(function.node)).body[0])], [])
+    code, names = _compiled(function.node, function.scope.source.what)
     given: dict[str, Any] = {}
-    exec(compile(ast.fix_missing_locations(code), f"<{function.scope.source.what}>", "exec"), given)
+    exec(code, given)
     run = given[function.node.name]
     called = run if caller is None else lambda *arguments: caller(function, run, arguments)
     made[key] = called
-    for name in {node.id for node in ast.walk(code) if isinstance(node, ast.Name)}:
+    for name in names:
         match function.scope.find(name):
             case None:
                 continue
@@ -66,6 +68,14 @@ def _run(
             case constant:
                 given[name] = constant
     return called
+
+
+@functools.lru_cache(maxsize=2048)  # a kernel is the same function in many problems, and each solve evaluates its own
+def _compiled(node: ast.FunctionDef, what: str) -> tuple[CodeType, frozenset[str]]:
+    """Python's code that defines a kernel, and the names in it."""
+    module = ast.Module([_Plain().visit(ast.parse(ast.unparse(node)).body[0])], [])
+    names = frozenset(one.id for one in ast.walk(module) if isinstance(one, ast.Name))
+    return compile(ast.fix_missing_locations(module), f"<{what}>", "exec"), names
 
 
 class _Plain(ast.NodeTransformer):

@@ -21,7 +21,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from lqrsim.errors import Array, InputError, check_count, check_function, check_memory, check_number, check_seed, shaped
 from lqrsim.process import keeping
@@ -144,6 +143,8 @@ def failure_probability(
 
 def _estimate(shares: Array, particles: int) -> Estimate:
     """The mean of the estimates with its interval, from the fractions (R, levels) above each level."""
+    from scipy import stats
+
     count, levels = shares.shape
     if levels == 1:
         return rate(round(float(shares.sum()) * particles), count * particles)

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_number, check_seed, excerpt
 from lqrsim.results.fields import check_fields
@@ -49,6 +48,8 @@ def wilson(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Es
 
 
 def _rate(successes: int, trials: int, confidence: float, method: Literal["exact", "wilson"]) -> Estimate:
+    from scipy import stats  # in functions here: it takes half a second to import, and much of lqrsim.stress needs none
+
     check_count("trials", trials)
     if check_count("successes", successes, at_least=0) > trials:
         raise InputError(f"successes: got {successes}, want at most the {trials} trials")
@@ -77,6 +78,8 @@ def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
     Raises:
       InputError: they have different lengths, or no trials, or are not booleans.
     """
+    from scipy import stats
+
     one, other = _flags("first", first), _flags("second", second)
     if one.shape != other.shape:
         raise InputError(f"second: got {len(other)} trials, want {len(one)}, as first has")
@@ -106,6 +109,8 @@ def paired_difference(only_first: int, only_second: int, trials: int, *, confide
     Raises:
       InputError: there are no trials, or fewer than those with different results.
     """
+    from scipy import stats
+
     check_count("trials", trials)
     apart = check_count("only_first", only_first, at_least=0) + check_count("only_second", only_second, at_least=0)
     if apart > trials:
@@ -140,6 +145,8 @@ def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
     Raises:
       InputError: there are fewer than two numbers, or one is not finite.
     """
+    from scipy import stats
+
     numbers = check_array("sample", sample, (None,))
     if len(numbers) < 2:
         raise InputError(f"sample: got {len(numbers)} numbers, want at least 2")
@@ -180,6 +187,8 @@ def bootstrap(
       InputError: there are fewer than two rows, the samples have different lengths, or the statistic is no such
         function.
     """
+    from scipy import stats
+
     arrays = [check_array("samples", sample, (None,)) for sample in samples]
     if not arrays or any(len(array) != len(arrays[0]) for array in arrays) or len(arrays[0]) < 2:
         raise InputError(f"samples: got lengths {[len(array) for array in arrays]}, want one length of at least 2")
