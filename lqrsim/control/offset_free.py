@@ -142,6 +142,10 @@ class OffsetFree(Controller):
         self._law = FilterLaw.of(solution, design)
         self.gain, self.offset, self.nominal = self._law.gain, self._law.offset, self._law.nominal
 
+    def __repr__(self) -> str:
+        plan, unknowns = self.solution.trajectory, len(self.uncertainty.unknowns)
+        return f"OffsetFree({plan.steps} steps of {plan.dt:g} s, {self.model.n} states and {unknowns} unknowns)"
+
     def _redesigned(self, solution: Solution, uncertainty: Uncertainty) -> "OffsetFree":
         """The same kind of law, with its sensors, tolerances and memory, for another uncertainty or solution.
 

@@ -259,6 +259,9 @@ class Replanner(Controller):
         self.problem, self.solution = problem, solution
         self.computing, self.seed = computing, check_count(f"{who}: seed", seed, at_least=0)
 
+    def __repr__(self) -> str:
+        return f"Replanner(every {self.rule.every:g} s, with a {self.rule.horizon} horizon)"
+
     def start(self, trials: int) -> "ReplannerRun":
         return ReplannerRun(self, trials)
 

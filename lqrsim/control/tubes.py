@@ -23,7 +23,7 @@ from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.kernels.records import LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import SHARE, check_fields
+from lqrsim.results.fields import SHARE, check_fields, repr_of
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -74,6 +74,8 @@ class Tube:
     collision_chance: Annotated[float, SHARE]
     samples: int = 0
     strays: Annotated[float, SHARE] = 0.0
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import (
     InputError,
+    brief,
     check_count,
     check_items,
     check_kind,
@@ -52,6 +53,12 @@ class Bounds(NamedTuple):
 
 
 SHARE = Bounds(at_least=0.0, at_most=1.0)
+
+
+def repr_of(record: Any) -> str:
+    """The repr of a record, in which arrays of many numbers are their shapes: `__repr__ = repr_of`."""
+    parts = (f"{field.name}={brief(getattr(record, field.name))}" for field in fields(record))
+    return f"{type(record).__name__}({', '.join(parts)})"
 
 
 class Declared(NamedTuple):

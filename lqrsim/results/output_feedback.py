@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, check_fields
+from lqrsim.results.fields import Bounds, check_fields, repr_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,8 @@ class OutputFeedbackPolicy:
     state_coordinates: Annotated[Coordinates, "n"]
     control_coordinates: Annotated[Coordinates, "m"]
     measured_coordinates: Annotated[Coordinates, "Y"]
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         sizes = check_fields(self)

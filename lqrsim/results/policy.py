@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, check_fields
+from lqrsim.results.fields import Bounds, check_fields, repr_of
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
@@ -39,6 +39,8 @@ class AffinePolicy:
     dt: Annotated[float, Bounds(above=0.0)]
     state_coordinates: Annotated[Coordinates, "n"]
     control_coordinates: Annotated[Coordinates, "m"]
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         if not check_fields(self)["T"]:

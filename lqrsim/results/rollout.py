@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 from lqrsim.results.goal import Target, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
@@ -34,6 +34,8 @@ class BallRecord:
     planned: Annotated[Array, "T+1 B 3", Bounds()]
     radii: Annotated[Array, "B", Bounds(at_least=0.0)]
     anchors: Annotated[Array, "B 4"]
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         if not check_fields(self)["B"]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count
-from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 
 # The end of a "moving" horizon moves along with the robot; the end of a "shrinking" horizon stays.
 HORIZONS = ("moving", "shrinking")
@@ -38,6 +38,8 @@ class Trajectory:
     states: Annotated[Array, "T+1 n"]
     controls: Annotated[Array, "T m"]
     dt: Annotated[float, Bounds(above=0.0)]
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         sizes = check_fields(self)
@@ -289,6 +291,8 @@ class Multipliers:
     values: Annotated[Array, "T+1 _"]
     penalty: Annotated[float, Bounds(at_least=0.0)]
 
+    __repr__ = repr_of
+
     def __post_init__(self) -> None:
         check_fields(self)
 
@@ -310,6 +314,8 @@ class Candidate:
     iterations: int
     status: Status | None
     trajectory: Trajectory
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         check_fields(self)

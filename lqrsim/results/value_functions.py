@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_kind, check_shape, vectors_of
-from lqrsim.results.fields import check_fields
+from lqrsim.results.fields import check_fields, repr_of
 
 
 def _check(value: object) -> None:
@@ -42,6 +42,8 @@ class Quadratic:
     hessian: Annotated[Array, "... n n"]
     gradient: Annotated[Array, "... n"]
     constant: Annotated[Array | float, "..."]
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         _check(self)
@@ -97,6 +99,8 @@ class Moments:
     mean: Annotated[Array, "... n"]
     constant: Annotated[Array | float, "..."]
 
+    __repr__ = repr_of
+
     def __post_init__(self) -> None:
         _check(self)
 
@@ -128,6 +132,8 @@ class TotalCost:
 
     cost_to_go: Quadratic
     cost_to_come: Quadratic | Moments
+
+    __repr__ = repr_of
 
     def __post_init__(self) -> None:
         check_fields(self)

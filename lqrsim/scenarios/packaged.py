@@ -100,6 +100,9 @@ class Scenario:
             target = Target(space, self.problem.weighed_goal, plan)
         return target.radius(self.robot.radius, **self.near_enough(goal_radius, goal_tolerance))
 
+    def __repr__(self) -> str:
+        return f"Scenario({self.name!r}: {self.summary})"
+
     def __post_init__(self) -> None:
         check_text("Scenario: name", self.name, "a name")
         check_text("Scenario: summary", self.summary, "a line of description", at_most=1000, empty=True)

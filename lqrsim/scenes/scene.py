@@ -93,6 +93,9 @@ class Scene:
     world: World
     geoms: tuple[int, ...]
 
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, {len(self.world)} obstacles)"
+
     def __post_init__(self) -> None:
         check_text("Scene: name", self.name, "a name", at_most=1000)
         check_kind("Scene: xml", self.xml, str, "the MJCF as text")

@@ -56,6 +56,10 @@ class Plant:
         robot.
     """
 
+    def __repr__(self) -> str:
+        moved = "MuJoCo" if self.simulator is None else self.simulator.name
+        return f"Plant({self.robot.name} in scene {self.scene.name}, moved by {moved})"
+
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")

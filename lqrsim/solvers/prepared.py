@@ -90,6 +90,9 @@ class PreparedSolver:
         self._idle: list[Stages] = []  # memory for the next solve
         self._compile()
 
+    def __repr__(self) -> str:
+        return f"PreparedSolver({len(self._states)} states, {len(self._controls)} controls, {self.problem.steps} steps)"
+
     def _compile(self) -> None:
         n, m, steps = len(self._states), len(self._controls), self.problem.steps
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()

@@ -192,7 +192,7 @@ def _pilot_run(
     step_sizes: list[float] = []
     b = 0.5
     while len(levels) < most_levels:
-        level = float(np.quantile(scores, 1 - keep, method="inverted_cdf"))
+        level = _exceeded_by(keep, scores)
         if on_level is not None:
             on_level(min(level, 0.0))
         if level >= 0 and (scores > 0).any():
@@ -202,12 +202,22 @@ def _pilot_run(
         vectors, scores = _resample(vectors, scores, level, rng)
         for _ in range(moves):
             vectors, scores, accepted = _crank_nicolson_step(score, vectors, scores, level, b, rng)
-            b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
+            b = _adapted(b, accepted)
         levels.append(level)
         step_sizes.append(b)
     raise NoFailure(
         f"score: got no failure in {len(levels)} levels up to {scores.max():g}: failures are too rare, or none exist"
     )
+
+
+def _exceeded_by(share: float, scores: Array) -> float:
+    """The score that this share of the scores exceeds."""
+    return float(np.quantile(scores, 1 - share, method="inverted_cdf"))
+
+
+def _adapted(b: float, accepted: float) -> float:
+    """The next step size, larger if more moves are accepted than wanted."""
+    return float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
 
 
 def _repetition(
