@@ -305,37 +305,49 @@ class Descent:
 
     def _pushed_back(self, there: CostedPlan, change: Array, multipliers: Array) -> CostedPlan:
         """The plan after a change of the offsets, corrected until it crosses no switch; or else the last trial."""
-        model, wanted, factor = self.model, self.model.values + self.model.slopes @ change, None
+        wanted, factor = self.model.values + self.model.slopes @ change, None
         for _ in range(PUSHES):
             if not np.isfinite(there.cost):
                 break
-            rows, missing, crossed, jumped = list[int](), list[float](), False, False
-            for t, period in enumerate(model.periods):
-                here = slice(model.first[t], model.first[t + 1])
-                sides, held = model.sides[here], multipliers[here] > 0
-                short = np.zeros(len(held))
-                if len(held) and not jumped:
-                    values = self._modes.step(there.states[t], there.controls[t])[1].at(period.switches.names)
-                    across = (sides * values < 0) & model.known[here]
-                    seen = period.switches.before_jump(across)
-                    aim = np.where(held, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
-                    across &= seen
-                    held = (across | held) & (np.isfinite(values) | ~seen)
-                    short = np.where(seen, sides * aim - values, 0.0)
-                    crossed, jumped = crossed or bool(across.any()), bool((across & ~period.switches.forces).any())
-                # The rest of a plan after a jump is meaningless: pressed switches there keep their intended values.
-                rows += (model.first[t] + np.flatnonzero(held)).tolist()
-                missing += short[held].tolist()
+            rows, missing, crossed = self._missing(there, wanted, multipliers)
             if not crossed:
                 break
-            factor = scipy.linalg.cho_factor(model.hessian) if factor is None else factor
-            moves = scipy.linalg.cho_solve(factor, model.slopes[rows].T)
-            system = model.slopes[rows] @ moves
-            scale = 1 / np.sqrt(np.maximum(np.diag(system), 1e-300))
-            pulls = np.linalg.lstsq(scale[:, None] * system * scale, scale * np.array(missing), rcond=1e-10)[0]
-            change = change + moves @ (scale * pulls)
-            there = changed(self._problem, self.plan, model, change)
+            factor = scipy.linalg.cho_factor(self.model.hessian) if factor is None else factor
+            change = change + self._push(factor, rows, missing)
+            there = changed(self._problem, self.plan, self.model, change)
         return there
+
+    def _missing(
+        self, there: CostedPlan, wanted: Array, multipliers: Array
+    ) -> tuple[npt.NDArray[np.intp], Array, bool]:
+        """The switches that a trial must keep to, what each misses, and whether the trial crosses any."""
+        model, rows, missing, crossed, jumped = self.model, list[int](), list[float](), False, False
+        for t, period in enumerate(model.periods):
+            here = slice(model.first[t], model.first[t + 1])
+            sides, held = model.sides[here], multipliers[here] > 0
+            short = np.zeros(len(held))
+            if len(held) and not jumped:
+                values = self._modes.step(there.states[t], there.controls[t])[1].at(period.switches.names)
+                across = (sides * values < 0) & model.known[here]
+                seen = period.switches.before_jump(across)
+                aim = np.where(held, np.maximum(MARGIN, sides * wanted[here]), MARGIN)
+                across &= seen
+                held = (across | held) & (np.isfinite(values) | ~seen)
+                short = np.where(seen, sides * aim - values, 0.0)
+                crossed, jumped = crossed or bool(across.any()), bool((across & ~period.switches.forces).any())
+            # The rest of a plan after a jump is meaningless: pressed switches there keep their intended values.
+            rows += (model.first[t] + np.flatnonzero(held)).tolist()
+            missing += short[held].tolist()
+        return np.array(rows, dtype=np.intp), np.array(missing), crossed
+
+    def _push(self, factor: tuple[Array, bool], rows: npt.NDArray[np.intp], missing: Array) -> Array:
+        """The change of the offsets that gives these switches what they miss, at the least cost of the model."""
+        slopes = self.model.slopes[rows]
+        moves = scipy.linalg.cho_solve(factor, slopes.T)
+        system = slopes @ moves
+        scale = 1 / np.sqrt(np.maximum(np.diag(system), 1e-300))
+        pulls = np.linalg.lstsq(scale[:, None] * system * scale, scale * missing, rcond=1e-10)[0]
+        return moves @ (scale * pulls)
 
     def _crossed(self, step: ModeStep) -> CostedPlan | None:
         """A cheaper plan across a switch that the present plan is pressed against; None if there is none."""
