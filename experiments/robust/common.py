@@ -18,6 +18,7 @@ from lqrsim.stress.statistics import rate
 
 Reached = npt.NDArray[np.bool_]
 PRESETS = ("light", "moderate", "severe")
+KEPT = ("particles", "world_trials", "without", "hardened", "seed")
 # The chance of collision that a safe plan is asked for; under severe turbulence few plans have less.
 ASKED = {"light": 1e-3, "moderate": 1e-2, "severe": 0.2}
 

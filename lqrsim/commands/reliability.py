@@ -136,9 +136,9 @@ class Harden(FailureOptions):
 
     The first plan has the wanted chance of collision by prediction, or is the given solution. Each plan's failures are
     measured with all disturbances, as by `lqrsim rare`; the next plan has more room where runs fail, and less where it
-    has too much. Prints each plan, then a fresh measurement of the cheapest that is safe enough. Writes solution.npz,
-    for `--solution` of other commands, harden.json, with settings and plans, and the files of `lqrsim rare` for the
-    fresh measurement; `lqrsim certify` checks its certificate.npz. Ctrl-C keeps the plans that are measured.
+    has too much. The first that is safe enough is measured again, with fresh random numbers. Writes solution.npz, for
+    `--solution` of other commands, harden.json, with settings and plans, and the files of `lqrsim rare`; `lqrsim
+    certify` checks certificate.npz. Ctrl-C keeps the plans that are measured.
 
       lqrsim harden quadrotor --sweep moderate --chance 0.01
 

@@ -12,6 +12,7 @@ Room does not help a robot that leaves its plan for good. Such failures are coun
 
 import os
 from dataclasses import asdict, dataclass, replace
+from itertools import count
 from math import ceil
 from typing import Any
 
@@ -91,9 +92,8 @@ class HardenedPlan:
     Attributes:
       problem: the ReliabilityProblem. chance: the requested probability. options: `seed`, `particles`, `repetitions`
         and `rounds`.
-      rounds: a HardeningRound for each plan. chosen: number of the one that is the result, from 0.
-      rare: the failures of the result, measured with fresh random numbers; `rare.save` writes them with their
-        certificate. None if none was found. After Ctrl-C, those of its round.
+      rounds: a HardeningRound for each plan. chosen: number of the one that is the result, from 0. If it is safe
+        enough, its failures were measured again with fresh random numbers.
       reason: why there is no success, and what may help; empty if there is.
     """
 
@@ -102,7 +102,6 @@ class HardenedPlan:
     options: dict[str, int]
     rounds: tuple[HardeningRound, ...]
     chosen: int
-    rare: RareFailures | None
     reason: str
 
     @property
@@ -111,8 +110,13 @@ class HardenedPlan:
         return self.rounds[self.chosen].solution
 
     @property
+    def rare(self) -> RareFailures | None:
+        """The plan's failures; `rare.save` writes them with their certificate. None if none was found."""
+        return self.rounds[self.chosen].rare
+
+    @property
     def success(self) -> bool:
-        """Whether the whole interval of the fresh measurement is at most the requested probability."""
+        """Whether the whole interval of two measurements is at most the requested probability."""
         return not self.reason
 
     @property
@@ -121,16 +125,14 @@ class HardenedPlan:
         return self.reason if self.reason.startswith("stopped") else ""
 
     def verdict(self) -> str:
-        """The fresh measurement, and whether it is as requested."""
-        lines = []
-        if not self.stopped:
-            found = "no failure found" if self.rare is None else f"probability of failure {self.rare.probability:.2g}"
-            lines.append(f"plan {self.chosen + 1} with fresh random numbers: {found}")
-        said = "the whole interval is below" if self.success else f"NOT reached: {self.reason}"
-        return "\n".join([*lines, f"requested: at most {self.chance:g}; {said}"])
+        """A line that says whether the plan is as requested."""
+        chosen = f"requested: at most {self.chance:g}; plan {self.chosen + 1}"
+        if self.reason:
+            return f"{chosen} is the safest, NOT as requested: {self.reason}"
+        return f"{chosen} is as requested, with the whole interval"
 
     def summary(self) -> str:
-        """A line for each plan, the fresh measurement of one of them, and whether it is as requested."""
+        """A line for each plan, and whether the result is as requested."""
         return "\n".join([*(f"plan {number}: {one}" for number, one in enumerate(self.rounds, 1)), self.verdict()])
 
     __str__ = summary
@@ -150,8 +152,7 @@ class HardenedPlan:
             for one in self.rounds
         ]
         found = {
-            "success": self.success, "reason": self.reason, "rounds": rounds, "chosen": self.chosen,
-            "probability": None if self.stopped else _as_json(self.rare),
+            "success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds,
         }  # fmt: skip
         save_load.save(self.solution, folder / "solution.npz")
         asked = {"chance": self.chance, **self.options}
@@ -186,14 +187,14 @@ def harden(
       particles: as in `ReliabilityProblem.rare_failures`. By default 250; for a `chance` from 0.005 on 10 / `chance`,
         so that failures are counted.
       repetitions: as in `ReliabilityProblem.rare_failures`.
-      seed: seed of the fresh measurement; those of the rounds have the seeds after it.
+      seed: seed of the first measurement; the others have the seeds after it.
       report: called with a description of the run, and with a line for each plan.
       progress: called with the number of finished repetitions, the largest possible number, and the result so far as
         text.
 
     Returns:
-      The HardenedPlan: the cheapest plan that is measured to be safe enough, or else the safest one, with `success`
-      False.
+      The HardenedPlan: the first plan that is safe enough in two measurements, the second with fresh random numbers; or
+        else the safest one, with `success` False and a `reason`.
 
     Raises:
       InputError: an option is out of range, or no plan is found for the scenario; or as of `smooth_chance_constrained`
@@ -211,32 +212,35 @@ def harden(
     check_function("report", report, "a function of a line of text", arguments=1)
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
-    search = _Search(problem, chance, options)
-    say, total = report or (lambda line: None), (rounds + 1) * repetitions
+    search, say = _Search(problem, chance, options), report or (lambda line: None)
+    seeds, total = count(seed), 2 * rounds * repetitions
 
-    def tell(what: str, before: int) -> Progress:
-        return lambda done, _, found: progress and progress(before + done, total, f"{what}: {found}")
+    def measure(solution: Solution, what: str) -> RareFailures | None:
+        used = next(seeds)
+        begun = repetitions * (used - seed)
+
+        def tell(done: int, _: int, found: str) -> None:
+            if progress is not None:
+                progress(begun + done, total, f"{what}: {found}")
+
+        return search.failures(solution, used, tell)
 
     def so_far(_: object) -> HardenedPlan | None:
-        if not search.rounds:
-            return None
-        stopped = f"stopped after {len(search.rounds)} of {rounds} plans"
-        return search.result(search.rounds[search.chosen].rare, stopped)
+        return search.result(f"stopped after {len(search.rounds)} of {rounds} plans") if search.rounds else None
 
     with keeping(so_far):
-        for number in range(rounds):
-            solution = search.next()
-            if solution is None:
-                break
-            if number == 0:
+        while len(search.rounds) < rounds and (solution := search.next()) is not None:
+            what = f"plan {len(search.rounds) + 1}"
+            if not search.rounds:
                 say(replace(problem, solution=solution).summary())
-            search.measure(solution, seed + 1 + number, tell(f"plan {number + 1}", number * repetitions))
-            say(f"plan {number + 1}: {search.rounds[-1]}")
-            if search.enough(search.rounds[-1].rare):
-                break
-        best = search.rounds[search.chosen].solution
-        rare = search.failures(best, seed, tell("measured again", rounds * repetitions))
-    return search.result(rare, search.shortfall(rare))
+            search.add(solution, measure(solution, what))
+            say(f"{what}: {search.rounds[-1]}")
+            if search.enough():
+                search.add(search.rounds.pop().solution, measure(solution, f"{what} again"))
+                say(f"{what} again, with fresh random numbers: {search.rounds[-1]}")
+                if search.enough():
+                    break
+    return search.result(search.shortfall())
 
 
 class _Search:
@@ -314,9 +318,9 @@ class _Search:
         except NoFailure:
             return None
 
-    def measure(self, solution: Solution, seed: int, progress: Progress) -> None:
-        """Measure how often a plan fails, and see how."""
-        rare, plan = self.failures(solution, seed, progress), solution.trajectory
+    def add(self, solution: Solution, rare: RareFailures | None) -> None:
+        """Add a plan with its failures, and see how it fails."""
+        plan, place = solution.trajectory, list(self.surroundings.place)
         tube = predict_tube(self.stated, solution, self.uncertainty, self.law(self.stated, solution))
         spread = self.surroundings.spread(plan.states + tube.mean, tube.covariance, tube.across)
         # Least planned clearance of each obstacle in predicted standard deviations, (O,), and these, (T+1, O).
@@ -324,43 +328,33 @@ class _Search:
         cost = float(costs_of(self.stated, plan.states[None], plan.controls[None])[0])
         hit, strays = dict[str, float](), 0.0
         if rare is not None:
-            run, place = rare.problem.score.rollout(rare.typical(SHOWN), frames=False), list(self.surroundings.place)
+            run = rare.problem.score.rollout(rare.typical(SHOWN), frames=False)
             away = np.linalg.norm((run.states[:, -1] - plan.states[-1])[:, place], axis=1)
             widest = np.sqrt(np.linalg.eigvalsh(tube.position_covariance).max()) if place else np.inf
             hits = np.array(run.obstacles)[(away <= STRAY * widest) & (np.array(run.outcome) == "collided")]
-            hit = {str(name): float(np.mean(hits == name) * len(hits) / run.trials) for name in np.unique(hits)}
+            hit = {str(name): float(np.sum(hits == name)) / run.trials for name in np.unique(hits)}
             strays = 1 - len(hits) / run.trials
         self.rounds.append(HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays))
 
-    def enough(self, rare: RareFailures | None) -> bool:
-        """Whether failures are surely as rare as requested."""
+    def enough(self) -> bool:
+        """Whether the last plan's failures are surely as rare as requested."""
+        rare = self.rounds[-1].rare
         return rare is None or rare.probability.high <= self.chance
 
-    @property
-    def chosen(self) -> int:
-        """Number of the cheapest plan that is safe enough, or else of the safest."""
-        safe = [number for number, one in enumerate(self.rounds) if self.enough(one.rare)]
-        if safe:
-            return min(safe, key=lambda number: self.rounds[number].cost)
-        measured = {number: one.rare.probability.value for number, one in enumerate(self.rounds) if one.rare}
-        return min(measured, key=lambda number: measured[number])
-
-    def shortfall(self, rare: RareFailures | None) -> str:
-        """Why there is no success, and what may help; empty if there is."""
-        if self.enough(rare):
-            return ""
-        if self.enough(self.rounds[self.chosen].rare):
-            return "the fresh measurement is not surely below; use more particles or repetitions"
-        if self.ended:
+    def shortfall(self) -> str:
+        """Why the last plan is not safe enough, and what may help; empty if it is."""
+        if self.enough() or self.ended:
             return self.ended
         after, strays = f"not after {len(self.rounds)} plans", self.rounds[-1].strays
         if strays < 0.5:
             return f"{after}; allow more rounds, or a higher chance"
         return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {REMEDY}"
 
-    def result(self, rare: RareFailures | None, reason: str) -> HardenedPlan:
-        """The plans so far, with the failures of the chosen one."""
+    def result(self, reason: str) -> HardenedPlan:
+        """The last plan if there is no reason against it, else the safest of the plans so far."""
+        measured = [0.0 if one.rare is None else one.rare.probability.value for one in self.rounds]
+        chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
         return HardenedPlan(
-            problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds),
-            chosen=self.chosen, rare=rare, reason=reason,
+            problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
+            reason=reason,
         )  # fmt: skip
