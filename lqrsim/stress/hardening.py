@@ -281,10 +281,9 @@ class _Search:
         for share in (1.0, 0.5, 0.25):  # as much of it as there is room for
             kept = self.surroundings.keep_away(np.maximum(self.near + share * more, 0.0) * self.std)
             problem = replace(self.stated, constraints=(*self.stated.constraints, *kept))
-            for start in (last.solution.trajectory, None):
-                solution = smooth(problem, start=start)
-                if solution.success:
-                    return solution
+            solution = smooth(problem, start=last.solution.trajectory)
+            if solution.success:
+                return solution
         self.ended = "there is no plan with more room; allow a higher chance, or another route"
         return None
 
@@ -321,7 +320,10 @@ class _Search:
     def add(self, solution: Solution, rare: RareFailures | None) -> None:
         """Add a plan with its failures, and see how it fails."""
         plan, place = solution.trajectory, list(self.surroundings.place)
-        tube = predict_tube(self.stated, solution, self.uncertainty, self.law(self.stated, solution))
+        # Trials of the model, which take long, are needed for moments with a latency or a delay alone.
+        samples = None if self.uncertainty.latency or self.uncertainty.delay else 0
+        law = self.law(self.stated, solution)
+        tube = predict_tube(self.stated, solution, self.uncertainty, law, samples=samples)
         spread = self.surroundings.spread(plan.states + tube.mean, tube.covariance, tube.across)
         # Least planned clearance of each obstacle in predicted standard deviations, (O,), and these, (T+1, O).
         self.near, self.std = (spread.mean / spread.std).min(axis=0), spread.std
