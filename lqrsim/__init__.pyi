@@ -67,7 +67,6 @@ from .solvers.risk import sample_costs as sample_costs
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.funnels import funnel as funnel
-from .stress.hardening import harden as harden
 from .verify.checks import verify_run as verify_run
 from .verify.checks import verify_video as verify_video
 from .view.render import render as render

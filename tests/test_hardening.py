@@ -1,4 +1,4 @@
-"""`ls.harden` and `lqrsim harden`: hardened plans against Monte Carlo of the exact dynamics, and what they say.
+"""`ls.stress.harden` and `lqrsim harden`: hardened plans against Monte Carlo of the exact dynamics, and what they say.
 
 A point mass passes a crate. A force of unknown size, drawn once for each trial, pushes it; in its runs the force is
 twice as large as its plans and laws were told.
@@ -83,7 +83,7 @@ def stated(reference: str, **more: Any) -> ls.stress.ReliabilityProblem:
 
 @pytest.fixture(scope="module")
 def hardened(own: str) -> HardenedPlan:
-    return ls.harden(stated(own), **FEW)
+    return ls.stress.harden(stated(own), **FEW)
 
 
 def collisions(problem: ls.stress.ReliabilityProblem, solution: ls.Solution) -> int:
@@ -134,7 +134,7 @@ def test_what_is_never_hit_gets_no_more_room(own: str, hardened: HardenedPlan) -
         others = np.array(names) != hit
         assert (wanted[others] <= search.near[others]).all()
         assert wanted[~others] > search.near[~others]  # its measured probability is more than the request
-    without = ls.harden(stated(f"{own},pillar=0"), **FEW, rounds=2)
+    without = ls.stress.harden(stated(f"{own},pillar=0"), **FEW, rounds=2)
     assert without.rounds[-1].cost == pytest.approx(hardened.rounds[-1].cost, rel=1e-3)
 
 
@@ -167,7 +167,7 @@ def test_what_cannot_be_reached_says_why(own: str, words: str, strength: float, 
     problem = stated(own + words, strength=strength)
     if words:  # a search for a safe first plan would take long
         problem = replace(problem, solution=ls.smooth(problem.resolved.problem))
-    found = ls.harden(problem, **FEW, rounds=2 if words else 1)
+    found = ls.stress.harden(problem, **FEW, rounds=2 if words else 1)
     assert not found.success
     assert says in found.reason
     assert str(found).endswith(f"is the safest, NOT as requested: {found.reason}")
@@ -184,14 +184,14 @@ def test_it_ends_early_where_all_failing_runs_leave_the_plan(own: str, hardened:
 
 
 def test_the_same_seed_gives_the_same_and_another_one_does_not(own: str, hardened: HardenedPlan) -> None:
-    again, other = (ls.harden(stated(own), **FEW, seed=seed, rounds=2 - seed) for seed in (0, 1))
+    again, other = (ls.stress.harden(stated(own), **FEW, seed=seed, rounds=2 - seed) for seed in (0, 1))
     assert str(again) == str(hardened)
     np.testing.assert_array_equal(again.solution.trajectory.states, hardened.solution.trajectory.states)
     assert str(other.rounds[0]) != str(hardened.rounds[0])
 
 
 def test_a_given_plan_that_is_safe_enough_is_kept(own: str, hardened: HardenedPlan) -> None:
-    found = ls.harden(stated(own, solution=hardened.solution), **FEW, seed=50)
+    found = ls.stress.harden(stated(own, solution=hardened.solution), **FEW, seed=50)
     assert len(found.rounds) == 1
     np.testing.assert_array_equal(found.solution.trajectory.states, hardened.solution.trajectory.states)
 
@@ -205,7 +205,7 @@ def test_ctrl_c_keeps_the_plans_that_are_measured(own: str) -> None:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt) as stopped:
-            ls.harden(stated(own), **FEW, progress=stop)
+            ls.stress.harden(stated(own), **FEW, progress=stop)
         found = getattr(stopped.value, "found", None)
         assert (found and len(found.rounds)) == kept
         if found is not None:
@@ -287,7 +287,7 @@ def test_wrong_options_are_refused_before_anything_is_solved(
     problem = options.pop("problem", {})
     problem = stated(own, **problem) if isinstance(problem, dict) else problem
     with pytest.raises(ls.InputError) as refused:
-        ls.harden(problem, **options)
+        ls.stress.harden(problem, **options)
     assert str(refused.value).startswith(says) or says in str(refused.value)
     assert "\n" not in str(refused.value)
 

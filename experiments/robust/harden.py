@@ -59,7 +59,9 @@ def of_query(config: Config, query: int, case: Case) -> dict[str, Any]:
             return [0.0, 0.0, 0.0]
 
     first = predicted(asked)
-    found = ls.harden(replace(problem, solution=first.solution), chance=asked, particles=config.hardened, seed=seed)
+    found = ls.stress.harden(
+        replace(problem, solution=first.solution), chance=asked, particles=config.hardened, seed=seed
+    )
     row: dict[str, Any] = {"query": query, "asked": asked, "success": found.success, "reason": found.reason}
     row["plans"] = len(found.rounds)
     fresh = [0.0, 0.0, 0.0] if found.rare is None else interval(found.rare.probability)
