@@ -15,7 +15,7 @@ from runner import interval, progress, table
 import lqrsim as ls
 from robust.common import Config
 
-LESS = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0)  # factors on the predicted chance of the third plan
+LESS = (1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)  # factors on the predicted chance of the third plan
 
 
 class Case(NamedTuple):
