@@ -68,7 +68,7 @@ def of_query(config: Config, query: int, case: Case) -> dict[str, Any]:
     row["hardened"] = {"cost": found.rounds[found.chosen].cost, "measured": fresh}
     row["first"] = {"cost": first.cost, "predicted": first.tube.collision_chance, "measured": measured(first.solution)}
     row["wider"] = None
-    for less in LESS:
+    for less in LESS if config.hardened >= 100 else LESS[:2]:  # `--quick` tries two
         plan = first if less == 1 else predicted(asked / less)
         rate = row["first"]["measured"] if less == 1 else measured(plan.solution)
         if rate[2] <= asked:
