@@ -13,6 +13,7 @@ steady   A steady wind, a wrong mass: whether it gets there, and what error stay
 drive    The differential drive under all disturbances at once.
 filter   Whether the filter knows how wrong it is.
 emphasis How much less often it collides if its law acts where deviations lead to collisions, at equal cost.
+harden   What it costs to bring the measured probability of failure below a request, and whether it is then below it.
 chances  The predicted chance of collision against what is measured, for four robots.
 severe   What keeps the quadrotor from its goal at 'severe': the plan, the lag, the thrust or the sensors; and how many
          trials have a plan that knows what they meet, which bounds any law.
@@ -22,10 +23,10 @@ worlds   Whether safe plans in random worlds keep the chance that they were aske
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from robust import alone, chances, common, consistency, drive, emphasis, presets, severe, steady, worlds
+from robust import alone, chances, common, consistency, drive, emphasis, harden, presets, severe, steady, worlds
 from runner import Result, Section, measure, opening, report_of, run
 
-Name = Literal["presets", "alone", "steady", "drive", "filter", "emphasis", "chances", "severe", "worlds"]
+Name = Literal["presets", "alone", "steady", "drive", "filter", "emphasis", "harden", "chances", "severe", "worlds"]
 SECTIONS = {
     "presets": Section(presets, "All disturbances of a preset"),
     "alone": Section(alone, "One disturbance alone"),
@@ -33,6 +34,7 @@ SECTIONS = {
     "drive": Section(drive, "The differential drive"),
     "filter": Section(consistency, "Consistency of the filter"),
     "emphasis": Section(emphasis, "Effort where deviations lead to collisions"),
+    "harden": Section(harden, "Failures put back into the plan"),
     "chances": Section(chances, "Predicted chances of collision"),
     "severe": Section(severe, "What limits severe disturbances"),
     "worlds": Section(worlds, "Safe plans in random worlds"),

@@ -9,7 +9,7 @@ import pytest
 from lqrsim.cli import main
 from lqrsim.commands import COMMANDS
 
-GIVEN = ("stress", "rare", "break", "funnel", "view")  # which run a stored solution
+GIVEN = ("stress", "rare", "harden", "break", "funnel", "view")  # which run a stored solution
 BASH = shutil.which("bash")
 
 

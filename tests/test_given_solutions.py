@@ -229,7 +229,7 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
 # What is refused.
 
 
-@pytest.mark.parametrize("command", ["stress", "rare", "break", "funnel", "view"])
+@pytest.mark.parametrize("command", ["stress", "rare", "harden", "break", "funnel", "view"])
 def test_a_solution_of_another_system_is_refused_by_every_command(
     command: str, stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

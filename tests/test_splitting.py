@@ -155,6 +155,17 @@ def test_two_opposite_planes_are_both_found() -> None:
     assert 0.2 < np.mean(found.failures[:, 0] > 0) < 0.8
 
 
+def test_failures_are_counted_without_levels() -> None:
+    """Each vector is evaluated once; the interval is Clopper and Pearson's."""
+    found = failure_probability(along(3, 1.5), 3, particles=200, keep=0, repetitions=7, seed=5)
+    k, n = len(found.failures), 1400
+    assert (found.simulations, found.levels.tolist()) == (n, [0.0])
+    exact = stats.binomtest(k, n).proportion_ci(method="exact")
+    one = found.probability
+    assert (one.value, one.low, one.high) == pytest.approx((k / n, exact.low, exact.high))
+    assert stats.binomtest(k, n, stats.norm.sf(1.5)).pvalue > 1e-4
+
+
 def test_repetitions_have_no_bias_and_the_standard_error_is_theirs() -> None:
     """Few particles and one move, where levels from the particles themselves would be off: 2,000 repetitions."""
     found = failure_probability(along(4, 3.5), 4, particles=40, moves=1, keep=0.25, repetitions=2000, seed=4)
@@ -266,6 +277,8 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
         (lambda: failure_probability(along(2, 1), 0), "size: got 0"),
         (lambda: failure_probability(along(2, 1), 2, particles=3), "particles: got 3"),
         (lambda: failure_probability(along(2, 1), 2, keep=0.9), "keep: got 0.9"),
+        (lambda: failure_probability(along(2, 1), 2, keep=-0.1), "keep: got -0.1"),
+        (lambda: failure_probability(along(2, 1), 2, particles=20, keep=0.09), "keep: got 0.09, want .* >= 0.1"),
         (lambda: failure_probability(along(2, 1), 2, repetitions=1), "repetitions: got 1"),
         (lambda: failure_probability(lambda z: np.full(len(z), np.nan), 2), "score: got NaN returned"),
         (

@@ -18,6 +18,7 @@ from lqrsim.stress.statistics import rate
 
 Reached = npt.NDArray[np.bool_]
 PRESETS = ("light", "moderate", "severe")
+KEPT = ("particles", "world_trials", "without", "hardened", "seed")
 # The chance of collision that a safe plan is asked for; under severe turbulence few plans have less.
 ASKED = {"light": 1e-3, "moderate": 1e-2, "severe": 0.2}
 
@@ -40,6 +41,8 @@ class Config(FolderSettings):
     """In each of them."""
     without: int = 300
     """Trials at severe of each thing that is better than it is, and with plans that know what they meet."""
+    hardened: int = 1000
+    """Trials of each of ten repetitions with which 'harden' measures. Ten may fail, which is the chance asked."""
     seed: int = 0
     """Of the disturbances, as in stress_test.py."""
     cases: tuple[str, ...] = ()
@@ -50,11 +53,25 @@ class Config(FolderSettings):
 
     def kept(self) -> Kept:
         """What is done."""
-        return Kept(self.keep, {name: getattr(self, name) for name in ("particles", "world_trials", "without", "seed")})
+        return Kept(
+            self.keep,
+            {name: getattr(self, name) for name in ("particles", "world_trials", "without", "hardened", "seed")},
+        )
 
     def bounded(self) -> Self:
         """The settings, reduced by `--quick`."""
-        return at_most(self, trials=5, queries=1, alone=3, plans=1, particles=20, worlds=1, world_trials=20, without=10)
+        return at_most(
+            self,
+            trials=5,
+            queries=1,
+            alone=3,
+            plans=1,
+            particles=20,
+            worlds=1,
+            world_trials=20,
+            without=10,
+            hardened=20,
+        )
 
 
 def reach_exactly(problem: ls.Problem) -> ls.Problem:

@@ -5,18 +5,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from lqrsim.commands.options import Folder, Json, OwnScenario, PolicyOptions, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.funnel import Funnel
     from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, SmallestFailure
+    from lqrsim.stress.hardening import HardenedPlan
 
 
 @dataclass(frozen=True, kw_only=True)
 class FailureOptions(PolicyOptions):
-    """Options of `rare` and `break`."""
+    """Options of `rare`, `break` and `harden`."""
 
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
     """Disturbances, as in `lqrsim stress`. By default the disturbances of the scenario's demo."""
@@ -24,7 +25,7 @@ class FailureOptions(PolicyOptions):
     """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal."""
 
     out: Folder = None
-    """Output folder. By default runs/rare/ or runs/break/ and the name of the scenario."""
+    """Output folder. By default runs/, the name of the command, and the name of the scenario."""
 
     def _begin(self, command: str) -> "tuple[ReliabilityProblem, Path]":
         """The problem, and the folder for the results. Raises InputError for a folder that cannot be written."""
@@ -127,6 +128,69 @@ class Break(FailureOptions):
         except NoFailure as none:
             return _say_none(none)
         return write(smallest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Harden(FailureOptions):
+    """Find a plan whose measured probability of failure is low enough.
+
+    The first plan has the wanted chance of collision by prediction, or is the given solution. Each plan's failures are
+    measured with all disturbances, as by `lqrsim rare`; the next plan has more room where runs fail, and less where it
+    has too much. The first that is safe enough is measured again, with fresh random numbers. Writes solution.npz, for
+    `--solution` of other commands, harden.json, with settings and plans, and the files of `lqrsim rare`; `lqrsim
+    certify` checks certificate.npz. Ctrl-C keeps the plans that are measured.
+
+      lqrsim harden quadrotor --sweep moderate --chance 0.01
+
+    Exits with 1 if the wanted probability is not reached; the output says why.
+    """
+
+    policy: Literal["smooth", "track", "offset_free"] = "offset_free"
+    """As in `lqrsim stress`."""
+    failure: Suppress[Literal["collision"]] = "collision"
+    chance: float = 1e-3
+    """Wanted probability that the robot collides. The whole interval of the measured probability must be below it."""
+    rounds: int = 4
+    """Largest number of plans."""
+    particles: Annotated[int | None, optional("INT")] = None
+    """As in `lqrsim rare`. By default 250; for a chance from 0.005 on 10 / chance, so that failures are counted."""
+    repetitions: int = 10
+    """As in `lqrsim rare`."""
+    shown: int = 8
+    """Number of failures to write."""
+
+    def run(self) -> int:
+        from lqrsim.commands import console
+        from lqrsim.errors import check_count
+        from lqrsim.stress.hardening import harden
+
+        check_count("shown", self.shown)
+        problem, folder = self._begin("harden")
+
+        def write(found: "HardenedPlan") -> int:
+            console.say(found.verdict())
+            shown = found.save(folder, shown=self.shown)
+            written = ["solution.npz", "harden.json"]
+            if shown is not None:
+                console.say(shown.summary())
+                written += ["rollout.npz", "rare.json", "certificate.npz"]
+            for name in written:
+                console.wrote(folder / name)
+            console.result(**json.loads((folder / "harden.json").read_text(encoding="utf-8")))
+            return 0 if found.success else 1
+
+        with console.keeping(write), console.progress("hardening", "repetition") as progress:
+            found = harden(
+                problem,
+                chance=self.chance,
+                rounds=self.rounds,
+                particles=self.particles,
+                repetitions=self.repetitions,
+                seed=self.seed,
+                report=console.say,
+                progress=progress,
+            )
+        return write(found)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,7 @@ class FailureCertificate:
       particles: number of trials at each level.
       seed: seed of all random numbers.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
+      keep: fraction of the trials that exceeds the next level; 0 if failures were counted.
 
     Raises:
       InputError: the parts do not fit together.
@@ -59,6 +60,7 @@ class FailureCertificate:
     particles: int
     seed: int
     versions: Mapping[str, Line]
+    keep: Annotated[float, Bounds(at_least=0.0, at_most=0.5)] = 0.1
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -5,6 +5,7 @@ from .failure_search import ReliabilityProblem as ReliabilityProblem
 from .failure_search import certify as certify
 from .funnels import FunnelCheck as FunnelCheck
 from .funnels import check_funnel as check_funnel
+from .hardening import harden as harden
 from .multilevel_splitting import NoFailure as NoFailure
 from .multilevel_splitting import failure_probability as failure_probability
 from .outcome_table import Outcomes as Outcomes

@@ -42,7 +42,7 @@ from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, failure_probability
+from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, check_keep, failure_probability
 from lqrsim.stress.policies import POLICIES, check_designed, make_policy
 from lqrsim.stress.specification import disturbances_as_json
 from lqrsim.stress.statistics import Estimate
@@ -110,7 +110,9 @@ class ReliabilityProblem:
             raise InputError(
                 f"failure: got 'collision' for {self.scenario}, which has no obstacles with a distance, want 'miss'"
             )
-        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, self.given)
+        # Whoever has a Solution at hand knows of which problem it is.
+        remark = not isinstance(self.solution, Solution)
+        solution, controller = make_policy(self.policy, scenario, self.design_disturbances, self.given, remark=remark)
         score = TrialScore(
             scenario.settled(solution).plant(),
             solution,
@@ -155,6 +157,7 @@ class ReliabilityProblem:
         *,
         particles: int = 250,
         repetitions: int = 10,
+        keep: float = 0.1,
         seed: int = 0,
         report: Report | None = None,
         progress: Progress | None = None,
@@ -164,6 +167,8 @@ class ReliabilityProblem:
         Args:
           particles: number of trials at each level.
           repetitions: number of independent estimates, from which the interval follows.
+          keep: fraction of the trials that exceeds the next level, at least 2 / `particles`. With 0 there are no
+            levels, and failures are counted.
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level that the pilot run finds.
           progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so
@@ -181,6 +186,7 @@ class ReliabilityProblem:
             "seed": check_seed("seed", seed),
             "particles": check_count("particles", particles, at_least=20),
             "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
+            "keep": check_keep(keep, particles),
         }
         score = self._begin(report, progress)
         with keeping(lambda done: None if done is None else RareFailures(self, done, options)):
@@ -270,13 +276,13 @@ class RareFailures:
     """The probability that a policy fails, and typical failures.
 
     Attributes:
-      problem: the ReliabilityProblem. options: `seed`, `particles` and `repetitions`.
+      problem: the ReliabilityProblem. options: `seed`, `particles`, `repetitions` and `keep`.
       splitting: the levels, the estimate of each repetition, and all failures that were found.
     """
 
     problem: ReliabilityProblem
     splitting: SplittingResult
-    options: Mapping[str, int]
+    options: Mapping[str, Any]
 
     @property
     def probability(self) -> Estimate:
@@ -329,6 +335,7 @@ class RareFailures:
             **asked, **_facts(problem), solution=problem.score.solution, probability=one.value, low=one.low,
             high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions,
             particles=self.options["particles"], seed=self.options["seed"], versions=versions(),
+            keep=self.options["keep"],
         )  # fmt: skip
 
     def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout:
@@ -438,7 +445,8 @@ def certify(
         for name, value in now.items()
         if value != (was := getattr(certificate, name))
     ]
-    options = {"particles": certificate.particles, "seed": certificate.seed if seed is None else seed}
+    options: dict[str, Any] = {"particles": certificate.particles, "keep": certificate.keep}
+    options["seed"] = certificate.seed if seed is None else seed
     measured = problem.rare_failures(repetitions=count, **options, report=report, progress=progress)
     fresh = f"seed {seed} (was {certificate.seed})" if options["seed"] != certificate.seed else ""
     others, one = fresh or changed(certificate.versions), measured.probability
@@ -533,6 +541,21 @@ def _write(
     """Write trials with these numbers as rollout.npz, and options and results as NAME.json. Returns the trials."""
     # With contacts, for pictures; bit-identical until the collision.
     rollout = replace(problem.score, contacts=True).rollout(numbers)
+    save_load.save(rollout, folder / "rollout.npz")
+    write_json(problem, problem.score.solution, folder, name, options, found, stopped)
+    return rollout
+
+
+def write_json(
+    problem: ReliabilityProblem,
+    solution: Solution,
+    folder: Path,
+    name: str,
+    options: Mapping[str, Any],
+    found: Mapping[str, Any],
+    stopped: str,
+) -> None:
+    """Write the settings of a search, and what it found, as NAME.json."""
     asked = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
     asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
@@ -542,16 +565,14 @@ def _write(
         "disturbances": disturbances_as_json(problem.disturbances),
         "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,
-        "policy": digest_of_solution(problem.score.solution),
+        "policy": digest_of_solution(solution),
         "versions": versions(),
         "machine": description(),
         "stopped": stopped or None,
         "found": found,
     }
-    save_load.save(rollout, folder / "rollout.npz")
     with save_load.replacing(folder / f"{name}.json") as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return rollout
 
 
 def _rounded(number: float) -> str:

@@ -85,7 +85,8 @@ def failure_probability(
       score: a function of vectors (K, size) that returns (K,); positive is failure.
       size: length of a vector.
       particles: number of vectors N in each repetition.
-      keep: fraction of the vectors that exceeds the next level.
+      keep: fraction of the vectors that exceeds the next level, at least 2 / `particles`. With 0 there are no levels,
+        and failures are counted.
       moves: number of moves of each particle at a level.
       repetitions: number of independent estimates; the interval follows from their spread.
       seed: seed of all random numbers.
@@ -103,7 +104,7 @@ def failure_probability(
     size = check_count("size", size)
     particles = check_count("particles", particles, at_least=10)
     check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved vectors, and copies of both
-    keep = check_number("keep", keep, at_least=2 / particles, at_most=0.5)
+    keep = check_keep(keep, particles)
     moves = check_count("moves", moves, at_most=MOST)
     repetitions = check_count("repetitions", repetitions, at_least=2, at_most=MOST)
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
@@ -112,9 +113,10 @@ def failure_probability(
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     counted = CountedScore(score)
     first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
-    levels, step_sizes = _pilot_run(
-        counted, size, particles, keep, moves, most_levels, np.random.default_rng(first), level
-    )
+    levels, step_sizes = np.zeros(1), np.zeros(0)
+    if keep:
+        rng = np.random.default_rng(first)
+        levels, step_sizes = _pilot_run(counted, size, particles, keep, moves, most_levels, rng, level)
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
@@ -139,6 +141,12 @@ def failure_probability(
     if found is None:
         raise NoFailure(f"particles: got {particles}, none of which failed, want more of them")
     return found
+
+
+def check_keep(keep: object, particles: int) -> float:
+    """The fraction of vectors that exceeds the next level. Raises InputError if it is out of range."""
+    kept = check_number("keep", keep, at_least=0.0, at_most=0.5)
+    return check_number("keep", kept, at_least=2 / particles) if kept else kept
 
 
 def _estimate(shares: Array, particles: int) -> Estimate:

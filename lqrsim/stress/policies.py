@@ -79,7 +79,12 @@ def design_uncertainty(scenario: Scenario, design: Design = None) -> Uncertainty
 
 
 def solve(
-    policies: Sequence[str], scenario: Scenario, design: Design = None, given: Solution | None = None
+    policies: Sequence[str],
+    scenario: Scenario,
+    design: Design = None,
+    given: Solution | None = None,
+    *,
+    remark: bool = True,
 ) -> dict[str, Solution]:
     """The solution that each policy runs, by the policy's name.
 
@@ -91,6 +96,7 @@ def solve(
       scenario: the scenario that is solved.
       design: the disturbances for which "track" and "offset_free" are designed.
       given: a solution from `solutions.given`, in place of the result of its solver.
+      remark: whether to warn of plans that have not converged, or are of another problem.
 
     Raises:
       InputError: a plan is not finite, or no policy uses the given solution.
@@ -106,8 +112,8 @@ def solve(
     for solver, plan in plans.items():
         if not np.isfinite(plan.trajectory.states).all():
             raise InputError(f"policies: got a plan of {solver} that is {plan.status.name}, want a finite one")
-        for remark in solving.remarks(scenario, plan):
-            _log.warning("the solution of %s %s", solver, remark)
+        for line in solving.remarks(scenario, plan) if remark else []:
+            _log.warning("the solution of %s %s", solver, line)
     if "track" in policies:
         problem = scenario.settled(solutions["track"]).problem
         law = track(problem, solutions["track"], uncertainty=design_uncertainty(scenario, design))
@@ -189,11 +195,11 @@ def make_controller(
 
 
 def make_policy(
-    policy: str, scenario: Scenario, design: Design = None, given: Solution | None = None
+    policy: str, scenario: Scenario, design: Design = None, given: Solution | None = None, *, remark: bool = True
 ) -> tuple[Solution, Controller | AffinePolicy]:
-    """Solve for one policy. Returns its solution and the controller that runs it; raises InputError as `solve` does."""
+    """Solve for one policy. Returns its solution and the controller that runs it; see `solve`."""
     if design is not None:
         check_designed((policy,))
         design = design_disturbances(scenario, design)  # before it is solved
-    solution = solve((policy,), scenario, design, given)[policy]
+    solution = solve((policy,), scenario, design, given, remark=remark)[policy]
     return solution, make_controller(POLICY_KINDS[policy].controller, scenario, solution, design=design)

@@ -250,7 +250,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "self": reliability, **more, "seed": 0, "report": print_nothing, "progress": print_nothing
             }, 0.1)
             for name, more in {
-                "rare_failures": {"particles": 20, "repetitions": 2}, "smallest_failure": {"rounds": 1}
+                "rare_failures": {"particles": 20, "repetitions": 2, "keep": 0.1}, "smallest_failure": {"rounds": 1}
             }.items()
         },
         "FailureCertificate": (vars(certificate),),
@@ -258,6 +258,10 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
             "certificate": certificate, "repetitions": 2, "seed": 0, "scenario": reference, "report": print_nothing,
             "progress": print_nothing,
         }, 0.1),
+        "harden": ({
+            "problem": ls.stress.ReliabilityProblem(reference, solution=place.solution), "chance": 0.5, "rounds": 1,
+            "particles": 20, "repetitions": 2, "seed": 0, "report": print_nothing, "progress": print_nothing,
+        }, 0.05),
         "report": ({
             "results": results, "out": place.folder / "report.html", "videos": 0, "progress": print_nothing
         }, 0.05),

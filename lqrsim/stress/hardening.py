@@ -1,0 +1,362 @@
+"""Harden a plan: its failing runs in MuJoCo say where the next plan needs more room, and where it needs less.
+
+The first plan has the requested chance of collision by prediction. Its failures are then measured, with all
+disturbances, also those that no prediction includes. From the planned clearance of an obstacle, in predicted standard
+deviations, and the measured probability of hitting it follows how many of these deviations correspond to one quantile
+of the normal distribution. The next plan keeps as many of them as correspond to an equal part of the requested
+probability. Obstacles that are never hit need no more room than before; there the deviations count as wrong as where
+they are most wrong. The law is designed again for each plan.
+
+Room does not help a robot that leaves its plan for good. Such failures are counted separately.
+"""
+
+import os
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+from math import ceil
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from lqrsim.control.chance_constrained import smooth_chance_constrained
+from lqrsim.control.collision_chance import Surroundings
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.tubes import STRAY, predict_tube
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_function,
+    check_kind,
+    check_name,
+    check_number,
+    check_path,
+    check_seed,
+)
+from lqrsim.problem.problem import Problem
+from lqrsim.process import keeping
+from lqrsim.results import save_load
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.simulation.uncertainty_of import uncertainty_of
+from lqrsim.solvers.compiled import costs_of
+from lqrsim.solvers.smoother import smooth
+from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report, write_json
+from lqrsim.stress.multilevel_splitting import NoFailure, Progress
+from lqrsim.stress.policies import DESIGNED, design_uncertainty, make_controller
+
+POLICIES = ("smooth", *DESIGNED)  # whose law can be designed for any plan, and predicted
+AIM = 0.5  # of the requested probability, so that the whole interval of the measured one is likely to be below it
+LESS, MORE = 0.8, 2.0  # limits of the factor on a number of standard deviations, from one plan to the next
+COUNTED = 5e-3  # requests from which failures are counted by default; smaller probabilities are cheaper by splitting
+FAILING = 10  # trials of each repetition that fail at the requested probability, if failures are counted
+SHOWN = 300  # failing runs that are run again, to see where they fail
+MOST = 20  # rounds
+REMEDY = "more range of the controls, less lag, or other tolerances may help"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardeningRound:
+    """A plan, and how its runs fail.
+
+    Attributes:
+      solution: the plan.
+      cost: its cost in the scenario's problem.
+      rare: its failures; None if none was found.
+      hit: fraction of the failing runs that return to the plan, but hit an obstacle before, by the obstacle's name.
+      strays: fraction of the failing runs that leave the plan for good: their simulation diverges, or they end farther
+        from it than six standard deviations of the position, where these are largest.
+    """
+
+    solution: Solution
+    cost: float
+    rare: RareFailures | None
+    hit: dict[str, float]
+    strays: float
+
+    def __str__(self) -> str:
+        if self.rare is None:
+            return f"cost {self.cost:.6g}, no failure found"
+        ranked = sorted(self.hit.items(), key=lambda one: -one[1])
+        parts = [f"{100 * share:.0f} % hit {name}" for name, share in ranked if share >= 0.005]
+        parts += [f"{100 * self.strays:.0f} % leave the plan for good"] if self.strays >= 0.005 else []
+        return f"cost {self.cost:.6g}, probability of failure {self.rare.probability:.2g}: {', '.join(parts)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardenedPlan:
+    """A plan with its measured probability of failure, and the plans before it.
+
+    Attributes:
+      problem: the ReliabilityProblem. chance: the requested probability. options: `seed`, `particles`, `repetitions`
+        and `rounds`.
+      rounds: a HardeningRound for each plan. chosen: number of the one that is the result, from 0. If it is safe
+        enough, its failures were measured again with fresh random numbers.
+      reason: why there is no success, and what may help; empty if there is.
+    """
+
+    problem: ReliabilityProblem
+    chance: float
+    options: dict[str, int]
+    rounds: tuple[HardeningRound, ...]
+    chosen: int
+    reason: str
+
+    @property
+    def solution(self) -> Solution:
+        """The plan."""
+        return self.rounds[self.chosen].solution
+
+    @property
+    def rare(self) -> RareFailures | None:
+        """The plan's failures; `rare.save` writes them with their certificate. None if none was found."""
+        return self.rounds[self.chosen].rare
+
+    @property
+    def success(self) -> bool:
+        """Whether the whole interval of two measurements is at most the requested probability."""
+        return not self.reason
+
+    @property
+    def stopped(self) -> str:
+        """The progress if it was stopped, such as "stopped after 1 of 4 plans"; else empty."""
+        return self.reason if self.reason.startswith("stopped") else ""
+
+    def verdict(self) -> str:
+        """A line that says whether the plan is as requested."""
+        chosen = f"requested: at most {self.chance:g}; plan {self.chosen + 1}"
+        if self.reason:
+            return f"{chosen} is the safest, NOT as requested: {self.reason}"
+        return f"{chosen} is as requested, with the whole interval"
+
+    def summary(self) -> str:
+        """A line for each plan, and whether the result is as requested."""
+        return "\n".join([*(f"plan {number}: {one}" for number, one in enumerate(self.rounds, 1)), self.verdict()])
+
+    __str__ = summary
+
+    def save(self, folder: str | os.PathLike[str], *, shown: int = 8) -> Rollout | None:
+        """Write solution.npz, harden.json, and, if there are failures, the files of `rare`.
+
+        Returns:
+          The typical failures that were written.
+
+        Raises:
+          InputError: they cannot be written.
+        """
+        folder = check_path("folder", folder, "the path of a folder")
+        rounds = [
+            {"cost": one.cost, "hit": one.hit, "strays": one.strays, "probability": _as_json(one.rare)}
+            for one in self.rounds
+        ]
+        found = {
+            "success": self.success, "reason": self.reason, "chosen": self.chosen, "rounds": rounds,
+        }  # fmt: skip
+        save_load.save(self.solution, folder / "solution.npz")
+        asked = {"chance": self.chance, **self.options}
+        write_json(self.problem, self.solution, folder, "harden", asked, found, self.stopped)
+        return None if self.rare is None else self.rare.save(folder, shown=shown)
+
+
+def _as_json(rare: RareFailures | None) -> dict[str, float] | None:
+    """The probability with its interval; None if no failure was found."""
+    return None if rare is None else asdict(rare.probability)
+
+
+def harden(
+    problem: ReliabilityProblem,
+    *,
+    chance: float = 1e-3,
+    rounds: int = 4,
+    particles: int | None = None,
+    repetitions: int = 10,
+    seed: int = 0,
+    report: Report | None = None,
+    progress: Progress | None = None,
+) -> HardenedPlan:
+    """Find a plan with a measured probability of failure of at most the requested one, at little additional cost.
+
+    Args:
+      problem: scenario, disturbances, policy and failure. The policy is "smooth", "track" or "offset_free"; the failure
+        is a collision. Predictions know its `design_disturbances`; by default all that it has. A `solution` is the
+        first plan; by default that is the result of `smooth_chance_constrained`.
+      chance: probability of failure, between 0 and 1.
+      rounds: largest number of plans.
+      particles: as in `ReliabilityProblem.rare_failures`. By default 250; for a `chance` from 0.005 on 10 / `chance`,
+        so that failures are counted.
+      repetitions: as in `ReliabilityProblem.rare_failures`.
+      seed: seed of the first measurement; the others have the seeds after it.
+      report: called with a description of the run, and with a line for each plan.
+      progress: called with the number of finished repetitions, the largest possible number, and the result so far as
+        text.
+
+    Returns:
+      The HardenedPlan: the first plan that is safe enough in two measurements, the second with fresh random numbers; or
+        else the safest one, with `success` False and a `reason`.
+
+    Raises:
+      InputError: an option is out of range, or no plan is found for the scenario; or as of `smooth_chance_constrained`
+        and `predict_tube`.
+      KeyboardInterrupt: Ctrl-C; its `found` is the HardenedPlan after the rounds that are done, or None.
+    """
+    check_kind("problem", problem, ReliabilityProblem, "a ReliabilityProblem")
+    chance = check_number("chance", chance, above=0.0, below=1.0)
+    rounds = check_count("rounds", rounds, at_most=MOST)
+    if particles is None:
+        particles = 250 if chance < COUNTED else max(20, ceil(FAILING / chance))
+    check_count("particles", particles, at_least=20)
+    check_count("repetitions", repetitions, at_least=2)
+    seed = check_seed("seed", seed)
+    check_function("report", report, "a function of a line of text", arguments=1)
+    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
+    search, say = _Search(problem, chance, options), report or (lambda line: None)
+    seeds, total = count(seed), 2 * rounds * repetitions
+
+    def measure(solution: Solution, what: str) -> RareFailures | None:
+        used = next(seeds)
+        begun = repetitions * (used - seed)
+
+        def tell(done: int, _: int, found: str) -> None:
+            if progress is not None:
+                progress(begun + done, total, f"{what}: {found}")
+
+        return search.failures(solution, used, tell)
+
+    def so_far(_: object) -> HardenedPlan | None:
+        return search.result(f"stopped after {len(search.rounds)} of {rounds} plans") if search.rounds else None
+
+    with keeping(so_far):
+        while len(search.rounds) < rounds and (solution := search.next()) is not None:
+            what = f"plan {len(search.rounds) + 1}"
+            if not search.rounds:
+                say(replace(problem, solution=solution).summary())
+            search.add(solution, measure(solution, what))
+            say(f"{what}: {search.rounds[-1]}")
+            if search.enough():
+                search.add(search.rounds.pop().solution, measure(solution, f"{what} again"))
+                say(f"{what} again, with fresh random numbers: {search.rounds[-1]}")
+                if search.enough():
+                    break
+    return search.result(search.shortfall())
+
+
+class _Search:
+    """The plans so far."""
+
+    def __init__(self, problem: ReliabilityProblem, chance: float, options: dict[str, int]) -> None:
+        check_name("problem: policy", problem.policy, POLICIES)
+        if problem.failure != "collision":
+            raise InputError(f"problem: failure: got {problem.failure!r}, want 'collision', which more room prevents")
+        scenario = problem.resolved
+        if scenario.problem.duration is not None:
+            raise InputError(f"problem: got {problem.scenario}, whose duration is free, want a fixed one")
+        self.asked, self.chance, self.options = problem, chance, options
+        self.scenario, self.stated, design = scenario, scenario.problem, problem.design_disturbances
+        told = uncertainty_of(scenario.plant(), problem.disturbances)
+        self.uncertainty = told if design is None else design_uncertainty(scenario, design)
+        self.surroundings = Surroundings.of(self.stated, self.uncertainty.obstacles)
+        self.names = [one.name for shape in self.surroundings.shapes for one in shape.world.obstacles]
+        self.rounds: list[HardeningRound] = []
+        self.ended = ""  # why there is no next plan
+
+    def law(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
+        """The law that runs a plan."""
+        name = self.asked.policy if self.asked.policy in DESIGNED else "feedback"
+        law = make_controller(name, self.scenario, solution, design=self.asked.design_disturbances)
+        assert isinstance(law, OffsetFree | AffinePolicy)
+        return law
+
+    def next(self) -> Solution | None:
+        """The next plan; None if there is none."""
+        if not self.rounds:
+            return self.asked.given or self.first()
+        last = self.rounds[-1]
+        if not any(name in last.hit for name in self.names):
+            self.ended = f"all failing runs leave the plan for good, which more room does not prevent; {REMEDY}"
+            return None
+        more = self.wanted(last) - self.near
+        for share in (1.0, 0.5, 0.25):  # as much of it as there is room for
+            kept = self.surroundings.keep_away(np.maximum(self.near + share * more, 0.0) * self.std)
+            problem = replace(self.stated, constraints=(*self.stated.constraints, *kept))
+            solution = smooth(problem, start=last.solution.trajectory)
+            if solution.success:
+                return solution
+        self.ended = "there is no plan with more room; allow a higher chance, or another route"
+        return None
+
+    def first(self) -> Solution:
+        """The plan that has the requested chance by prediction."""
+        plan = smooth_chance_constrained(self.stated, self.uncertainty, chance=self.chance, controller=self.law)
+        if not plan.solution.success:
+            got = plan.solution.status.name
+            raise InputError(f"problem: got no plan for {self.asked.scenario} ({got}), want one that can be solved")
+        return plan.solution
+
+    def wanted(self, last: HardeningRound) -> Array:
+        """The numbers of standard deviations (O,) that the next plan keeps from each obstacle."""
+        assert last.rare is not None
+        hit, near = np.array([last.hit.get(name, 0.0) for name in self.names]), np.maximum(self.near, 1.0)
+        critical, chance = hit > 0, last.rare.probability.value
+        # The runs that leave the plan for good take their part of the request.
+        left = max(self.chance - chance * last.strays, 0.1 * self.chance)
+        quantile = -ndtri(AIM * left / critical.sum())
+        measured = -ndtri(np.clip(chance * hit[critical], 1e-300, 0.4))
+        wanted = np.minimum(near, quantile * (near[critical] / measured).max())
+        wanted[critical] = near[critical] * np.clip(quantile / measured, LESS, MORE)
+        return wanted
+
+    def failures(self, solution: Solution, seed: int, progress: Progress) -> RareFailures | None:
+        """The failures of a plan; None if none is found."""
+        options: dict[str, Any] = {name: self.options[name] for name in ("particles", "repetitions")} | {"seed": seed}
+        keep = 0.0 if self.chance * options["particles"] >= FAILING else 0.1
+        try:
+            return replace(self.asked, solution=solution).rare_failures(**options, keep=keep, progress=progress)
+        except NoFailure:
+            return None
+
+    def add(self, solution: Solution, rare: RareFailures | None) -> None:
+        """Add a plan with its failures, and see how it fails."""
+        plan, place = solution.trajectory, list(self.surroundings.place)
+        # Trials of the model, which take long, are needed for moments with a latency or a delay alone.
+        samples = None if self.uncertainty.latency or self.uncertainty.delay else 0
+        law = self.law(self.stated, solution)
+        tube = predict_tube(self.stated, solution, self.uncertainty, law, samples=samples)
+        spread = self.surroundings.spread(plan.states + tube.mean, tube.covariance, tube.across)
+        # Least planned clearance of each obstacle in predicted standard deviations, (O,), and these, (T+1, O).
+        self.near, self.std = (spread.mean / spread.std).min(axis=0), spread.std
+        cost = float(costs_of(self.stated, plan.states[None], plan.controls[None])[0])
+        hit, strays = dict[str, float](), 0.0
+        if rare is not None:
+            run = rare.problem.score.rollout(rare.typical(SHOWN), frames=False)
+            away = np.linalg.norm((run.states[:, -1] - plan.states[-1])[:, place], axis=1)
+            widest = np.sqrt(np.linalg.eigvalsh(tube.position_covariance).max()) if place else np.inf
+            hits = np.array(run.obstacles)[(away <= STRAY * widest) & (np.array(run.outcome) == "collided")]
+            hit = {str(name): float(np.sum(hits == name)) / run.trials for name in np.unique(hits)}
+            strays = 1 - len(hits) / run.trials
+        self.rounds.append(HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays))
+
+    def enough(self) -> bool:
+        """Whether the last plan's failures are surely as rare as requested."""
+        rare = self.rounds[-1].rare
+        return rare is None or rare.probability.high <= self.chance
+
+    def shortfall(self) -> str:
+        """Why the last plan is not safe enough, and what may help; empty if it is."""
+        if self.enough() or self.ended:
+            return self.ended
+        after, strays = f"not after {len(self.rounds)} plans", self.rounds[-1].strays
+        if strays < 0.5:
+            return f"{after}; allow more rounds, or a higher chance"
+        return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {REMEDY}"
+
+    def result(self, reason: str) -> HardenedPlan:
+        """The last plan if there is no reason against it, else the safest of the plans so far."""
+        measured = [0.0 if one.rare is None else one.rare.probability.value for one in self.rounds]
+        chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
+        return HardenedPlan(
+            problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,
+            reason=reason,
+        )  # fmt: skip
