@@ -318,6 +318,17 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
     if model.na:
         named = robot.at(None, **angles, first_activation=0.25)
         np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
+    keys = {"bare": "", "driven": 'ctrl="0.2 -0.1"'} | ({"set": 'act="0.3 0"', "zero": 'act="0 0"'} if model.na else {})
+    places = " ".join(repr(float(angle)) for angle in angles.values())
+    frames = "".join(f'<key name="{name}" qpos="{places}" {more}/>' for name, more in keys.items())
+    other = ls.MjcfRobot(scene_from_xml(xml.replace("</mujoco>", f"<keyframe>{frames}</keyframe></mujoco>"), "arm"))
+    acts = {"set": [0.3, 0.0], "zero": [0.0, 0.0]}  # a keyframe that states none has those that hold the robot
+    for name in keys:
+        wanted = [*state[:4], *acts.get(name, state[4:])]
+        np.testing.assert_allclose(other.at(name), wanted, rtol=0, atol=1e-12)
+        if model.na:
+            changed = other.at(name, second_activation=0.5)
+            np.testing.assert_allclose(changed, [*wanted[:5], 0.5], rtol=0, atol=1e-12)
 
 
 @settings(max_examples=examples(10), deadline=None)

@@ -442,7 +442,7 @@ class MjcfRobot(Robot):
 
         A joint that an equality constraint couples to another follows it, unless it is named. The joints of a closed
         loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of actuators are
-        those that hold the robot, unless they are named or given by the keyframe.
+        those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -457,11 +457,11 @@ class MjcfRobot(Robot):
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
         if keyframe is None:
-            qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), np.zeros(model.na)
+            qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), None
         else:
-            qpos, qvel, act = mjcf_joints.keyframe(model, keyframe, who)
+            qpos, qvel, act = mjcf_joints.keyframe(model, self.scene.xml, keyframe, who)
         state[: 2 * model.nv] = self.state(qpos, qvel)[: 2 * model.nv]
-        state[2 * model.nv :] = act
+        state[2 * model.nv :] = 0.0 if act is None else act
         names = self.dynamics.state_coordinates.names
         for name, value in values.items():
             state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
@@ -470,7 +470,7 @@ class MjcfRobot(Robot):
                 state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
         if (keyframe is None or values) and mjcf_joints.loops_of(model):
             state[: model.nv] = self._closed(state, qpos, values)
-        if self.activations and keyframe is None:
+        if self.activations and act is None:
             unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
             state[unnamed] = self._held(state).activations[np.array(unnamed, dtype=np.intp) - 2 * model.nv]
         return state

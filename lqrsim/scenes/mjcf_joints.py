@@ -277,11 +277,17 @@ def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
     return next((number for number in moving if masses[number] > 0), moving[0])
 
 
-def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array, Array]:
-    """qpos, qvel and act of a keyframe. Raises InputError if there is none of that name."""
+def keyframe(model: mujoco.MjModel, xml: str, name: str, what: str) -> tuple[Array, Array, Array | None]:
+    """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, for which the model has zeros.
+
+    Raises:
+      InputError: there is no keyframe of that name.
+    """
     names = [model.key(number).name for number in range(model.nkey)]
     number = names.index(check_name(f"{what}: keyframe", name, names))
-    return model.key_qpos[number].copy(), model.key_qvel[number].copy(), model.key_act[number].copy()
+    stated = model.na > 0 and len(mujoco.MjSpec.from_string(xml).keys[number].act) > 0
+    act = model.key_act[number].copy() if stated else None
+    return model.key_qpos[number].copy(), model.key_qvel[number].copy(), act
 
 
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
