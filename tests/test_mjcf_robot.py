@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import signal
 import threading
 import time
@@ -693,7 +694,39 @@ def test_a_goal_past_the_limits_of_a_joint_is_refused(past: float) -> None:
         robot.problem(robot.at(), robot.at(b=past))
     for fine in (-0.3, 2.0):
         robot.problem(robot.at(), robot.at(b=fine))
-    robot.problem(robot.at(b=past), robot.at(a=1.0, b=past))
+    if past in (-0.32, 2.1):  # by less than a tenth of the range, as springs are pressed
+        robot.problem(robot.at(b=past), robot.at(a=1.0, b=past))
+        robot.problem(robot.at(b=past), robot.at(a=1.0))
+
+
+@pytest.mark.parametrize("past", [-1.0, -0.54, 2.24, 57.0, -1e6])
+def test_a_start_far_past_the_limits_of_a_joint_is_refused(past: float) -> None:
+    """The range is 2.3 rad; 0.23 rad past it, as springs are, and where the MJCF itself has the joint it is not."""
+    robot = elbow(1.0, -0.3)
+    degrees = f"{-0.3 * 180 / np.pi:.4g} to {360 / np.pi:.4g}"
+    wanted = rf"got {re.escape(f'{past:.4g}')} rad for b, want .* -0.3 to 2 rad \({degrees} degrees\)$"
+    for goal in (robot.at(), robot.at(b=past), robot.at(a=1.0, b=past)):
+        with pytest.raises(InputError, match=f"^start: {wanted}"):
+            robot.problem(robot.at(b=past), goal)
+    key = f'<keyframe><key name="past" qpos="0.2 {past!r}"/></keyframe></mujoco>'
+    stated = ls.MjcfRobot(scene_from_xml(robot.scene.xml.replace("</mujoco>", key), "arm"))
+    stated.problem(stated.at("past"), stated.at())
+    stated.problem(stated.at("past", a=0.0), stated.at("past"))
+    with pytest.raises(InputError, match="start: got 30 rad for b"):
+        stated.problem(stated.at("past", b=30.0), stated.at())
+
+
+def test_a_start_that_mujoco_cannot_leave_is_said_to_be_past_the_limits() -> None:
+    """The first state is not finite either, but it is not the cause."""
+    robot = elbow(1.0, -0.3)
+    far = robot.at(b=1e12)
+    assert not np.isfinite(robot.dynamics.step(far, np.zeros(2), 0.02)).any()
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=5, initial=ls.FixedState(far), stage_cost=ls.ControlCost([1.0, 1.0]),
+        final_cost=ls.QuadraticCost(np.ones(4), about=robot.at()),
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"no finite state follows the start: got 1e\+12 rad for b, want .* -0.3 to 2"):
+        ls.smooth(problem)
 
 
 def test_what_is_amiss_at_rest_is_said() -> None:

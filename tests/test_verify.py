@@ -366,7 +366,12 @@ TILTING = '<joint name="tilt" axis="0 1 0" damping=".1" armature=".01"/>'
 FOLLOWED = {
     "the followed geom": ("", HEAD + LENS["ball"], "", "lens"),
     "another of its body": ("", HEAD + LENS["mesh"], "", "head"),
-    "one that cannot collide": ("", HEAD.replace("mass", 'contype="0" conaffinity="0" mass') + LENS["mesh"], "", "head"),
+    "one that cannot collide": (
+        "",
+        HEAD.replace("mass", 'contype="0" conaffinity="0" mass') + LENS["mesh"],
+        "",
+        "head",
+    ),
     "one of a body that carries it": (HEAD, LENS["mesh"], "", "head"),
     "one of a body that it carries": ("", LENS["mesh"], HEAD, "head"),
     "none": ("", LENS["mesh"], "", ""),

@@ -240,6 +240,10 @@ class Dynamics:
         """
         return False
 
+    def cause_of_failure(self, state: Array) -> str | None:
+        """Why a step from a state (n,) is not finite, as the end of a message; None if that is unknown."""
+        return None
+
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
         """The dynamics with softer contacts and limits, in several degrees with their names, the softest first.
 
