@@ -92,6 +92,7 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
     speeds = np.linalg.norm(solution.trajectory.states[:, 2:], axis=1)
     assert speeds.max() < 1.05
     assert "puck" not in robots.names()
+    assert names["robot"].dynamics is names["robot"].dynamics  # made once
 
     page = (DOCS / "adding_a_robot.md").read_text(encoding="utf-8")
     (tmp_path / "rink.py").write_text("\n".join(BLOCK.findall(page)), encoding="utf-8")
