@@ -241,7 +241,14 @@ class Dynamics:
         return False
 
     def cause_of_failure(self, state: Array) -> str | None:
-        """Why a step from a state (n,) is not finite, as the end of a message; None if that is unknown."""
+        """Why a step from a state is not finite, as the end of a message.
+
+        Args:
+          state: (n,).
+
+        Returns:
+          The cause; None if it is unknown.
+        """
         return None
 
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
