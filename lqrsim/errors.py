@@ -11,6 +11,8 @@ import itertools
 import math
 import os
 import re
+import sysconfig
+import types
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -387,10 +389,28 @@ def without_addresses(text: str) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """An exception as one printable line for a message: its type and text."""
+    """An exception as one printable line for a message: its type and text, and where it is in a user's file."""
     try:
         text = " ".join(str(error).split())
     except Exception:  # raised by its own __str__
         text = ""
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:500])
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+    where = _line_of_user(error.__traceback__)
+    return (f"{type(error).__name__}: {text}" if text else type(error).__name__) + (f" ({where})" if where else "")
+
+
+_NOT_USERS = tuple(
+    os.path.join(os.path.realpath(folder), "")
+    for folder in (os.path.dirname(__file__), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+)
+
+
+def _line_of_user(trace: types.TracebackType | None) -> str:
+    """The innermost line of a traceback that is in no package and not in Python's library; empty if there is none."""
+    where = ""
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if os.path.isfile(file) and not os.path.realpath(file).startswith(_NOT_USERS):
+            where = f"{os.path.basename(file)}, line {trace.tb_lineno}"
+        trace = trace.tb_next
+    return "".join(letter if letter.isprintable() else "?" for letter in where)

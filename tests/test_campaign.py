@@ -55,6 +55,8 @@ class Trouble(Disturbance):
             if step == 10 and bad.any():
                 if self.kind == "raise":
                     raise RuntimeError("two\\nlines")
+                if self.kind == "shapes":
+                    np.stack([np.zeros(2), np.zeros(3)])
                 if self.kind == "sleep":
                     time.sleep(600)
                 if self.kind == "die":
@@ -303,11 +305,28 @@ def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> No
     reasons = results.reasons(cell)
     table = results.outcomes(cell)
     assert 0 < len(reasons) < 6
-    assert set(reasons.values()) == {"RuntimeError: two lines"}
+    said = f"RuntimeError: two lines ({own.name}, line {line_of('raise RuntimeError')})"
+    assert set(reasons.values()) == {said}
     assert sorted(reasons) == np.flatnonzero(table.outcome == "error").tolist()
     assert results.tally(cell)["reached"] == 24 - len(reasons)
     assert np.isnan(table.worst[sorted(reasons)]).all()
-    assert f"{len(reasons)} trials came to nothing: RuntimeError: two lines" in results.summary()
+    assert f"{len(reasons)} trials came to nothing: {said}" in results.summary()
+
+
+def line_of(text: str) -> int:
+    return next(number for number, line in enumerate(OWN.splitlines(), 1) if text in line)
+
+
+def test_where_every_trial_fails_the_line_is_named_and_no_disturbance_blamed(own: Path, tmp_path: Path) -> None:
+    """The error is NumPy's, in a line of the user's; nothing was run, so that no run is alike."""
+    campaign = troubled(own, "shapes,share=1.0")
+    results = run_campaign(replace(campaign, sweeps={"light": campaign.sweeps["own"]}), tmp_path, workers=0)
+    summary = results.summary()
+    where = f"({own.name}, line {line_of('np.stack')})"
+    assert f"24 trials came to nothing: ValueError: all input arrays must have the same shape {where}" in summary
+    assert "alone: --sweep" not in summary
+    assert "deterministic" not in summary
+    assert "0/24" in summary
 
 
 @LINUX

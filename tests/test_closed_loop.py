@@ -378,6 +378,21 @@ def test_a_robot_whose_names_are_none_is_told(tmp_path, fields, message):
         Plant(robot, load_scene(tmp_path / "ice.xml"))
 
 
+@pytest.mark.parametrize(
+    ("radius", "message"),
+    [
+        (-1.0, "robot sled: radius: got -1.0, want a finite number >= 0"),
+        (None, "robot sled: radius: got none, want a number >= 0, in m: .* its size in pictures"),
+    ],
+)
+def test_a_robot_without_a_radius_is_told_what_it_is_for(tmp_path, radius, message):
+    (tmp_path / "ice.xml").write_text(SLED)
+    robot = Sled()
+    vars(robot)["radius"] = radius
+    with pytest.raises(InputError, match=message):
+        Plant(robot, load_scene(tmp_path / "ice.xml"))
+
+
 def test_a_model_that_sleeps_is_told(tmp_path):
     (tmp_path / "ice.xml").write_text(
         SLED.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1)

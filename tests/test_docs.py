@@ -92,6 +92,7 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
     speeds = np.linalg.norm(solution.trajectory.states[:, 2:], axis=1)
     assert speeds.max() < 1.05
     assert "puck" not in robots.names()
+    assert names["robot"].dynamics is names["robot"].dynamics  # made once
 
     page = (DOCS / "adding_a_robot.md").read_text(encoding="utf-8")
     (tmp_path / "rink.py").write_text("\n".join(BLOCK.findall(page)), encoding="utf-8")
@@ -143,8 +144,19 @@ def test_an_arm_goes_round_a_post(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.long
-def test_one_system_at_three_levels() -> None:
+def test_one_system_at_three_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     names = run_page("stating_a_system.md")
+    # A plan that depends on time runs in MuJoCo: its clock is exact, and the mass follows the sine as is planned.
+    followed = names["followed"]
+    assert followed.outcome == ("reached",) * 3
+    np.testing.assert_allclose(followed.states[:, :, 2], np.tile(followed.times, (3, 1)), rtol=0, atol=1e-12)
+    assert np.abs(followed.states[:, :, 0] - np.sin(followed.times)).max() < 0.03
+    found = ls.check_plant(names["plant"].robot, names["plant"].scene, controls=([-2.0], [2.0]))
+    assert found.good
+    by_joint = ls.MjcfRobot("rail.xml")
+    after = by_joint.dynamics.step(by_joint.at(place_velocity=0.3, clock_velocity=1.0), [2.0], 0.5)
+    np.testing.assert_allclose(after, [0.4, 0.5, 1.3, 1.0], rtol=0, atol=1e-12)
     assert names["solution"].status is names["same"].status is ls.Status.CONVERGED
     # The compiled statement has central differences: eight digits of a derivative, twice that of a minimum.
     assert names["same"].cost == pytest.approx(names["solution"].cost, rel=1e-7)

@@ -715,8 +715,9 @@ def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
         results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)
         table = results.outcomes(results.cells[0])
         np.testing.assert_array_equal(table.outcome == "error", beyond)
+        line = some.__code__.co_firstlineno + 3
         assert set(results.reasons(results.cells[0]).values()) == {
-            "controller at 0.2333 s: ValueError: too far to the side"
+            f"controller at 0.2333 s: ValueError: too far to the side ({Path(__file__).name}, line {line})"
         }
         files.append([path.read_bytes() for path in sorted((tmp_path / str(batch) / "shards").iterdir())])
     assert files[0] == files[1]

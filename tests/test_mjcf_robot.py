@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import signal
 import threading
 import time
@@ -318,6 +319,17 @@ def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) 
     if model.na:
         named = robot.at(None, **angles, first_activation=0.25)
         np.testing.assert_array_equal(named, [*state[:4], 0.25, state[5]])
+    keys = {"bare": "", "driven": 'ctrl="0.2 -0.1"'} | ({"set": 'act="0.3 0"', "zero": 'act="0 0"'} if model.na else {})
+    places = " ".join(repr(float(angle)) for angle in angles.values())
+    frames = "".join(f'<key name="{name}" qpos="{places}" {more}/>' for name, more in keys.items())
+    other = ls.MjcfRobot(scene_from_xml(xml.replace("</mujoco>", f"<keyframe>{frames}</keyframe></mujoco>"), "arm"))
+    acts = {"set": [0.3, 0.0], "zero": [0.0, 0.0]}  # a keyframe that states none has those that hold the robot
+    for name in keys:
+        wanted = [*state[:4], *acts.get(name, state[4:])]
+        np.testing.assert_allclose(other.at(name), wanted, rtol=0, atol=1e-12)
+        if model.na:
+            changed = other.at(name, second_activation=0.5)
+            np.testing.assert_allclose(changed, [*wanted[:5], 0.5], rtol=0, atol=1e-12)
 
 
 @settings(max_examples=examples(10), deadline=None)
@@ -682,7 +694,39 @@ def test_a_goal_past_the_limits_of_a_joint_is_refused(past: float) -> None:
         robot.problem(robot.at(), robot.at(b=past))
     for fine in (-0.3, 2.0):
         robot.problem(robot.at(), robot.at(b=fine))
-    robot.problem(robot.at(b=past), robot.at(a=1.0, b=past))
+    if past in (-0.32, 2.1):  # by less than a tenth of the range, as springs are pressed
+        robot.problem(robot.at(b=past), robot.at(a=1.0, b=past))
+        robot.problem(robot.at(b=past), robot.at(a=1.0))
+
+
+@pytest.mark.parametrize("past", [-1.0, -0.54, 2.24, 57.0, -1e6])
+def test_a_start_far_past_the_limits_of_a_joint_is_refused(past: float) -> None:
+    """The range is 2.3 rad; 0.23 rad past it, as springs are, and where the MJCF itself has the joint it is not."""
+    robot = elbow(1.0, -0.3)
+    degrees = f"{-0.3 * 180 / np.pi:.4g} to {360 / np.pi:.4g}"
+    wanted = rf"got {re.escape(f'{past:.4g}')} rad for b, want .* -0.3 to 2 rad \({degrees} degrees\)$"
+    for goal in (robot.at(), robot.at(b=past), robot.at(a=1.0, b=past)):
+        with pytest.raises(InputError, match=f"^start: {wanted}"):
+            robot.problem(robot.at(b=past), goal)
+    key = f'<keyframe><key name="past" qpos="0.2 {past!r}"/></keyframe></mujoco>'
+    stated = ls.MjcfRobot(scene_from_xml(robot.scene.xml.replace("</mujoco>", key), "arm"))
+    stated.problem(stated.at("past"), stated.at())
+    stated.problem(stated.at("past", a=0.0), stated.at("past"))
+    with pytest.raises(InputError, match="start: got 30 rad for b"):
+        stated.problem(stated.at("past", b=30.0), stated.at())
+
+
+def test_a_start_that_mujoco_cannot_leave_is_said_to_be_past_the_limits() -> None:
+    """The first state is not finite either, but it is not the cause."""
+    robot = elbow(1.0, -0.3)
+    far = robot.at(b=1e12)
+    assert not np.isfinite(robot.dynamics.step(far, np.zeros(2), 0.02)).any()
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=5, initial=ls.FixedState(far), stage_cost=ls.ControlCost([1.0, 1.0]),
+        final_cost=ls.QuadraticCost(np.ones(4), about=robot.at()),
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"no finite state follows the start: got 1e\+12 rad for b, want .* -0.3 to 2"):
+        ls.smooth(problem)
 
 
 def test_what_is_amiss_at_rest_is_said() -> None:

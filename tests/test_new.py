@@ -1,17 +1,21 @@
 """`lqrsim new`: what it writes works as it is, by the commands that it prints."""
 
+import dataclasses
 import os
+import pickle
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands.creating import TEMPLATES
+from lqrsim.templates.my_robot.my_robot import MyRobot
 from lqrsim.view import gl
 
 ROOT = Path(__file__).parent.parent
@@ -82,6 +86,17 @@ def test_what_is_there_is_kept(
     assert not list((tmp_path / "out" / "kept_disc").iterdir())
     assert main(["new", "other", "--out", "out"]) == 0
     assert "lqrsim solve out/other/other.py:scenario" in capsys.readouterr().out
+
+
+def test_the_robot_of_the_template_makes_its_dynamics_once() -> None:
+    """Also in another process, where it is made anew."""
+    robot = MyRobot(mass=0.7)
+    assert robot.dynamics is robot.dynamics
+    assert robot.dynamics.parameters["mass"] == 0.7
+    assert dataclasses.replace(robot, mass=0.9).dynamics.parameters["mass"] == 0.9
+    step = robot.dynamics.step(np.zeros(4), np.ones(2), 0.1)
+    there = pickle.loads(pickle.dumps(robot))
+    np.testing.assert_array_equal(there.dynamics.step(np.zeros(4), np.ones(2), 0.1), step)
 
 
 def test_the_template_is_checked_as_the_package_is() -> None:

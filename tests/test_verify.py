@@ -355,6 +355,60 @@ def test_a_rod_that_is_too_thin_is_said_to_be(short: ls.Rollout, monkeypatch: py
     assert found.likely.startswith("the geom is too thin to be seen")
 
 
+SOLID = '<asset><mesh name="solid" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>'  # no symmetric silhouette
+HEAD = '<geom name="head" type="box" size=".12 .05 .04" mass="1"/>'
+LENS = {
+    "ball": '<geom name="lens" type="sphere" pos=".5 0 0" size=".03" mass=".1" contype="0" conaffinity="0"/>',
+    "mesh": '<geom name="lens" type="mesh" mesh="solid" pos=".5 0 0" mass=".1"/>',
+}
+TILTING = '<joint name="tilt" axis="0 1 0" damping=".1" armature=".01"/>'
+# Geoms of a mount that turns, of the mount's head that tilts, and of what the head carries; the geom to be drawn.
+FOLLOWED = {
+    "the followed geom": ("", HEAD + LENS["ball"], "", "lens"),
+    "another of its body": ("", HEAD + LENS["mesh"], "", "head"),
+    "one that cannot collide": (
+        "",
+        HEAD.replace("mass", 'contype="0" conaffinity="0" mass') + LENS["mesh"],
+        "",
+        "head",
+    ),
+    "one of a body that carries it": (HEAD, LENS["mesh"], "", "head"),
+    "one of a body that it carries": ("", LENS["mesh"], HEAD, "head"),
+    "none": ("", LENS["mesh"], "", ""),
+}
+
+
+@pytest.mark.parametrize("kind", list(FOLLOWED))
+def test_a_robot_without_position_or_balls_is_measured_by_a_geom_that_is_whole_in_the_picture(
+    kind: str, tmp_path: Path
+) -> None:
+    """Within a 60th of the radius, which the page promises, of the lens as MuJoCo places it."""
+    mount, head, carried, drawn = FOLLOWED[kind]
+    (tmp_path / "scene.xml").write_text(f"""<mujoco><option timestep="0.005" gravity="0 0 0"/>{SOLID}<worldbody>
+      <geom name="table" type="box" size=".1 .1 .1" pos="0 0 -2"/>
+      <body name="mount"><joint name="pan" axis="0 0 1" damping=".1" armature=".01"/>
+      <inertial pos="0 0 0" mass=".5" diaginertia=".01 .01 .01"/>{mount}
+      <body name="camera">{TILTING}{head}<body name="hung" pos="-.1 0 0">{carried}</body></body></body></worldbody>
+      <actuator><motor joint="pan"/><motor joint="tilt"/></actuator></mujoco>""")
+    robot = ls.MjcfRobot(tmp_path / "scene.xml", body="mount", outline=False, radius=0.05)
+    problem = robot.problem(robot.at(), robot.at(pan=0.6, tilt=0.4), steps=16)
+    run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=3, starts=1), seed=0)
+    if not drawn:
+        with pytest.raises(ls.InputError, match="got no geom to track"):
+            ls.verify_run(run)
+        return
+    found = ls.verify_run(run)
+    assert found.passed, found.summary()
+    assert f"the silhouette of {drawn} in" in found.method
+    data = mujoco.MjData(model := checks.drawable_model(run, 0))
+    for seen, frame in zip(found.seen, run.frames[0, checks.frames_at_states(run, 0)[1]], strict=True):
+        data.qpos[:] = frame
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(seen, data.geom("lens").xpos, rtol=0, atol=0.05 / 60)
+    late = dataclasses.replace(run, frames=np.roll(run.frames, run.frames.shape[1] // 10, axis=1))
+    assert "position" in failed(ls.verify_run(late))
+
+
 @settings(max_examples=examples(200), deadline=None)
 @given(
     thickness=st.floats(1.0, 16.0), length=st.floats(20.0, 90.0), angle=st.floats(0.0, np.pi),

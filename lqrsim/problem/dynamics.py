@@ -240,6 +240,17 @@ class Dynamics:
         """
         return False
 
+    def cause_of_failure(self, state: Array) -> str | None:
+        """Why a step from a state is not finite, as the end of a message.
+
+        Args:
+          state: (n,).
+
+        Returns:
+          The cause; None if it is unknown.
+        """
+        return None
+
     def softened(self, states: Array) -> Iterator[tuple[str, "Dynamics"]]:
         """The dynamics with softer contacts and limits, in several degrees with their names, the softest first.
 

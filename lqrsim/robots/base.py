@@ -26,7 +26,8 @@ class Robot(abc.ABC):
       wheels: the geoms in the MJCF that are the treads of its wheels, each on its own body; none by default.
       drag: linear drag against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
-      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball.
+      radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball. For
+        a robot with neither a position nor balls its size in pictures.
       balls: the colliding balls, in place of `radius`, for a robot of more than one ball or without a position. None by
         default. With balls, the radius is the size of the robot in pictures, and the distance from the goal within
         which the robot has reached it.
@@ -55,7 +56,10 @@ class Robot(abc.ABC):
     @property
     @abc.abstractmethod
     def dynamics(self) -> "Dynamics":
-        """The analytic model `xdot = f(x, u)` that policies are computed from."""
+        """The analytic model `xdot = f(x, u)` that policies are computed from.
+
+        It is read often: make it once, such as with `functools.cached_property`.
+        """
 
     @abc.abstractmethod
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:

@@ -317,12 +317,13 @@ class MjcfRobot(Robot):
           The Problem.
 
         Raises:
-          InputError: an argument is not as described, or the goal moves a joint past its limits.
+          InputError: an argument is not as described; the goal moves a joint past its limits; or the start has one past
+            them by more than a tenth of its range, unless it is there in the MJCF's rest or in a keyframe.
         """
         dynamics, model = self.dynamics, self.dynamics.physics.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
-        self._check_goal(start, goal)
+        self._check_limits(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(model, self._numbers) ** -2.0 if effort is None else effort
@@ -348,19 +349,22 @@ class MjcfRobot(Robot):
             constraints=kept,
         )  # fmt: skip
 
-    def _check_goal(self, start: Array, goal: Array) -> None:
-        """Raises InputError for a goal that moves a joint past its limits."""
-        names = self.dynamics.state_coordinates.names
+    def _check_limits(self, start: Array, goal: Array) -> None:
+        """Raises InputError for a goal that moves a joint past its limits, or a start far past them.
+
+        Limits are springs, and an MJCF may itself be past them at rest or in a keyframe.
+        """
+        model = self.scene.model
         for one in self._joints:
-            if one.limits is None or goal[one.dof] == start[one.dof]:
+            if one.limits is None:
                 continue
-            least, most = one.limits
-            if not least - _PAST * (most - least) <= goal[one.dof] <= most + _PAST * (most - least):
-                unit, more = "m", ""
-                if one.kind == "hinge":
-                    unit, more = "rad", f" ({np.degrees(least):.4g} to {np.degrees(most):.4g} degrees)"
-                wanted = f"want the joint within its limits in the MJCF, {least:.4g} to {most:.4g} {unit}{more}"
-                raise InputError(f"goal: got {goal[one.dof]:.4g} {unit} for {names[one.dof]}, {wanted}")
+            stated = [model.qpos0[one.qpos.start], *model.key_qpos[:, one.qpos.start]]
+            if not np.isclose(start[one.dof], stated, rtol=0, atol=1e-9).any() and (
+                said := one.past_limits(start[one.dof], mjcf_joints.FAR_PAST)
+            ):
+                raise InputError(f"start: {said}")
+            if goal[one.dof] != start[one.dof] and (said := one.past_limits(goal[one.dof], _PAST)):
+                raise InputError(f"goal: {said}")
 
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
         """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
@@ -442,7 +446,7 @@ class MjcfRobot(Robot):
 
         A joint that an equality constraint couples to another follows it, unless it is named. The joints of a closed
         loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of actuators are
-        those that hold the robot, unless they are named or given by the keyframe.
+        those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -457,11 +461,11 @@ class MjcfRobot(Robot):
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
         if keyframe is None:
-            qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), np.zeros(model.na)
+            qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), None
         else:
-            qpos, qvel, act = mjcf_joints.keyframe(model, keyframe, who)
+            qpos, qvel, act = mjcf_joints.keyframe(model, self.scene.xml, keyframe, who)
         state[: 2 * model.nv] = self.state(qpos, qvel)[: 2 * model.nv]
-        state[2 * model.nv :] = act
+        state[2 * model.nv :] = 0.0 if act is None else act
         names = self.dynamics.state_coordinates.names
         for name, value in values.items():
             state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
@@ -470,7 +474,7 @@ class MjcfRobot(Robot):
                 state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
         if (keyframe is None or values) and mjcf_joints.loops_of(model):
             state[: model.nv] = self._closed(state, qpos, values)
-        if self.activations and keyframe is None:
+        if self.activations and act is None:
             unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
             state[unnamed] = self._held(state).activations[np.array(unnamed, dtype=np.intp) - 2 * model.nv]
         return state

@@ -21,6 +21,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
+from lqrsim.scenes.mjcf_joints import FAR_PAST, joints_of
 from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches
 from lqrsim.scenes.scene import unlogged
@@ -150,6 +151,10 @@ class MjcfDynamics(Dynamics):
 
     def touches(self, states: Array) -> bool:
         return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
+
+    def cause_of_failure(self, state: Array) -> str | None:
+        found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in joints_of(self.physics.model))
+        return next((said for said in found if said), None)
 
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
         if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):

@@ -20,6 +20,9 @@ _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
+FAR_PAST = 0.1  # fraction of a joint's range; springs of limits give way by less
+
+
 @dataclass(frozen=True)
 class Joint:
     """A joint.
@@ -39,6 +42,19 @@ class Joint:
     def dof(self) -> int:
         """The first of its indices in qvel; a slide or hinge has only this index."""
         return self.dofs.start
+
+    def past_limits(self, position: float, share: float) -> str | None:
+        """What a message says of a position past the joint's limits by more than a share of its range; else None."""
+        if self.limits is None:
+            return None
+        least, most = self.limits
+        if least - share * (most - least) <= position <= most + share * (most - least):
+            return None
+        unit, more = "m", ""
+        if self.kind == "hinge":
+            unit, more = "rad", f" ({np.degrees(least):.4g} to {np.degrees(most):.4g} degrees)"
+        wanted = f"want the joint within its limits in the MJCF, {least:.4g} to {most:.4g} {unit}{more}"
+        return f"got {position:.4g} {unit} for {self.name}, {wanted}"
 
 
 @dataclass(frozen=True)
@@ -277,11 +293,17 @@ def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
     return next((number for number in moving if masses[number] > 0), moving[0])
 
 
-def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array, Array]:
-    """qpos, qvel and act of a keyframe. Raises InputError if there is none of that name."""
+def keyframe(model: mujoco.MjModel, xml: str, name: str, what: str) -> tuple[Array, Array, Array | None]:
+    """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, for which the model has zeros.
+
+    Raises:
+      InputError: there is no keyframe of that name.
+    """
     names = [model.key(number).name for number in range(model.nkey)]
     number = names.index(check_name(f"{what}: keyframe", name, names))
-    return model.key_qpos[number].copy(), model.key_qvel[number].copy(), model.key_act[number].copy()
+    stated = model.na > 0 and len(mujoco.MjSpec.from_string(xml).keys[number].act) > 0
+    act = model.key_act[number].copy() if stated else None
+    return model.key_qpos[number].copy(), model.key_qvel[number].copy(), act
 
 
 def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:

@@ -26,7 +26,10 @@ def check_names(robot: Robot, scene: Scene) -> None:
 
     Its radius and its drag must not be negative, and its balls must be CollisionSpheres.
     """
-    check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
+    if getattr(robot, "radius", None) is None:
+        size = "of its collision circle or ball; without position and balls, its size in pictures"
+        raise InputError(f"robot {robot.name}: radius: got none, want a number >= 0, in m: {size}")
+    check_number(f"robot {robot.name}: radius", robot.radius, at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
     check_kind(
         f"robot {robot.name}: balls",

@@ -70,8 +70,8 @@ def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -
 
 
 def alike(outcomes: Outcomes) -> bool:
-    """Whether there are several trials, and all are the same run."""
-    if len(_checked(outcomes)) < 2:
+    """Whether there are several trials, and all are the same run. Trials of which nothing was simulated are none."""
+    if len(_checked(outcomes)) < 2 or np.isnan(outcomes.ended).any():
         return False
     numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
     same = all(np.array_equal(one, np.full_like(one, one[0]), equal_nan=True) for one in numbers)

@@ -174,10 +174,13 @@ class Results:
         return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def hints(self) -> list[str]:
-        """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance."""
+        """A line for each preset under which no trial reached the goal: a way to find the responsible disturbance.
+
+        Trials that ended with an error do not count.
+        """
         reached: dict[str, int] = {}
         for cell, ends, found in self.cell_successes():
-            if found is not None and cell.strength > 0:
+            if found is not None and cell.strength > 0 and ends["error"] < ends.total():
                 reached[cell.sweep] = reached.get(cell.sweep, 0) + ends["reached"]
         sweeps = self.manifest["campaign"]["sweeps"]
         kinds = {name: [f"{name}:{one['kind']}" for one in sweeps[name]] for name in reached if name in PRESETS}

@@ -127,9 +127,9 @@ def verify_run(
     """Draw the frames of a rollout, read positions from the pixels, and compare them with its states.
 
     Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
-    plane, and from both if it moves in space. The pictures are segmentations that show only a part of the robot that
-    can collide, like X-rays, in which obstacles hide nothing. For a robot without a position, the position of its last
-    ball is read.
+    plane, and from both if it moves in space. The pictures are segmentations that show only one geom of the robot, like
+    X-rays, in which obstacles hide nothing, and all of it is in each picture. For a robot without a position, the
+    position of its last ball is read, or of its outermost geom if it has no balls.
 
     Args:
       rollout: rollout of `simulate`, with frames.
@@ -142,16 +142,21 @@ def verify_run(
     """
     check_arguments(solution, progress)
     model = drawable_model(rollout, trial)
-    body = robot_body(model, rollout.body)
+    body, place = robot_body(model, rollout.body), None
     if rollout.balls is not None and not rollout.state_coordinates.position:
-        body = rollout.balls.tracked[0]
-    geom = _tracked_geom(model, body)
-    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout.plane)]
+        body, place = rollout.balls.tracked
+    geom = _tracked_geom(model, body, place)
     times, rows = frames_at_states(rollout, trial)
+    around = _corners(model, geom, rollout.frames[trial, rows])
+    makers = {"top": cameras.top, "side": cameras.side}
+    views = [makers[name](rollout, around=around) for name in cameras.measuring(rollout.plane)]
     measured: list[Array] = []
     offsets: list[Array] = []
     thickness = _thickness(model, geom, rollout.frames[trial, rows], views)
-    finer = 1 if thickness >= THIN else int(np.clip(np.ceil(FILLED / thickness), 1, FINEST))
+    bound, wanted = DRAWN_BOUND * rollout.radius, 1.0 if thickness >= THIN else FILLED / thickness
+    if model.geom_type[geom] == Geom.mjGEOM_BOX:  # it may lie along the pixels, and be drawn half of one too long
+        wanted = max(wanted, max(view.height for view in views) / SIZE[1] / 2 / max(bound, 1e-9))
+    finer = int(np.clip(np.ceil(wanted), 1, FINEST))
     size, centre = (finer * SIZE[0], finer * SIZE[1]), mask_centre if thickness >= THIN else mask_middle
     for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views, size):
         measured.append(np.array([view.measure(centre(mask), size) for view, mask in zip(views, masks, strict=True)]))
@@ -176,22 +181,50 @@ def verify_run(
         f"the silhouette of {name} in {size[0]} x {size[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
         positions,
-        bound=DRAWN_BOUND * rollout.radius,
+        bound=bound,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
         others=tuple(others),
     )
 
 
-def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
-    """The largest geom of the robot's body that can collide and has a symmetric silhouette."""
-    kinds = [kind.value for kind in SYMMETRIC_KINDS]
-    fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
-    fits &= (model.geom_contype | model.geom_conaffinity) != 0
-    if not fits.any():
+def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) -> int:
+    """The geom to draw: one that has a symmetric silhouette.
+
+    The one about `place`, the followed point on the body (3,), is the best: its picture shows nothing but that point.
+    Else the largest one of the body that can collide; else of the body; else of the bodies that carry it, the nearest
+    first; else of any other body of the robot.
+    """
+    carriers, above = [body], body
+    while above := int(model.body_parentid[above]):
+        carriers.append(above)
+    nearness = {int(model.body_weldid[one]): level for level, one in reversed([*enumerate(carriers)])}
+    best: tuple[tuple[bool, int, bool, float], int] | None = None
+    for geom in np.flatnonzero(np.isin(model.geom_type, [kind.value for kind in SYMMETRIC_KINDS])).tolist():
+        own, welded = int(model.geom_bodyid[geom]), int(model.body_weldid[model.geom_bodyid[geom]])
+        if own != body and (welded == 0 or model.body_rootid[own] != model.body_rootid[body]):
+            continue
+        followed = place is not None and own == body and np.allclose(model.geom_pos[geom], place, rtol=0, atol=1e-9)
+        collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
+        level = 0 if own == body else 1 + nearness.get(welded, len(carriers))
+        rank = (not followed, level, not collides, -float(model.geom_rbound[geom]))
+        if best is None or (rank, geom) < best:
+            best = rank, geom
+    if best is None:
         raise InputError(
             "rollout.model: got no geom to track, want a sphere, capsule, ellipsoid, cylinder or box of the robot"
         )
-    return int(np.argmax(np.where(fits, model.geom_rbound, -1)))
+    return best[1]
+
+
+def _corners(model: mujoco.MjModel, geom: int, frames: Array) -> Array:
+    """The lowest and the highest corner (2, 3) of a box in the world that has a geom in it in all frames (N, nq)."""
+    data, places = mujoco.MjData(model), []
+    for frame in frames:
+        data.qpos = frame
+        mujoco.mj_kinematics(model, data)
+        places.append(data.geom_xpos[geom].copy())
+    reach = float(model.geom_rbound[geom])
+    return np.stack([np.min(places, axis=0) - reach, np.max(places, axis=0) + reach])
 
 
 def _thickness(model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[Camera]) -> float:

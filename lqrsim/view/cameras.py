@@ -75,16 +75,20 @@ class Camera:
         return self.axes @ self.position + off * (self.height / size[1])
 
 
-def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
-    """A camera above that shows the plan and all trials with a margin, in a picture of this aspect ratio."""
-    low, high = _bounds(rollout)
+def top(rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
+    """A camera above that shows the plan and all trials with a margin, in a picture of this aspect ratio.
+
+    Args:
+      around: corners (k, 3) of what is shown as well, in metres.
+    """
+    low, high = _bounds(rollout, around)
     right = _right(high - low, aspect)
     return _camera("top", low, high, right, np.cross([0.0, 0.0, 1.0], right), aspect)
 
 
-def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
+def side(rollout: Rollout, aspect: float = 4 / 3, *, around: Array | None = None) -> Camera:
     """A level camera at the side that shows the same, with the longer horizontal side across the picture."""
-    low, high = _bounds(rollout)
+    low, high = _bounds(rollout, around)
     plane = rollout.plane
     level = plane.replace("z", "")
     # A vertical plane is seen at a right angle.
@@ -106,17 +110,18 @@ def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect:
     return Camera(name, *vectors, height=height)
 
 
-def _bounds(rollout: Rollout) -> tuple[Array, Array]:
+def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array]:
     """The lowest and highest corner (3,) of the run with a margin; robots seen from above are at height zero.
 
-    A robot without a position counts with all of its balls.
+    A robot without a position counts with all of its balls. The points `around` (k, 3) need no margin.
     """
     places = np.vstack([rollout.planned_places, *(rollout.places(trial) for trial in range(rollout.trials))])
     if rollout.balls is not None and not rollout.state_coordinates.position:
         places = np.vstack([rollout.balls.planned.reshape(-1, 3), rollout.balls.driven.reshape(-1, 3)])
     low, high = (rollout.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
     margin = rollout.radius + 0.05 * float((high - low).max())
-    return low - margin, high + margin
+    corners = np.vstack([low - margin, high + margin, *([] if around is None else [around])])
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def _right(span: Array, aspect: float) -> Array:

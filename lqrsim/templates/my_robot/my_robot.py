@@ -4,6 +4,7 @@ Change the MJCF, the dynamics and the scenario to those of your robot; `test_my_
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,13 @@ import numpy as np
 import lqrsim as ls
 
 MJCF = Path(__file__).parent / "my_robot.xml"
+
+
+def rate(x: Any, u: Any, p: Any) -> list[Any]:
+    """The rate of the state under a control."""
+    force_x = u.push_x + p.force_x - p.damping * x.vx
+    force_y = u.push_y + p.force_y - p.damping * x.vy
+    return [x.vx, x.vy, force_x / p.mass, force_y / p.mass]
 
 
 @dataclass(frozen=True)
@@ -31,15 +39,9 @@ class MyRobot(ls.Robot):
     joints = ("slide_x", "slide_y")
     actuators = ("push_x", "push_y")
 
-    @property
-    def dynamics(self) -> ls.Dynamics:
-        """The rate of the state under a control; lqrsim derives the derivatives."""
-
-        def rate(x: Any, u: Any, p: Any) -> list[Any]:
-            force_x = u.push_x + p.force_x - p.damping * x.vx
-            force_y = u.push_y + p.force_y - p.damping * x.vy
-            return [x.vx, x.vy, force_x / p.mass, force_y / p.mass]
-
+    @cached_property  # it is read often
+    def dynamics(self) -> ls.Dynamics:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The model that plans are made with; lqrsim derives the derivatives of the rate."""
         return ls.Dynamics(
             rate,
             states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
