@@ -163,7 +163,7 @@ def test_failures_are_counted_without_levels() -> None:
     exact = stats.binomtest(k, n).proportion_ci(method="exact")
     one = found.probability
     assert (one.value, one.low, one.high) == pytest.approx((k / n, exact.low, exact.high))
-    assert stats.binomtest(k, n, stats.norm.sf(1.5)).pvalue > 1e-4
+    assert stats.binomtest(k, n, float(stats.norm.sf(1.5))).pvalue > 1e-4
 
 
 def test_repetitions_have_no_bias_and_the_standard_error_is_theirs() -> None:

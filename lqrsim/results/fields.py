@@ -55,10 +55,10 @@ class Bounds(NamedTuple):
 SHARE = Bounds(at_least=0.0, at_most=1.0)
 
 
-def repr_of(record: Any) -> str:
+def repr_of(self: Any) -> str:
     """The repr of a record, in which arrays of many numbers are their shapes: `__repr__ = repr_of`."""
-    parts = (f"{field.name}={brief(getattr(record, field.name))}" for field in fields(record))
-    return f"{type(record).__name__}({', '.join(parts)})"
+    parts = (f"{field.name}={brief(getattr(self, field.name))}" for field in fields(self))
+    return f"{type(self).__name__}({', '.join(parts)})"
 
 
 class Declared(NamedTuple):
