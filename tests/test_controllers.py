@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import re
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -217,3 +218,22 @@ def test_the_run_of_the_controller_stays_in_memory(plant: ls.Plant, drive_soluti
     assert isinstance(loaded, ls.Rollout)
     assert loaded.controller_run is None
     assert loaded.states.tobytes() == run.states.tobytes()
+
+
+def test_what_is_printed_has_shapes_and_no_addresses(
+    differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    """Policies, laws and tubes have tens of thousands of numbers."""
+    problem, plan, policy = differential_drive.problem, drive_solution.trajectory, drive_solution.policy
+    law = ls.OffsetFree(problem, drive_solution, STATED, tolerate=TOLERATE)
+    tube = ls.predict_tube(problem, drive_solution, STATED, law, samples=0)
+    records = [
+        policy, plan, law.policy, tube, drive_solution.cost_to_go, drive_solution.total_cost, law,
+        ls.Replanner(problem, drive_solution, every=1.0), ls.prepare(problem), differential_drive,
+        differential_drive.scene, differential_drive.plant(),
+    ]  # fmt: skip
+    for one in records:
+        assert re.fullmatch(rf"{type(one).__name__}\(.{{1,2000}}\)", str(one))
+        assert " at 0x" not in str(one)
+    assert f"gain=array {policy.gain.shape}" in str(policy)
+    assert f"states=array {plan.states.shape}" in str(plan)

@@ -87,6 +87,23 @@ def test_what_cannot_keep_constraints_is_left_out_and_said_so(
     assert html.escape(says) in (folder / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
 
 
+def test_policies_that_were_not_asked_for_are_not_said_to_be_left_out(
+    elsewhere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stress", "own file.py:walled", "--policies", "open_loop", *FEW]) == 0
+    assert "left out" not in capsys.readouterr().out
+
+
+def test_of_a_file_that_lacks_the_function_those_are_offered_that_can_be_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not what it imports, nor its helpers."""
+    text = "from dataclasses import dataclass\n\n\ndef rate(x, u, p):\n    return x\n\n\ndef camera(): ...\n"
+    (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    assert main(["solve", f"{tmp_path / 'own.py'}:camra"]) == 2
+    assert "got 'camra', want one of: camera (did you mean camera?)" in capsys.readouterr().err
+
+
 def test_asked_by_name_it_is_refused(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = "policies: got ilqr, which cannot keep the scenario's constraints, want some of smooth, open_loop, replan,"
     wanted += " track, offset_free"

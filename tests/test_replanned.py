@@ -273,7 +273,7 @@ def test_where_no_solve_succeeds_the_law_goes_on() -> None:
     [
         ({"latency": 2}, 1.0, "replan_every: got 1 with a latency of 2 and a delay of 0 periods, want None, or"),
         ({"delay": 1}, 1.0, "replan_every: got 1 with a latency of 0 and a delay of 1 periods, want None, or"),
-        ({}, 0.05, "OffsetFree: replan_every: got 0.05, want a finite number >= 0.0999"),
+        ({}, 0.05, "OffsetFree: replan_every: got 0.05 s, want at least a control period, 0.1 s"),
         ({}, "often", "OffsetFree: replan_every: got 'often', want"),
     ],
 )

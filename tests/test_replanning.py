@@ -277,7 +277,7 @@ class TestReplanner:
     @pytest.mark.parametrize(
         ("wrong", "line"),
         [
-            ({"every": 0.01}, r"every: got 0\.01, want a finite number >= 0\.033"),
+            ({"every": 0.01}, r"every: got 0\.01 s, want at least a control period, 0\.0333333 s"),
             ({"deadline": 1.1}, r"deadline: got 1\.1 s, 33 control periods, want at most every=1 s"),
             ({"deadline": -1.0}, "deadline: got -1"),
             ({"horizon": "fixed"}, "horizon: got 'fixed', want one of"),

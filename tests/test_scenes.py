@@ -1,6 +1,7 @@
 """The rule that makes obstacles of an MJCF, the packaged scenes, and what a bad file is told."""
 
 import time
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -190,6 +191,12 @@ def test_a_bad_file_is_told_in_one_line(scene_of, text, message):
     with pytest.raises(InputError, match=message) as caught:
         scene_of(text=text)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_with_nearly_that_name_is_offered(tmp_path: Path) -> None:
+    (tmp_path / "excavator.xml").write_text("<mujoco/>")
+    with pytest.raises(InputError, match=r"\(did you mean .*excavator\.xml\?\)$"):
+        load_scene(tmp_path / "excavater.xml")
 
 
 def test_an_unknown_scene_is_told_the_names():

@@ -230,7 +230,9 @@ class ReplanRule:
         if (plan.steps, plan.dt) != (problem.steps, problem.dt):
             got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
             raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")
-        self.every = check_number(f"{who}: {name}", every, at_least=0.999 * problem.dt)
+        self.every = check_number(f"{who}: {name}", every, above=0.0)
+        if self.every < 0.999 * problem.dt:
+            raise InputError(f"{who}: {name}: got {self.every:g} s, want at least a control period, {problem.dt:g} s")
         self.periods = round(self.every / problem.dt)
         deadline = max(problem.dt, at_least) if deadline is None else deadline
         self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)

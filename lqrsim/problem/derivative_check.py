@@ -54,7 +54,7 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
     with np.errstate(all="ignore"):
         for i, moved in enumerate(dynamics.step(x, u, problem.dt) if dynamics.discrete else dynamics.rate(x, u)):
             if not np.isfinite(moved):
-                if cause := dynamics.cause_of_failure(x):
+                if cause := dynamics._cause_of_failure(x):
                     raise InputError(f"{called}: no finite state follows the start: {cause}")
                 raise InputError(f"{called}: got {moved:g} as entry {i} ({names[i]}) {where}, want a finite number")
         columns = names, dynamics.control_coordinates.names

@@ -240,7 +240,7 @@ class Dynamics:
         """
         return False
 
-    def cause_of_failure(self, state: Array) -> str | None:
+    def _cause_of_failure(self, state: Array) -> str | None:
         """Why a step from a state is not finite, as the end of a message.
 
         Args:

@@ -152,7 +152,7 @@ class MjcfDynamics(Dynamics):
     def touches(self, states: Array) -> bool:
         return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
 
-    def cause_of_failure(self, state: Array) -> str | None:
+    def _cause_of_failure(self, state: Array) -> str | None:
         found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in joints_of(self.physics.model))
         return next((said for said in found if said), None)
 

@@ -117,7 +117,15 @@ def _own_function(target: str) -> Callable[..., object]:
     place, _, name = target.rpartition(":")  # the last colon: C:\robots\mine.py:hallway
     module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     functions = {key: value for key, value in vars(module).items() if inspect.isfunction(value) and key[0] != "_"}
-    return functions[check_name(f"function in {place}", name, functions)]
+    if name not in functions:  # offered are the module's own, those that need arguments only if there are no others
+        own = [key for key, one in functions.items() if one.__module__ == module.__name__]
+        check_name(f"function in {place}", name, [key for key in own if not _needs_arguments(functions[key])] or own)
+    return functions[name]
+
+
+def _needs_arguments(function: Callable[..., object]) -> bool:
+    parameters = inspect.signature(function).parameters.values()
+    return any(one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
 
 
 class _Uncached(SourceFileLoader):

@@ -16,6 +16,7 @@ not in the way of that robot.
 """
 
 import contextlib
+import difflib
 import math
 import os
 import re
@@ -143,7 +144,10 @@ def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
             raise InputError(f"{error}; or the path of an .xml file") from None
     elif not os.path.isfile(path):
         packaged = ", ".join(names())
-        raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
+        near = difflib.get_close_matches(path.name, [one.name for one in path.parent.glob("*.xml")], n=1)
+        hint = f" (did you mean {path.with_name(near[0])}?)" if near else ""
+        got = os.fspath(name_or_path)
+        raise InputError(f"scene: got {got!r}, want a file that exists, or one of: {packaged}{hint}")
     try:
         return path.stem, _flatten(path)
     except RecursionError:

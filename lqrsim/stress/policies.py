@@ -151,7 +151,9 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
 
 
 def left_out(policies: Sequence[str], impossible: Mapping[str, str]) -> str:
-    """A line with the impossible policies that were left out; empty if there are none."""
+    """A line with the impossible policies that were left out; empty if there are none, or policies were chosen."""
+    if {*policies} != {*DEFAULT_POLICIES} - {*impossible}:
+        return ""
     missing = [f"{policy}, {why}" for policy, why in impossible.items() if policy not in policies]
     return f"left out: {'; '.join(missing)}" if missing else ""
 
