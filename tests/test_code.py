@@ -1,7 +1,11 @@
-"""Test files stand alone."""
+"""Test files stand alone, and their types are right."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 TESTS = Path(__file__).parent
 
@@ -18,3 +22,11 @@ def test_no_test_file_imports_another() -> None:
                 assert first not in names, f"{path.name} imports {module}"
                 assert first != "tests", f"{path.name} imports {module}"
                 assert not rest or rest[-1] not in names, f"{path.name} imports {module}"
+
+
+@pytest.mark.long
+def test_types_of_tests() -> None:
+    """The types of everything else are a part of `run.py check`."""
+    command = [sys.executable, "-m", "basedpyright", "--pythonpath", sys.executable, "tests"]
+    done = subprocess.run(command, cwd=TESTS.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

@@ -113,6 +113,7 @@ def test_derivatives_of_a_softer_step_are_its_differences(kind: str, mass: float
         np.testing.assert_allclose(np.hstack([a, b])[:, k], want, rtol=0, atol=1e-5)
 
 
+@pytest.mark.long
 def test_a_plan_that_is_softened_again_comes_to_a_cheaper_optimum() -> None:
     robot = robot_of("leg", 2.0)
     problem = hop(robot)
