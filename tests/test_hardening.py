@@ -213,6 +213,18 @@ def test_ctrl_c_keeps_the_plans_that_are_measured(own: str) -> None:
             assert not found.success
 
 
+def test_ctrl_c_in_the_second_measurement_keeps_the_first(own: str, hardened: HardenedPlan) -> None:
+    def stop(done: int, total: int, found: str) -> None:
+        if "again" in found:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        ls.stress.harden(stated(own, solution=hardened.solution), **FEW, seed=50, progress=stop)
+    found = stopped.value.found  # pyright: ignore[reportAttributeAccessIssue]
+    assert (len(found.rounds), found.success) == (1, False)
+    np.testing.assert_array_equal(found.solution.trajectory.states, hardened.solution.trajectory.states)
+
+
 WORDS = ["--strength", "2", "--policy", "track", "--design-disturbances", "scenario", "--particles", "200",
          "--repetitions", "2", "--shown", "2"]  # fmt: skip
 

@@ -236,7 +236,9 @@ def harden(
             search.add(solution, measure(solution, what))
             say(f"{what}: {search.rounds[-1]}")
             if search.enough():
-                search.add(search.rounds.pop().solution, measure(solution, f"{what} again"))
+                again = measure(solution, f"{what} again")
+                search.rounds.pop()  # only now, so that Ctrl-C keeps it
+                search.add(solution, again)
                 say(f"{what} again, with fresh random numbers: {search.rounds[-1]}")
                 if search.enough():
                     break
