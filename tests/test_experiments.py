@@ -163,10 +163,11 @@ def test_benchmark_of_lags() -> None:
     """A small part: the template's disc does as well without its lag, and what is told of it is printed."""
     script = import_module("benchmark_lag")
     result = script.main(script.Config(robots=("my_robot",), presets=("light",), trials=3))
-    (row,) = result["rows"]
-    assert row["reached"] == [3] * 4
+    row, at_its_word = result["rows"]
+    assert row["reached"] == at_its_word["reached"] == [3] * 4
     assert row["periods"] == pytest.approx(0.48)
     assert 0 < row["told"] <= 1
+    assert at_its_word["told"] == 1
     assert [one.time_constant for one in script.with_lag([MotorLag(0.1)], 0.5)] == [0.05]
     assert "| my_robot, light | 0.48 |" in script.report(result)
 

@@ -8,8 +8,8 @@
 A command in a table is that of its row. Rows without one, and text, belong to the command that the paragraph above
 them names first. A number counts as printed if the command's output has it, rounded as on the page; the row of a
 table that stands as it was printed needs all of its numbers in one line. Whether it is the same quantity is for the
-reader to judge: build/numbers/ has each output, with the machine, the commit and the time that it took. A rerun at
-the same commit continues.
+reader to judge: build/numbers/ has each output, with the machine, the last commit that changed code, and the time that
+it took. A rerun continues if code is committed and has not changed.
 
 docs/results.md is not read: `lqrsim reproduce` writes it.
 
@@ -33,6 +33,7 @@ from lqrsim.machine import description
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "build" / "numbers"
+CODE = ("lqrsim", "models", "experiments", "tests/tools", "pyproject.toml")
 NAMED = re.compile(r"`((?:python (?:experiments|tests/tools)/|lqrsim (?:demo|(?:reproduce|solve|simulate) \S+))[^`]*)`")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
 
@@ -59,7 +60,7 @@ class Config:
     list: bool = False
     """Print the commands without running them."""
     again: bool = False
-    """Run a command also if its output at this commit is there."""
+    """Run a command also if its output, by the same code, is there."""
     folder: Path | None = None
     """What FOLDER stands for in a command; without it, commands that want one are left out, and named."""
 
@@ -141,9 +142,9 @@ def farthest(claim: Claim, output: str) -> float:
 
 
 def run(command: str, words: list[str], commit: str, *, again: bool) -> tuple[int, str]:
-    """The exit code and the output of a command, from an earlier run at this commit if there is one."""
+    """The exit code and the output of a command, from an earlier run of this code if there is one."""
     kept = OUT / (re.sub(r"[^\w]+", "_", command).strip("_") + ".txt")
-    if kept.is_file() and not again:
+    if kept.is_file() and not again and not commit.endswith("-dirty"):  # there are many of that name
         header, _, output = kept.read_text(encoding="utf-8").partition("\n\n")
         if f"commit: {commit}\n" in header and "exit code: 0\n" in header:
             return 0, output
@@ -157,6 +158,16 @@ def run(command: str, words: list[str], commit: str, *, again: bool) -> tuple[in
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(f"{header}\n\n{done.stdout}", encoding="utf-8")
     return done.returncode, done.stdout
+
+
+def last_commit() -> str:
+    """The last commit that changed code, with "-dirty" if some has changed since then."""
+
+    def git(*words: str) -> str:
+        command = ["git", *words, "--", *CODE]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    return git("log", "-1", "--format=%h") + ("-dirty" if git("status", "--porcelain") else "")
 
 
 def all_claims() -> dict[str, list[Claim]]:
@@ -176,9 +187,7 @@ def main(config: Config) -> int:
             rows_of_tables = sum(row.in_table for row in rows)
             print(f"{rows_of_tables:4} rows, {len(rows) - rows_of_tables:3} texts: {command}")
         return 0 if chosen else 2
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.strip()
+    commit = last_commit()
     failed = 0
     for command, rows in tqdm(chosen.items(), desc="numbers", disable=None):
         words = shlex.split(command)
