@@ -87,7 +87,7 @@ def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: py
     assert (tmp_path / "policy.pdf").read_bytes().startswith(b"%PDF")
     solution = ls.load(tmp_path / "solution.npz", ls.Solution)
     printed = capsys.readouterr().out
-    assert solution.iteration_table() in printed
+    assert solution.log in printed
     assert solution.summary() in printed
     assert solution.status is ls.Status.COST_CONVERGED
     assert solution.scenario == "quadrotor,query=2,seed=0"

@@ -659,7 +659,9 @@ def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(
             trajectory=dataclasses.replace(plan, states=states, controls=controls),
             certificate=certificate,
             clearance=drive_solution.clearance - rng.choice([0.0, 1.0]) if rng.random() < 0.7 else None,
-            options=drive_solution.options | rng.choice([{}, {"noise": "of the wheels"}, {"noise": "a", "risk": 0.1}]),
+            options=drive_solution.options
+            | rng.choice([{}, {"noise": "of the wheels"}, {"noise": "a", "risk": 0.1}])
+            | rng.choice([{}, {"duration": "1 to 3 s"}]),
             goal=rng.choice([0.0, 1.0]) * np.ones(3) if rng.random() < 0.7 else None,
         )
         lines = str(drawn).splitlines()
@@ -670,7 +672,7 @@ def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(
         ]
         assert sum("  cost: " in line for line in lines) == 1
         assert ("violation: 3.0e-01" in str(drawn)) == (certificate.violation > 0)
-        assert len(drawn.iteration_table().splitlines()) == 1 + len(drawn.iterations)
+        assert len(drawn.log.splitlines()) == 1 + len(drawn.iterations)
 
 
 def test_files_are_ordinary_zip_archives(saved: Path) -> None:

@@ -20,15 +20,15 @@ from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 class Solution(Plan):
     """A locally optimal feedback policy, and how it was found.
 
-    A `Plan` with the log of the solve. `detail` also says where the safeguard stepped in. The policy and the cost-to-go
-    come from the last completed backward pass.
+    A `Plan` with a record of the solve. `detail` also says where the safeguard stepped in. The policy and the
+    cost-to-go come from the last completed backward pass.
 
     Attributes:
       inverse_policy: the law that follows the optimum backwards from a state of arrival. None from `ilqr`, and with a
         fixed start, from which not every state can be reached.
       cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
         dual form; None if a pass failed, and from `ilqr`.
-      iterations: the log.
+      iterations: a record of each iteration; `log` is their table.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
         if the problem has no obstacles.
       certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
@@ -132,13 +132,14 @@ class Solution(Plan):
         policy = replace(self.policy, gain=np.zeros_like(self.policy.gain), offset=self.trajectory.controls)
         return replace(self, policy=policy, inverse_policy=None)
 
-    def iteration_table(self) -> str:
-        """The log as a table, one line for each iteration."""
+    @property
+    def log(self) -> str:
+        """The iterations as a table, one line for each."""
         rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
         return "\n".join([Iteration.HEADER, *rows])
 
     def summary(self) -> str:
-        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 16 lines."""
+        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 15 lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
@@ -161,8 +162,8 @@ class Solution(Plan):
             verdict = "collides" if self.clearance[knot] < 0 else "clear"
             lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
         lines += [f"  goal:      {line}" for line in self._at_goal()]
-        lines += [f"  limits:    {line}" for line in _first(self._beyond_limits(), 2)]
-        lines += [f"  starts:    {line}" for line in _first(self._search(), 3)]
+        lines += [f"  limits:    {line}" for line in _first(self._beyond_limits(), 1)]
+        lines += [f"  starts:    {line}" for line in _first(self._search(), 2)]
         return "\n".join(lines)
 
     def _at_goal(self) -> list[str]:
