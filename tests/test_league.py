@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import peers
@@ -16,8 +17,10 @@ import solver_league
 from league import contestants, flights, problems, verification
 from peers.shooting import Moment, Shooting
 from sampling import rarely
+from scipy.optimize import lsq_linear
 
 import lqrsim as ls
+from lqrsim.problem.costs import terms_of
 
 SCRIPT = Path(__file__).parent.parent / "experiments" / "solver_league.py"
 
@@ -53,6 +56,55 @@ def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -
     found = verification.verify(problem, solution.trajectory, solution.cost)
     assert found.faults == ()
     assert found.cost == pytest.approx(solution.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_optimality_is_zero_at_the_optimum_and_nowhere_else(seed: int) -> None:
+    """Of linear dynamics with quadratic costs, limits and a goal or none, whose optimum SciPy's bounded least squares
+    finds. The residual is right to rounding times the condition of the dynamics, and 1e-7 is far from both sides.
+    """
+    rng = np.random.default_rng(seed)
+    n, m, steps = int(rng.integers(2, 4)), int(rng.integers(1, 3)), int(rng.integers(6, 14))
+    a, b = rng.normal(size=(n, n)) - np.eye(n), rng.normal(size=(n, m))
+
+    def f(x: Any, u: Any, p: Any) -> list[Any]:
+        return [sum(a[i, j] * x[j] for j in range(n)) + sum(b[i, j] * u[j] for j in range(m)) for i in range(n)]
+
+    limit = rng.uniform(0.1, 0.4)
+    problem = ls.Problem(
+        dynamics=ls.Dynamics(f, states={f"x{i}": "m" for i in range(n)}, controls={f"u{i}": "N" for i in range(m)}),
+        dt=0.1, steps=steps, initial=ls.FixedState(rng.normal(size=n)),
+        stage_cost=ls.ControlCost(rng.uniform(0.01, 1, m))
+        + ls.QuadraticCost(rng.uniform(0.1, 1, n), about=np.zeros(n)),
+        final_cost=ls.QuadraticCost(rng.uniform(1, 10, n), about=rng.normal(size=n)),
+        control_limits=(np.full(m, -limit), np.full(m, limit)),
+        constraints=[ls.StateBounds(x0=(-50.0, 50.0))],
+    )  # fmt: skip
+
+    def terms(controls: np.ndarray) -> np.ndarray:
+        """The cost is half of the sum of their squares."""
+        plan = verification.rolled_out(problem, controls.reshape(steps, m))
+        effort, state = terms_of(problem.stage_cost)
+        parts = [
+            controls.reshape(steps, m) * np.sqrt(np.diag(effort.weight)),
+            plan[:-1] * np.sqrt(np.diag(state.weight)),
+        ]
+        end = (plan[-1] - problem.final_cost.about) * np.sqrt(np.diag(problem.final_cost.weight))
+        return np.concatenate([part.ravel() for part in (*parts, end)])
+
+    zero = terms(np.zeros(steps * m))
+    slopes = np.stack([terms(one) - zero for one in np.eye(steps * m)], axis=1)
+    best = lsq_linear(slopes, -zero, (-limit, limit), method="bvls", tol=1e-15).x
+    assert (np.abs(best) == limit).any()
+    off = np.clip(best + 0.1 * limit * rng.normal(size=best.shape), -limit, limit)
+    residuals = []
+    for controls in (best, off):
+        plan = ls.Trajectory(
+            verification.rolled_out(problem, controls.reshape(steps, m)), controls.reshape(steps, m), 0.1
+        )
+        residuals.append(verification.verify(problem, plan, 0.5 * float(terms(controls) @ terms(controls))))
+    assert [one.faults for one in residuals] == [(), ()]
+    assert residuals[0].optimality < 1e-7 < 1e-4 < residuals[1].optimality
 
 
 @pytest.mark.long

@@ -238,7 +238,17 @@ def numeric(function: Any, n: int, m: int, parameters: tuple[str, ...], several:
     for name, symbol in zip(parameters, p, strict=True):
         setattr(namespace, name, symbol)
     formula = function(x, u, namespace)
-    return sympy.lambdify([x, u, p], list(formula) if several else formula, modules="numpy", cse=True)
+    modules = [{"atan2": _atan2}, "numpy"]
+    return sympy.lambdify([x, u, p], list(formula) if several else formula, modules=modules, cse=True)
+
+
+def _atan2(y: Values, x: Values) -> Values:
+    """The angle, with its complex step, which NumPy's `arctan2` does not have."""
+    angle = np.arctan2(np.real(y), np.real(x))
+    if not (np.iscomplexobj(y) or np.iscomplexobj(x)):
+        return angle
+    turned = np.real(x) * np.imag(y) - np.real(y) * np.imag(x)
+    return angle + 1j * turned / (np.real(x) ** 2 + np.real(y) ** 2)
 
 
 def rate_of(problem: ls.Problem, rate: Rate | None) -> Rate:
