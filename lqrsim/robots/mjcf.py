@@ -168,9 +168,7 @@ class MjcfRobot(Robot):
                     yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
         yield from ((name, "") for name in mjcf_joints.activations_of(self.scene.model))
 
-    def _position(
-        self, asked: Sequence[str] | None, names: tuple[str, ...], who: str
-    ) -> tuple[tuple[int, ...], str]:
+    def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
         """The states that are the position, and its plane."""
         axes = self._axes
         if asked is None:
