@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import asdict, fields
@@ -129,6 +130,44 @@ def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytes
     assert (found["version"], found["exit_code"]) == (1, 2)
     assert says in found["error"]
     assert captured.err == f"lqrsim: error: {found['error']}\n"
+
+
+REQUIRED = {"bridge": ["--commands", "1"], "export": ["--c", "1"], "replay": ["--cell", "1", "--trial", "1"]}
+CHOSEN = {"--overlays": "plan", "--policies": "smooth"}  # lists whose help does not show the choices
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_option_that_is_repeated_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each option in the help of each command, with values; as --option=value and with underscores, too.
+
+    The last value was taken in silence. The error is an object, too, where the command has --json.
+    """
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    printed = capsys.readouterr().out
+    arguments = re.findall(r"^[│ ] ([A-Z{]\S*)", printed, re.MULTILINE)
+    options = re.findall(r"^[│ ] (--[\w-]+)(?:, (--no-[\w-]+))?(?: (\S+(?: \S+)*))?", printed, re.MULTILINE)
+    assert options
+    required = REQUIRED.get(command, [])
+
+    def values(option: str, shown: str) -> list[str]:
+        words = [word for word in shown.split() if word not in ("...", "│")]
+        return [word[1:].split(",")[0].rstrip("}") if word[0] == "{" else CHOSEN.get(option, "1") for word in words]
+
+    begun = [command, *(word for shown in arguments for word in values("", shown)), *required]
+    for option, opposite, shown in options:
+        given = values(option, shown)
+        again = [f"{option.replace('-', '_').replace('__', '--')}={given[0]}"] if len(given) == 1 else [option, *given]
+        as_json = ["--json"] if option != "--json" and any(name == "--json" for name, *_ in options) else []
+        wrong = [*begun, option, *given, *([opposite] if opposite else again), *as_json]
+
+        times = 3 if option in required else 2
+        assert main(wrong) == 2, wrong
+        out, err = capsys.readouterr()
+        several = ", with all its values" if shown.endswith("...") or len(given) > 1 else ""
+        assert err == f"lqrsim: error: {option}: got it {times} times, want it once{several}\n", wrong
+        if as_json:
+            assert json.loads(out)["error"] == err.removeprefix("lqrsim: error: ").rstrip(), wrong
 
 
 LONG = "x" * 500  # longer than the lines of a box
