@@ -122,10 +122,11 @@ def _parse(arguments: list[str]) -> Any:
     import tyro
 
     from lqrsim.commands import Command
+    from lqrsim.commands.options import RULES
 
     printed = io.StringIO()
     try:
-        with _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
+        with RULES, _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
             command = tyro.cli(Command, prog="lqrsim", args=arguments)
         return _given_twice(command, arguments) or command
     except SystemExit as end:

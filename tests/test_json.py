@@ -1,5 +1,6 @@
 """`--json`: one object on stdout and nothing else there, with the numbers that Python has, to the last bit."""
 
+import contextlib
 import io
 import json
 import math
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.cli import main
+from lqrsim.cli import _parse, main
 from lqrsim.codegen import disk_cache
 from lqrsim.commands import COMMANDS
 from lqrsim.stress.statistics import rate
@@ -136,11 +137,10 @@ REQUIRED = {"bridge": ["--commands", "1"], "export": ["--c", "1"], "replay": ["-
 CHOSEN = {"--overlays": "plan", "--policies": "smooth"}  # lists whose help does not show the choices
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_an_option_that_is_repeated_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each option in the help of each command, with values; as --option=value and with underscores, too.
+def listed(command: str, capsys: pytest.CaptureFixture[str]) -> tuple[list[str], list[tuple[str, str, list[str], str]]]:
+    """The beginning of a valid command line, and the command's options in its help.
 
-    The last value was taken in silence. The error is an object, too, where the command has --json.
+    Each with its opposite if it is a flag, values, and how the help shows these.
     """
     with pytest.raises(SystemExit):
         main([command, "--help"])
@@ -148,26 +148,54 @@ def test_an_option_that_is_repeated_is_refused(command: str, capsys: pytest.Capt
     arguments = re.findall(r"^[│ ] ([A-Z{]\S*)", printed, re.MULTILINE)
     options = re.findall(r"^[│ ] (--[\w-]+)(?:, (--no-[\w-]+))?(?: (\S+(?: \S+)*))?", printed, re.MULTILINE)
     assert options
-    required = REQUIRED.get(command, [])
 
     def values(option: str, shown: str) -> list[str]:
         words = [word for word in shown.split() if word not in ("...", "│")]
         return [word[1:].split(",")[0].rstrip("}") if word[0] == "{" else CHOSEN.get(option, "1") for word in words]
 
-    begun = [command, *(word for shown in arguments for word in values("", shown)), *required]
-    for option, opposite, shown in options:
-        given = values(option, shown)
+    begun = [command, *(word for shown in arguments for word in values("", shown)), *REQUIRED.get(command, [])]
+    return begun, [(option, opposite, values(option, shown), shown) for option, opposite, shown in options]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_option_that_is_repeated_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each option in the help of each command, with values; as --option=value and with underscores, too.
+
+    The last value was taken in silence. The error is an object, too, where the command has --json.
+    """
+    begun, options = listed(command, capsys)
+    for option, opposite, given, shown in options:
         again = [f"{option.replace('-', '_').replace('__', '--')}={given[0]}"] if len(given) == 1 else [option, *given]
         as_json = ["--json"] if option != "--json" and any(name == "--json" for name, *_ in options) else []
         wrong = [*begun, option, *given, *([opposite] if opposite else again), *as_json]
-
-        times = 3 if option in required else 2
+        times = 3 if option in begun else 2
         assert main(wrong) == 2, wrong
         out, err = capsys.readouterr()
         several = ", with all its values" if shown.endswith("...") or len(given) > 1 else ""
         assert err == f"lqrsim: error: {option}: got it {times} times, want it once{several}\n", wrong
         if as_json:
             assert json.loads(out)["error"] == err.removeprefix("lqrsim: error: ").rstrip(), wrong
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_errors_of_usage_have_no_markup_nor_types(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One value too few for each option of several values; and for three others, drawn, a word that is no number.
+
+    tyro prints `[bold]X Y Z AT[/bold]` as it stands, and types as Python names them, where a value may be None.
+    """
+    begun, options = listed(command, capsys)
+    rng = np.random.default_rng(list(COMMANDS).index(command))
+    wrong = [[option, *given[:-1]] for option, _, given, _ in options if len(given) > 1]
+    single = [option for option, _, given, shown in options if len(given) == 1 and shown[0] != "{"]
+    wrong += (
+        [[str(option), "many"] for option in rng.choice(single, min(3, len(single)), replace=False)] if single else []
+    )
+    for words in wrong:
+        with contextlib.suppress(SystemExit):  # a word may be what an option wants
+            _parse([*begun, *words])
+        said = capsys.readouterr().err
+        assert words[0] in said or words[-1] == "many", words
+        assert not re.search(r"\[/?bold|NoneType|\{None\}|<class", said), words
 
 
 LONG = "x" * 500  # longer than the lines of a box
