@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from interrupting import interrupted
 from sampling import rarely
 from scipy import stats
 
@@ -315,18 +316,6 @@ def test_commands_check_their_options_before_they_solve(
     assert says in capsys.readouterr().err
 
 
-# The command as it is, which says at each step of its progress how far it is.
-TELLING = """
-import sys
-
-from lqrsim.cli import main
-from lqrsim.commands import console
-
-console.Progress.__call__ = lambda self, done, total, found="": print(f"{done} of {total}; {found}", flush=True)
-sys.exit(main())
-"""
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
 @pytest.mark.parametrize(
     ("command", "at", "says"),
@@ -343,14 +332,8 @@ def test_ctrl_c_keeps_what_there_is_and_says_how_far_it_came(
     asked, *more = command.split()
     name, *settings = asked.split(",")
     scenario = ",".join([f"{own}:shifted", *settings])
-    words = [sys.executable, "-c", TELLING, name, scenario, *more, *OPEN, "--out", str(tmp_path)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        while not (line := process.stdout.readline()).startswith(at):
-            assert process.poll() is None, line
-        process.send_signal(signal.SIGINT)
-        printed, error = process.communicate(timeout=60)
-    assert (process.returncode, error.splitlines()[-1]) == (130, "lqrsim: stopped")
+    code, printed, error = interrupted([name, scenario, *more, *OPEN, "--out", str(tmp_path)], at)
+    assert (code, error.splitlines()[-1]) == (130, "lqrsim: stopped")
     assert re.search(says, printed)
     if name == "funnel":
         funnel = ls.load(tmp_path / "funnel.npz", ls.types.Funnel)

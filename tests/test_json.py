@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import past_a_crate
 import pytest
 
 import lqrsim as ls
@@ -313,6 +314,19 @@ def test_rare_and_break_print_their_files(printed: Any, tmp_path: Path) -> None:
     found = printed("rare", f"{reference},std=0.0001", "--policy", "open_loop", "--out", str(tmp_path / "none"), code=1)
     assert found["found"] is None
     assert "wrote" not in found
+
+
+def test_harden_prints_its_file(printed: Any, tmp_path: Path) -> None:
+    """A plan that is not as safe as requested: the exit code is 1, and the object has what the file has."""
+    (tmp_path / "crate.py").write_text(past_a_crate.OWN, encoding="utf-8")
+    asked = ["--strength", "2", "--particles", "40", "--repetitions", "2", "--rounds", "1", "--chance", "1e-6"]
+    law = ["--policy", "track", "--design-disturbances", "scenario"]
+    found = printed("harden", f"{tmp_path / 'crate.py'}:told", *asked, *law, "--out", str(tmp_path / "out"), code=1)
+    file = json.loads((tmp_path / "out" / "harden.json").read_text(encoding="utf-8"))
+    assert {key: found[key] for key in file} == file
+    assert set(found) - set(file) == {"exit_code", "wrote"}
+    assert (found["found"]["success"], len(found["found"]["rounds"])) == (False, 1)
+    assert all(Path(path).is_file() for path in found["wrote"])
 
 
 def test_demo(printed: Any, tmp_path: Path) -> None:
