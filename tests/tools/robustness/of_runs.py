@@ -250,7 +250,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "self": reliability, **more, "seed": 0, "report": print_nothing, "progress": print_nothing
             }, 0.1)
             for name, more in {
-                "rare_failures": {"particles": 20, "repetitions": 2, "keep": 0.1}, "smallest_failure": {"rounds": 1}
+                "rare_failures": {"particles": 20, "repetitions": 2, "keep": 0.1},
+                "smallest_failure": {"rounds": 1, "particles": 20}
             }.items()
         },
         "FailureCertificate": (vars(certificate),),
