@@ -207,9 +207,8 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
 def test_the_search_for_first_failures_has_the_given_number_of_particles(own: str, seed: int) -> None:
     """More particles, more trials; 200 are the default. All find the same failure, to a tenth."""
     problem = ls.stress.ReliabilityProblem(f"{own}:shifted", strength=2, policy="open_loop")
-    found = [
-        problem.smallest_failure(rounds=1, seed=seed, **more) for more in ({"particles": 20}, {"particles": 60}, {})
-    ]
+    given: list[dict[str, Any]] = [{"particles": 20}, {"particles": 60}, {}]
+    found = [problem.smallest_failure(rounds=1, seed=seed, **more) for more in given]
     few, some, many = (one.simulations for one in found)
     assert some - few > 2 * 40 - 1  # two repetitions, of at least one level
     assert many - some > 2 * 140 - 1
