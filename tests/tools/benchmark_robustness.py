@@ -9,6 +9,7 @@ or ends the process.
 
 api     Every public callable, with one or two of its arguments spoilt. What is accepted is asked for all that it has.
         A call that fails is printed with its number; --sections api --first NUMBER --calls 1 repeats it.
+
 files   Solutions, rollouts and campaigns with flipped bits, other members, other arrays and other text, also with the
         hash of their content made anew, as another program would. What is accepted is used. A file that fails is
         printed with its number; --sections files --first NUMBER --mutations 1 repeats it.
