@@ -264,7 +264,7 @@ class TestLater:
 
     @pytest.mark.parametrize("horizon", ["shrinking", "moving"])
     def test_a_quadrotor_flies_a_figure_of_eight_in_mujoco(self, horizon: str) -> None:
-        """Re-planned every half second. A moving horizon of 3 s looks further and further along the longer reference."""
+        """Re-planned every half second. A moving horizon of 3 s looks further and further along a longer reference."""
         robot, scene = ls.Quadrotor(), ls.load_scene("cage", obstacles=False)
         dt, whole = 1 / 30, 180
         steps = whole if horizon == "shrinking" else whole // 2
@@ -275,7 +275,7 @@ class TestLater:
         space = robot.dynamics.state_coordinates
         names = [space.names[i] for i in space.position]
 
-        def places(rows: Array) -> dict[str, Array]:
+        def places(rows: Array) -> dict[str, Any]:
             return dict(zip(names, rows.T, strict=True))
 
         def end_at(knot: int) -> ls.QuadraticCost:
@@ -362,7 +362,7 @@ class TestStated:
             ),
             (
                 lambda: follows(5, final_cost=ls.QuadraticCost([1, 1], about=np.zeros((6, 2)))),
-                "final_cost: got a QuadraticCost with a row for each knot, want one",
+                "final_cost: got a QuadraticCost with a row for each knot, want one row, such as rows",
             ),
             (
                 lambda: follows(5, initial=ls.QuadraticCost([1, 1], about=np.zeros((6, 2)))),

@@ -238,7 +238,7 @@ def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
     found = tuple(term._in(dynamics) for term in terms)
     for term in found:
         if field in ("initial", "final_cost") and term.by_knot:
-            raise InputError(f"{field}: got a {term.name} with a row for each knot, want one: about=rows[-1] at the end")
+            raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
     return cost if all(map(operator.is_, terms, found)) else CostSum(found)
 
 
@@ -371,7 +371,7 @@ def _number_or_column(field: str, given: object) -> float | Array:
 
 
 def _by_name(space: Coordinates, field: str, given: Mapping[str, object]) -> Array:
-    """Numbers by name or unit as an array (n,); or (K, n) if some have one number for each of K knots. The rest is 0."""
+    """Numbers by name or unit as an array (n,), with 0 for the rest; (K, n) if some have one number for each knot."""
     found = space._by_name(field, given, _number_or_column)
     counts = {len(one) for one in found.values() if isinstance(one, np.ndarray)}
     if len(counts) > 1 or 0 in counts:
@@ -392,9 +392,9 @@ class QuadraticCost(_SquareCost):
 
     As a stage cost it may have another reference or weight at each knot: T+1 rows, row t for the step that begins at
     knot t. A stage cost does not use row T, which may be left out; for the end, give a final cost about it. Rows belong
-    to knots whatever dt is, also with a free duration. Angles count whole turns, so a reference must not jump by a turn.
-    When a `Replanner` plans again, the rows move with time: a shrinking horizon uses those that are left, a moving one
-    repeats the last row.
+    to knots whatever dt is, also with a free duration. Angles count whole turns, so a reference must not jump by a
+    turn. When a `Replanner` plans again, the rows move with time: a shrinking horizon uses those that are left, a
+    moving one repeats the last row.
 
     Args:
       weight: (n, n) symmetric positive semidefinite, or its diagonal (n,), or a dictionary of name or unit of a state:
@@ -419,9 +419,9 @@ class ControlCost(_SquareCost):
     Args:
       weight: (m, m) symmetric positive definite, or its diagonal (m,), or a dictionary of name or unit of a control:
         number, with one for each control. Or (T, m, m), one matrix for each step; in a dictionary, numbers (T,).
-      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. Or (T, m), one
-        for each step; in a dictionary, numbers (T,). The solvers start from it unless told otherwise. By default 0, also
-        for controls that the dictionary leaves out.
+      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. Or (T, m),
+        one for each step; in a dictionary, numbers (T,). The solvers start from it unless told otherwise. By default 0,
+        also for controls that the dictionary leaves out.
       longer: whether there may be more rows than steps, as for a QuadraticCost.
     """
 
