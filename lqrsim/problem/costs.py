@@ -343,12 +343,11 @@ class _SquareCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         weight, about = self._in(dynamics)._known
-        if weight.ndim == 2 and about.ndim == 1:
-            kernel, rows = source_of(quadratic_cost, CONTROL=int(self.controls)), []
-        else:
-            kernel = source_of(reference_cost, CONTROL=int(self.controls))
-            rows = [[about.size // len(weight[-1]), weight.size // weight[-1].size if weight.ndim == 3 else 1]]
-        return CostTerm(kernel, np.concatenate([*rows, about.ravel(), weight.ravel()]), uses_control=self.controls)
+        kernel, counts, size = quadratic_cost, [], weight.shape[-1]
+        if weight.ndim == 3 or about.ndim == 2:
+            kernel, counts = reference_cost, [about.size // size, weight.size // size**2]
+        data = np.concatenate([counts, about.ravel(), weight.ravel()])
+        return CostTerm(source_of(kernel, CONTROL=int(self.controls)), data, uses_control=self.controls)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
         steps = len(times) - 1
