@@ -284,18 +284,24 @@ def check_items(
 def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) -> Array:
     """`value` as a symmetric positive-semidefinite (or definite) matrix; a vector is read as its diagonal.
 
+    Three axes are matrices (K, n, n), one for each knot.
+
     Raises:
       InputError: wrong shape, NaN or infinite entries, not symmetric, or an eigenvalue of the wrong sign.
     """
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
+    if raw.ndim == 3 and len(raw):
+        found = np.array([check_weight(f"{field}: row {k}", one, definite=definite) for k, one in enumerate(raw)])
+        found.setflags(write=False)
+        return found
     if raw.ndim == 1:
         check_memory(field, len(raw), 16 * len(raw), "whose square matrix")
     matrix = np.diag(raw) if raw.ndim == 1 else raw
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not matrix.size:
         got = f"the number {raw:g}" if raw.ndim == 0 else f"shape {_shape(raw.shape)}"
         wanted = "a square matrix or its diagonal, such as (1.0,)"
-        if raw.ndim > 2:
-            wanted += "; for weights that change with time, make the time a state and state the cost as a SymbolicCost"
+        if raw.ndim >= 2:
+            wanted += "; for weights that change with time, one matrix for each knot: rows[:, :, None] * np.eye(n)"
         raise InputError(f"{field}: got {got}, want {wanted}")
     matrix = check_array(field, matrix, matrix.shape)
     scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)

@@ -864,6 +864,11 @@ class TestParts:
         of_term(ls.QuadraticCost([1.0, 2.0, 3.0], about=[0.1, 0.2, 0.3]).bind(CART))
         of_term(ls.ControlCost([1.0, 2.0], about=[0.1, 0.2]).bind(CART))
 
+    def test_quadratic_costs_of_a_reference(self) -> None:
+        weights = np.array([[[2.0, 0.3], [0.3, 1.0]], [[1.0, -0.1], [-0.1, 3.0]]])
+        of_term(ls.QuadraticCost([1.0, 2.0, 3.0], about=np.arange(6.0).reshape(2, 3)).bind(CART))
+        of_term(ls.ControlCost(weights, about=[0.1, 0.2]).bind(CART))
+
     def test_costs_of_limits(self) -> None:
         low, high = {"x": X[0] + 0.3, "y": X[1] - 0.3}, {"x": X[0] + 0.4, "y": X[1] - 0.4}
         of_term(LimitCost(low, high, weight=3.0).bind(CART))

@@ -231,7 +231,8 @@ def test_where_a_goal_is_inside_is_known_of_constraints_and_of_what_moves() -> N
         (lambda: ls.QuadraticCost([1.0, np.inf], about=[0, 0]), r"got inf at index \[1, 1\], want finite numbers"),
         (lambda: ls.QuadraticCost([[1.0, 0.0]], about=[0]), r"got shape \(1, 2\), want a square matrix"),
         (lambda: ls.ControlCost(2.0), "^ControlCost: weight: got the number 2, want a square matrix or its diagonal"),  # pyright: ignore[reportArgumentType]
-        (lambda: ls.ControlCost(np.ones((5, 2, 2))), r"got shape \(5, 2, 2\), want a square matrix or its diagonal"),
+        (lambda: ls.ControlCost(np.ones((5, 2, 2))), "weight: row 0: got smallest eigenvalue 0, want a positive-def"),
+        (lambda: ls.ControlCost(np.ones((1, 5, 2, 2))), r"got shape \(1, 5, 2, 2\), want a square matrix or its diag"),
         (lambda: ls.QuadraticCost("heavy", about=[0]), "got 'heavy', want a matrix of numbers or its diagonal"),
         (lambda: ls.QuadraticCost([1.0], about=[0, 0]), r"about: got shape \(2,\), want \(1,\)"),
         (lambda: ls.ObstacleCost(PILLAR, radius=-1.0), "radius: got -1.0, want a finite number >= 0"),

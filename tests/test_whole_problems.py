@@ -17,11 +17,11 @@ from lqrsim.results.solution_parts import Status
 
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
-KINDS = ("linear", "pendulum", "parking", "planar", "drive", "quadrotor")
+KINDS = ("linear", "pendulum", "parking", "planar", "tracking", "drive", "quadrotor")
 
 
 @pytest.mark.parametrize(
-    ("kinds", "count"), [(KINDS[-3:], 15), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
+    ("kinds", "count"), [(KINDS[-4:], 20), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
 )
 def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], count: int) -> None:
     @settings(max_examples=count, suppress_health_check=[HealthCheck.too_slow])

@@ -264,7 +264,14 @@ def numbers_of(problem: ls.Problem) -> tuple[float, ...]:
 
 
 def _quadratic(cost: ls.QuadraticCost | ls.ControlCost, z: Values) -> Values:
-    return 0.5 * np.einsum("...i,ij,...j->...", z - cost.about, cost.weight, z - cost.about)
+    about, weight = quadratic_at(cost, z.shape[-2])
+    return 0.5 * np.einsum("...i,...ij,...j->...", z - about, weight, z - about)
+
+
+def quadratic_at(cost: ls.QuadraticCost | ls.ControlCost, count: int) -> tuple[Array, Array]:
+    """Reference and weight at the first points: (count, n) and (count, n, n), or (n,) and (n, n) if always the same."""
+    about, weight = cost.about, cost.weight
+    return about[:count] if about.ndim == 2 else about, weight[:count] if weight.ndim == 3 else weight
 
 
 def _formula_cost(cost: ls.SymbolicCost, n: int, size: int, m: int) -> Function:

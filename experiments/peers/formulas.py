@@ -95,6 +95,8 @@ def parameters(problem: ls.Problem) -> Array:
     found = [problem.initial.numbers, np.array(list(problem.dynamics.parameters.values()))]
     for one in (*terms_of(problem.stage_cost), *terms_of(problem.final_cost)):
         if isinstance(one, ls.QuadraticCost | ls.ControlCost):
+            if one.by_knot:
+                raise NotImplementedError("a reference with a row for each knot")
             found.append(one.about)
         elif isinstance(one, ls.SymbolicCost):
             found.append(np.array(list(one.parameters.values())))

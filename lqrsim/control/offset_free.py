@@ -74,7 +74,7 @@ class OffsetFree(Controller):
       replan_every: seconds between two checks, rounded to control periods; by default there are no checks. A check
         simulates the model from the estimated state, with the estimated constants. If the law no longer leads to the
         goal without a collision, the rest of the horizon is solved from that state. If the solve fails, the law stays
-        in force. Costs that depend on the step's number are not supported with re-planning.
+        in force. Except for a reference, costs that depend on the step's number are not supported with re-planning.
       replan_always: whether to solve at each of these times without a check.
 
     Its run, a rollout's `controller_run`, has these attributes:

@@ -198,8 +198,9 @@ class Replanner(Controller):
                 robot.apply(live.step(robot.state(), t))
 
     Each solve begins with the law in force, and its plan is no worse than continuing with that law; see `Replan`. A
-    plan that is not ready by the deadline is not used. Costs that depend on the step's number are not supported.
-    Running a re-planner does not change it, so several runs can share it.
+    plan that is not ready by the deadline is not used. A reference moves with time, see `QuadraticCost`; other costs
+    that depend on the step's number are not supported. Running a re-planner does not change it, so several runs can
+    share it.
 
     In a simulation a solve takes as long as `computing` says. With a number or a function, the results are
     bit-identical on all machines. With "measured" they depend on the speed of the machine. The rollout's

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.sources import source_of
@@ -32,18 +33,32 @@ from lqrsim.errors import (
     check_count,
     check_flag,
     check_items,
+    check_memory,
     check_name,
     check_number,
     check_weight,
     excerpt,
     keep,
+    numbers_of,
 )
-from lqrsim.kernels import differences, distance_cost, limit_cost, obstacle_cost, quadratic_cost, user_functions
+from lqrsim.kernels import (
+    differences,
+    distance_cost,
+    limit_cost,
+    obstacle_cost,
+    quadratic_cost,
+    reference_cost,
+    user_functions,
+)
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomsInWorld, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.results.coordinates import PerEntry
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.solution_parts import HORIZONS, left_after
 from lqrsim.scenes.world import World
+
+# One number for each entry, or by name or unit of an entry; each of them may have one row or number for each knot.
+PerKnot = npt.ArrayLike | Mapping[str, npt.ArrayLike]
 
 FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
 
@@ -115,11 +130,15 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     def __repr__(self) -> str:
         parts = [
-            f"{name}={brief(value)}"
+            f"{name}={self._brief(name, value)}"
             for name, value in self._stated().items()
             if not (value is None or value is False or (isinstance(value, Mapping) and not value))
         ]
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _brief(self, name: str, value: object) -> str:
+        """An argument as it is printed."""
+        return brief(value)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
         """Bind the term to a system and the times (T+1,) in s of a problem's knots."""
@@ -157,6 +176,23 @@ class Cost(ProblemPart[CostTerm]):
         """The name in messages."""
         return type(self).__name__
 
+    @property
+    def by_knot(self) -> bool:
+        """Whether it has other numbers at each knot; only a stage cost may."""
+        return False
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "Cost":
+        """The cost for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
+
+        Args:
+          steps: number of steps that are over.
+          horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
+            length, which repeats the last row.
+        """
+        check_count("steps", steps, at_least=0)
+        check_name("horizon", horizon, HORIZONS)
+        return self
+
     def _in(self, dynamics: Dynamics) -> "Cost":
         """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
         return self
@@ -173,6 +209,9 @@ class CostSum(Cost):
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self.terms))
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
+        return CostSum(tuple(term.ahead(steps, horizon=horizon) for term in self.terms))
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
@@ -193,40 +232,60 @@ def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
     """The cost with numbers by name in the order of a system; the same object if it has no numbers by name.
 
     Raises:
-      InputError: a term does not fit the system, or is no cost.
+      InputError: a term does not fit the system, or is no cost; or an initial or final cost has numbers for each knot.
     """
     terms = terms_of(cost, field)
     found = tuple(term._in(dynamics) for term in terms)
+    for term in found:
+        if field in ("initial", "final_cost") and term.by_knot:
+            raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
     return cost if all(map(operator.is_, terms, found)) else CostSum(found)
 
 
 class _SquareCost(Cost):
-    """`1/2 (z - about)' weight (z - about)` of the states or the controls."""
+    """`1/2 (z - about)' weight (z - about)` of the states or the controls; both may change from knot to knot."""
 
     controls: ClassVar[bool]
 
-    def __init__(self, weight: PerEntry, about: PerEntry | None) -> None:
+    def __init__(self, weight: PerKnot, about: PerKnot | None, longer: bool) -> None:
+        self.longer = check_flag(f"{self.name}: longer", longer)
         self._given = {"weight": weight, "about": about}
         self._numbers: tuple[Array, Array] | None = None
         if not any(isinstance(numbers, Mapping) for numbers in self._given.values()):
             self._numbers = self._checked(weight, about)
 
     def _stated(self) -> Mapping[str, object]:
-        return self._given if self._numbers is None else {"weight": self.weight, "about": self.about}
+        numbers = self._given if self._numbers is None else {"weight": self.weight, "about": self.about}
+        return {**numbers, "longer": self.longer}
+
+    def _brief(self, name: str, value: object) -> str:
+        if isinstance(value, np.ndarray) and value.ndim == (2 if name == "about" else 3):
+            each = ("controls" if self.controls else "states") if name == "about" else "matrices"
+            return f"a trajectory of {len(value)} {each}"
+        return brief(value)
 
     def _checked(self, weight: Any, about: Any) -> tuple[Array, Array]:
+        """Weight ([K,] n, n) and reference ([K,] n), each with or without one row for each of K knots."""
         weight = check_weight(f"{self.name}: weight", weight, definite=self.controls)
-        about = np.zeros(len(weight)) if about is None else about
-        return weight, check_array(f"{self.name}: about", about, (len(weight),))
+        field, size = f"{self.name}: about", weight.shape[-1]
+        about = np.zeros(size) if about is None else numbers_of(field, about, f"numbers of shape ({size},)")
+        about = check_array(field, about, (None, size) if about.ndim == 2 else (size,))
+        if not about.size:
+            raise InputError(f"{field}: got no rows, want one, or one for each knot")
+        return weight, about
 
     @property
     def weight(self) -> Array:
-        """The weight matrix. Numbers by name are in no order before a Problem has the cost."""
+        """The weight matrix (n, n), or one for each knot, (K, n, n). Numbers by name are in no order before a Problem
+        has the cost.
+        """
         return self._known[0]
 
     @property
     def about(self) -> Array:
-        """The point at which the cost is zero. Numbers by name are in no order before a Problem has the cost."""
+        """The point (n,) at which the cost is zero, or one for each knot, (K, n). Numbers by name are in no order
+        before a Problem has the cost.
+        """
         return self._known[1]
 
     @property
@@ -235,68 +294,140 @@ class _SquareCost(Cost):
             raise InputError(f"{self.name}: got numbers by name, want the cost from a Problem: problem.final_cost")
         return self._numbers
 
+    @property
+    def by_knot(self) -> bool:
+        return self.weight.ndim == 3 or self.about.ndim == 2
+
+    @property
+    def moving(self) -> bool:
+        return self.by_knot
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "_SquareCost":
+        super().ahead(steps, horizon=horizon)
+        if not self.by_knot:
+            return self
+
+        def later(rows: Array) -> Array:
+            return left_after(min(steps, len(rows) - 1), rows, filled=horizon == "moving")
+
+        weight, about = self._known
+        other = copy.copy(self)
+        other._numbers = later(weight) if weight.ndim == 3 else weight, later(about) if about.ndim == 2 else about
+        return other
+
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
         space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
         if self._numbers is None:
             weight = self._given["weight"]
             if self.controls and isinstance(weight, Mapping):
-                weighed = space._by_name(f"{self.name}: weight", weight, check_number)
+                weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
                 missing = [name for i, name in enumerate(space.names) if i not in weighed]
                 if missing:
                     raise InputError(
                         f"{self.name}: weight: got none for {', '.join(missing)}, want one for each control"
                     )
             found = {
-                field: space._numbers(f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
+                field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
                 for field, given in self._given.items()
             }
+            if isinstance(weight, Mapping) and np.ndim(found["weight"]) == 2:  # diagonals, one for each knot
+                found["weight"] = found["weight"][:, :, None] * np.eye(len(space))
             other = copy.copy(self)
             other._numbers = self._checked(**found)
             return other._in(dynamics)
-        if len(self.weight) != len(space):
+        size = self.weight.shape[-1]
+        if size != len(space):
             kind = "controls" if self.controls else "states"
-            raise InputError(
-                f"{self.name}: weight: got size {len(self.weight)}, want {len(space)}, the number of {kind}"
-            )
+            raise InputError(f"{self.name}: weight: got size {size}, want {len(space)}, the number of {kind}")
         return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         weight, about = self._in(dynamics)._known
-        kernel = source_of(quadratic_cost, CONTROL=int(self.controls))
-        return CostTerm(kernel, np.concatenate([about, weight.ravel()]), uses_control=self.controls)
+        kernel, counts, size = quadratic_cost, [], weight.shape[-1]
+        if weight.ndim == 3 or about.ndim == 2:
+            kernel, counts = reference_cost, [about.size // size, weight.size // size**2]
+        data = np.concatenate([counts, about.ravel(), weight.ravel()])
+        return CostTerm(source_of(kernel, CONTROL=int(self.controls)), data, uses_control=self.controls)
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+        steps = len(times) - 1
+        for name, array, single in (("about", self.about, 1), ("weight", self.weight, 2)):
+            rows = len(array)
+            if array.ndim == single or rows == steps or (rows == steps + 1 and not self.controls):
+                continue
+            if not (self.longer and rows > steps):
+                want = f"{steps}, one for each step" if self.controls else f"{steps + 1}, one for each knot"
+                more = "; for a moving horizon, more with longer=True" if rows > steps else ""
+                raise InputError(f"{self.name}: {name}: got {rows} rows, want {want}{more}")
+        return self.bind(dynamics)
+
+
+def _number_or_column(field: str, given: object) -> float | Array:
+    """A number; or numbers (K,), one for each knot. Raises InputError for anything else."""
+    if isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.ndim):
+        return check_array(field, given, (None,))
+    return check_number(field, given)
+
+
+def _by_name(space: Coordinates, field: str, given: Mapping[str, object]) -> Array:
+    """Numbers by name or unit as an array (n,), with 0 for the rest; (K, n) if some have one number for each knot."""
+    found = space._by_name(field, given, _number_or_column)
+    counts = {len(one) for one in found.values() if isinstance(one, np.ndarray)}
+    if len(counts) > 1 or 0 in counts:
+        got = " and ".join(map(str, sorted(counts)))
+        raise InputError(f"{field}: got columns of {got} numbers, want one number for each knot in all of them")
+    check_memory(field, max(counts, default=1), 16 * len(space) ** 2, "whose matrices")
+    out = np.zeros((*counts, len(space)))
+    for i, one in found.items():
+        out[..., i] = one
+    return out
 
 
 class QuadraticCost(_SquareCost):
     """`1/2 (x - about)' weight (x - about)`.
 
         ls.QuadraticCost({"x": 100, "y": 100, "m/s": 10}, about={"x": 2.0})
+        ls.QuadraticCost({"x": 100, "y": 100}, about={"x": xs, "y": ys})  # follows a reference
+
+    As a stage cost it may have another reference or weight at each knot: T+1 rows, row t for the step that begins at
+    knot t. A stage cost does not use row T, which may be left out; for the end, give a final cost about it. Rows belong
+    to knots whatever dt is, also with a free duration. Angles count whole turns, so a reference must not jump by a
+    turn. When a `Replanner` plans again, the rows move with time: a shrinking horizon uses those that are left, a
+    moving one repeats the last row.
 
     Args:
       weight: (n, n) symmetric positive semidefinite, or its diagonal (n,), or a dictionary of name or unit of a state:
-        number; states without a number have no weight.
+        number; states without a number have no weight. Or (T+1, n, n), one matrix for each knot; in a dictionary,
+        numbers (T+1,).
       about: (n,) the state at which the cost is zero, or a dictionary of name or unit: number; the other states are 0.
+        Or (T+1, n), one state for each knot; in a dictionary, numbers (T+1,).
+      longer: whether there may be more rows than knots, for a moving horizon, which then goes on along them.
     """
 
     controls = False
 
-    def __init__(self, weight: PerEntry, *, about: PerEntry) -> None:
-        super().__init__(weight, about)
+    def __init__(self, weight: PerKnot, *, about: PerKnot, longer: bool = False) -> None:
+        super().__init__(weight, about, longer)
 
 
 class ControlCost(_SquareCost):
     """`1/2 (u - about)' weight (u - about)`.
 
+    It may have another nominal control or weight at each step, as a QuadraticCost at each knot.
+
     Args:
       weight: (m, m) symmetric positive definite, or its diagonal (m,), or a dictionary of name or unit of a control:
-        number, with one for each control.
-      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. The solvers
-        start from it unless told otherwise. By default 0, also for controls that the dictionary leaves out.
+        number, with one for each control. Or (T, m, m), one matrix for each step; in a dictionary, numbers (T,).
+      about: (m,) the nominal control, at which the cost is zero, or a dictionary of name or unit: number. Or (T, m),
+        one for each step; in a dictionary, numbers (T,). The solvers start from it unless told otherwise. By default 0,
+        also for controls that the dictionary leaves out.
+      longer: whether there may be more rows than steps, as for a QuadraticCost.
     """
 
     controls = True
 
-    def __init__(self, weight: PerEntry, *, about: PerEntry | None = None) -> None:
-        super().__init__(weight, about)
+    def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
+        super().__init__(weight, about, longer)
 
 
 class LimitCost(Cost):

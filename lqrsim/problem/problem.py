@@ -88,7 +88,7 @@ class Problem:
       dt: the control period in seconds.
       steps: T, the number of control periods.
       initial: c_0, the cost of starting elsewhere than desired (the paper's soft start); or `FixedState(x)`.
-      stage_cost: c, per step: it is *not* multiplied by dt.
+      stage_cost: c, per step: it is *not* multiplied by dt. A QuadraticCost or ControlCost may follow a reference.
       final_cost: c_T.
       control_limits: (lowest, highest) control, each a number or (m,), or a dictionary of name or unit of a control:
         (lowest, highest); by default the actuators' range. Infinite limits mean that the plan has none. Plan and policy
@@ -176,7 +176,7 @@ class Problem:
 
     @property
     def moving(self) -> bool:
-        """Whether the problem depends on the time at which it begins, because obstacles move."""
+        """Whether the problem depends on the time at which it begins, as with obstacles that move or a reference."""
         return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
@@ -210,7 +210,8 @@ class Problem:
         if not after:
             return other
         left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
-        return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
+        stage = self.stage_cost.ahead(after)
+        return other._with(steps=self.steps - after, begin=begin, constraints=left, stage_cost=stage)._bound_anew()
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs. It may begin inside an obstacle if this one does; see `from_state`.
@@ -228,12 +229,22 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later beginning: moving obstacles are at their positions at that time.
+        """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs with
+        a row for each knot begin with a later one and repeat the last.
 
         Args:
-          seconds: the delay in seconds.
+          seconds: the delay in seconds; with such costs, a multiple of dt.
+
+        Raises:
+          InputError: the delay is no such number.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
+        if any(cost.by_knot for cost in terms_of(self.stage_cost)):
+            steps = round(seconds / self.dt)
+            if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
+                want = f"a multiple of dt, {self.dt:g} s, not negative: the stage cost has a row for each knot"
+                raise InputError(f"seconds: got {seconds:g}, want {want}")
+            other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"))
         return other._bound_anew() if self.moving else other
 
     def _bound_anew(self) -> "Problem":
@@ -304,9 +315,19 @@ class Problem:
 
     @property
     def nominal_control(self) -> Array:
-        """u*, (m,), at which the control cost is zero; zeros if there is no control cost."""
+        """u*, (m,), at which the control cost is zero; zeros if there is no control cost. The mean if it has one for
+        each step.
+        """
+        controls = self.nominal_controls
+        return controls if controls.ndim == 1 else controls.mean(axis=0)
+
+    @property
+    def nominal_controls(self) -> Array:
+        """u*, (m,); or (T, m) if the control cost has one for each step."""
         abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
-        return abouts[0] if abouts else np.zeros(len(self.dynamics.control_coordinates))
+        if not abouts:
+            return np.zeros(len(self.dynamics.control_coordinates))
+        return abouts[0] if abouts[0].ndim == 1 else abouts[0][: self.steps]
 
     @property
     def obstacle_costs(self) -> tuple[ObstacleCost, ...]:
@@ -419,7 +440,7 @@ class Problem:
             why = "dynamics that are not a formula"
         elif self.noise is not None:
             why = "noise"
-        elif self.moving:
+        elif any(one.world.moving for one in self.kept_clear):
             why = "obstacles that move"
         if why:
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")

@@ -25,6 +25,7 @@ from lqrsim.errors import (
     excerpt,
     real,
 )
+from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
@@ -339,6 +340,9 @@ def smooth_continuous(
         raise InputError("constraints: got a problem with constraints, want none in continuous time; use `smooth`")
     if problem.noise is not None:
         raise InputError("noise: got a problem with noise, which is per control period, want none; use `smooth`")
+    for cost in terms_of(problem.stage_cost):
+        if cost.by_knot:
+            raise InputError(f"stage_cost: got a {cost.name} with a row for each knot, want one; or use `smooth`")
     if problem.dynamics.discrete:
         raise InputError(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"

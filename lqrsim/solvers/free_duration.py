@@ -198,7 +198,11 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
 def _longer_cost(cost: Cost, n: int) -> Cost:
     """A cost of n states as a cost of n + 1 states, independent of the last state."""
     if isinstance(cost, QuadraticCost):
-        return QuadraticCost(np.pad(cost.weight, (0, 1)), about=np.append(cost.about, 0.0))
+        weight, about = (
+            np.pad(array, [(0, 0)] * (array.ndim - axes) + [(0, 1)] * axes)
+            for array, axes in ((cost.weight, 2), (cost.about, 1))
+        )
+        return QuadraticCost(weight, about=about, longer=cost.longer)
     if isinstance(cost, SymbolicCost):
         return _of_fewer(cost, n)
     if isinstance(cost, (ControlCost, ObstacleCost)):

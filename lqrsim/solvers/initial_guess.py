@@ -187,7 +187,7 @@ def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:
 
 
 def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
-    """The initial guess for a caller's start; by default the problem's nominal control, held constant.
+    """The initial guess for a caller's start; by default the problem's nominal controls.
 
     Raises:
       InputError: it does not fit the problem.
@@ -223,7 +223,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
         controls = check_array("start: controls", start.controls, (steps, m))
         given = Trajectory(states, controls, problem.dt)
         return InitialGuess(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
-    wanted, given = problem.nominal_control if start is None else start, None
+    wanted, given = problem.nominal_controls if start is None else start, None
     try:
         given = numbers_of("start", wanted)
         controls = np.broadcast_to(given, (steps, m))

@@ -534,7 +534,7 @@ class Search:
 
     def _idle(self) -> bool:
         """Whether the best plan does nothing, as when no single control helps from rest, but several together would."""
-        found, nominal = self.best[1], self._problem.nominal_control
+        found, nominal = self.best[1], self._problem.nominal_controls
         off = np.abs(found.controls - nominal).max()
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 

@@ -83,8 +83,9 @@ class Shooting:
         for term in terms_of(cost):
             if isinstance(term, ls.QuadraticCost | ls.ControlCost):
                 place = slice(0, self.n) if isinstance(term, ls.QuadraticCost) else slice(self.n, None)
-                off = points[..., place] - term.about
-                found.append(0.5 * np.einsum("...i,ij,...j->...", off, term.weight, off))
+                about, weight = kkt.quadratic_at(term, self.problem.steps)
+                off = points[..., place] - about
+                found.append(0.5 * np.einsum("...i,...ij,...j->...", off, weight, off))
             elif isinstance(term, ls.SymbolicCost):
                 formula = kkt.numeric(term.function, self.n, self.m, tuple(term.parameters), False)
                 entries = list(np.moveaxis(points, -1, 0))

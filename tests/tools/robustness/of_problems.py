@@ -88,6 +88,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     cost = ls.QuadraticCost([1.0, 1.0, 1.0], about=[0.0, 0.0, 0.0])
     balls = ls.CollisionSpheres(reach, [0.1], level="plain")
     places = balls.bind(cart)
+    short = dataclasses.replace(place.problem, steps=3)
     at, there = {"state": [0.1, 0.2], "control": [0.3]}, {"vector": [0.1, 0.2, 9.0], "near": [0.0, 0.0, 0.0]}
     source = "def value(x, u, t, row, data):\n    return x[0]\n\n\ndef slope(x, u, t, row, data, gradient):\n    pass\n"
     file = place.folder / "cart.xml"
@@ -152,8 +153,24 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "call": lambda weight: dataclasses.replace(place.problem, stage_cost=ls.ControlCost(weight)),
             "weight": {"m/s": 1.0},
         },),
-        "QuadraticCost": ({"weight": [1.0, 2.0], "about": [0.0, 0.0]},),
-        "ControlCost": ({"weight": [[1.0]], "about": [0.0]},),
+        "QuadraticCost": ({"weight": [1.0, 2.0], "about": [0.0, 0.0], "longer": False},),
+        "ControlCost": ({"weight": [[1.0]], "about": [0.0], "longer": False},),
+        "QuadraticCost of rows": ({
+            "call": lambda **stated: dataclasses.replace(short, stage_cost=ls.QuadraticCost(**stated)).from_state(
+                [0.0, 0.0, 0.0], after=1
+            ),
+            "weight": np.tile(np.eye(3), (4, 1, 1)), "about": np.zeros((4, 3)), "longer": False,
+        },),
+        "QuadraticCost of rows by name": ({
+            "call": lambda weight, about: dataclasses.replace(
+                short, stage_cost=ls.QuadraticCost(weight, about=about)
+            ).later(place.problem.dt),
+            "weight": {"m": [1.0, 2.0, 3.0]}, "about": {place.space.names[0]: [0.5, 0.6, 0.7, 0.8]},
+        },),
+        "ControlCost of rows": ({
+            "call": lambda **stated: dataclasses.replace(short, stage_cost=ls.ControlCost(**stated)),
+            "weight": np.tile(np.eye(2), (5, 1, 1)), "about": np.zeros((5, 2)), "longer": True,
+        },),
         "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
         "ObstacleCost of balls": ({"call": ls.ObstacleCost, "world": world, "balls": balls, "weight": 1.0},),
         "ObstacleCost.weighing": ({"self": ls.ObstacleCost(world, radius=0.2), "weight": 2.0},),
@@ -171,12 +188,14 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "convex": True, "level": "plain",
         },),
         **{
-            f"{kind}.__add__": ({"self": one, "other": cost},)
+            f"{kind}.{method}": ({"self": one, **given},)
             for kind, one in {
-                "Cost": cost, "QuadraticCost": cost, "ControlCost": ls.ControlCost([1.0], about=[0.0]),
+                "Cost": cost, "QuadraticCost": ls.QuadraticCost([1.0, 1.0], about=np.eye(5, 2)),
+                "ControlCost": ls.ControlCost([1.0], about=np.ones((4, 1))),
                 "ObstacleCost": ls.ObstacleCost(world, radius=0.2), "SymbolicCost": ls.SymbolicCost(bowl),
                 "FunctionCost": ls.FunctionCost(bowl), "SiteCost": ls.SiteCost("tip", position=(0.0, 0.0, 0.0)),
             }.items()
+            for method, given in (("__add__", {"other": cost}), ("ahead", {"steps": 2, "horizon": "moving"}))
         },
         "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
         "Clearance": ({"world": world, "radius": 0.2, "margin": 0.1},),

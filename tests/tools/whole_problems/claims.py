@@ -89,11 +89,10 @@ def _size(problem: ls.Problem, plan: ls.Trajectory) -> float:
     total = 0.0
     for cost, places in ((problem.stage_cost, plan.states[:-1]), (problem.final_cost, plan.states[-1:])):
         for term in terms_of(cost):
-            if isinstance(term, ls.QuadraticCost):
-                total += float(np.einsum("ti,ij,tj->", np.abs(places), np.abs(term.weight), np.abs(places)))
-            elif isinstance(term, ls.ControlCost):
-                controls = np.abs(plan.controls)
-                total += float(np.einsum("ti,ij,tj->", controls, np.abs(term.weight), controls))
+            if isinstance(term, ls.QuadraticCost | ls.ControlCost):
+                sizes = np.abs(places if isinstance(term, ls.QuadraticCost) else plan.controls)
+                _, weight = kkt.quadratic_at(term, len(sizes))
+                total += float(np.einsum("ti,...ij,tj->...", sizes, np.abs(weight), sizes).sum())
             else:
                 total += len(places) * max(float(np.abs(places).max()) ** 2, 1.0)
     return total

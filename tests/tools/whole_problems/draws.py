@@ -237,6 +237,25 @@ def parking(rng: Generator) -> ls.Problem:
     )
 
 
+def tracking(rng: Generator) -> ls.Problem:
+    """The planar quadrotor along a reference that it need not be able to follow, with weights that change."""
+    problem = planar_quadrotor.draw(rng, clearance=False)
+    steps, hover, goal = problem.steps, problem.nominal_control, problem.goal
+    assert goal is not None
+
+    def walk(size: int, rows: int) -> np.ndarray:
+        return np.cumsum(rng.normal(size=(rows, size)), axis=0) / np.sqrt(rows)
+
+    states = np.linspace(0, 1, steps + 1)[:, None] * goal + 0.5 * walk(6, steps + 1)
+    weights = _weights(rng, 6, 1e-2, 100.0) * np.exp(walk(6, steps + 1))
+    controls, efforts = hover + 0.2 * walk(2, steps), _weights(rng, 2, 0.1, 20.0) * np.exp(walk(2, steps))
+    changing = rng.random() < 0.7
+    stage = ls.QuadraticCost(
+        weights[:, :, None] * np.eye(6) if changing else weights[0], about=states[: steps + int(rng.integers(2))]
+    ) + ls.ControlCost(efforts[:, :, None] * np.eye(2) if changing else efforts[0], about=controls)
+    return replace(problem, stage_cost=stage, final_cost=ls.QuadraticCost(_weights(rng, 6, 1.0), about=states[-1]))
+
+
 KINDS: dict[str, Callable[[Generator], ls.Problem]] = {
     "linear": linear,
     "pendulum": classics.pendulum,
@@ -250,4 +269,5 @@ KINDS: dict[str, Callable[[Generator], ls.Problem]] = {
     "drive": drive,
     "quadrotor": quadrotor,
     "parking": parking,
+    "tracking": tracking,
 }
