@@ -302,7 +302,7 @@ class RareFailures:
         return plain if np.isfinite(plain) else None
 
     def summary(self) -> str:
-        """Two lines: the probability with its interval, and the number of simulated trials; a third if stopped."""
+        """The probability with its interval; the number of simulated trials; what splitting may miss; if stopped."""
         one, plain = self.probability, self.plain_trials
         interval = f"{100 * one.confidence:g} % interval, {len(self.splitting.repetitions)} repetitions"
         needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
@@ -310,9 +310,22 @@ class RareFailures:
             f"probability of failure: {one:.2g} ({interval})",
             f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}",
         ]
+        if self._may_miss:
+            lines.append(
+                f"splitting may miss failures by draws with few values, as of {self._may_miss}; rare_failures(keep=0)"
+                " counts failures"
+            )
         return "\n".join([f"stopped {self.stopped}", *lines] if self.stopped else lines)
 
     __str__ = summary
+
+    @property
+    def _may_miss(self) -> str:
+        """The disturbances whose draws have few values, if there were levels between no failure and failures."""
+        score = self.problem.score
+        drawn = zip(self.problem.disturbances, score.sizes, strict=True)
+        few = [one.describe(score.plant) for one, size in drawn if one.discrete and size]
+        return "; ".join(few) if len(self.splitting.levels) > 1 else ""
 
     def typical(self, count: int = 8) -> Array:
         """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others.
