@@ -154,7 +154,7 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
     return sha256(*parts)
 
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 7, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST = 1 << 26  # bytes, largest manifest
 
@@ -272,4 +272,5 @@ def digest_of_solution(solution: Solution) -> str:
     if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
     arrays += [one.values for one in solution.multipliers]
-    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))
+    rules = policy.state_coordinates.rules, policy.control_coordinates.rules
+    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)), *rules)
