@@ -102,7 +102,8 @@ class Results:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
-        return Outcomes(**columns)
+        deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest["deterministic"]
+        return Outcomes(**columns, deterministic=deterministic)
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """Count the outcomes of a cell's trials, reading one file after the other.
