@@ -38,7 +38,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import disturbance_set, resolve
+from lqrsim.scenarios.references import disturbance_set, from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
@@ -58,7 +58,7 @@ class ReliabilityProblem:
     """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
 
     Attributes:
-      scenario: as in `lqrsim solve`.
+      scenario: as in `lqrsim solve`. Relative paths become absolute.
       sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
         demo.
       strength: factor by which they are scaled.
@@ -87,6 +87,7 @@ class ReliabilityProblem:
 
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
+        keep(self, scenario=from_anywhere(self.scenario))
         check_text("sweep", self.sweep, "a name, such as 'light'")
         keep(self, strength=check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)
@@ -446,7 +447,7 @@ def certify(
     check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")
     every = len(certificate.repetitions)
     count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
-    if scenario is None and ":" in certificate.scenario:
+    if scenario is None and names_code(certificate.scenario):
         raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
     asked: dict[str, Any] = {name: getattr(certificate, name) for name in _ASKED} | {"solution": certificate.solution}
     if scenario is not None:
