@@ -26,7 +26,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_function, check_memory, check_number, check_seed, shaped
 from lqrsim.process import keeping
@@ -135,7 +134,6 @@ def failure_probability(
     if keep:
         rng = np.random.default_rng(first)
         levels, step_sizes, batches = _pilot_run(counted, size, particles, keep, moves, most_levels, rng, level)
-    counts = particles * np.array(batches)
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
@@ -145,7 +143,7 @@ def failure_probability(
         estimates = shares.prod(axis=1)
         error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
         failures, scores = (np.concatenate([one[i] for one in done]) for i in (1, 2))
-        interval = _estimate(shares, counts)
+        interval = _estimate(shares, particles, batches)
         return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
 
     with keeping(lambda _: so_far()):
@@ -159,7 +157,7 @@ def failure_probability(
     if progress is not None:
         progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
     if found is None:
-        trials = repetitions * int(counts[0]) if len(levels) == 1 else 0
+        trials = repetitions * particles * batches[0] if len(levels) == 1 else 0
         raise NoFailure(f"particles: got {particles}, none of which failed, want more of them", trials)
     return found
 
@@ -170,19 +168,20 @@ def check_keep(keep: object, particles: int) -> float:
     return check_number("keep", kept, at_least=2 / particles) if kept else kept
 
 
-def _estimate(shares: Array, counts: npt.NDArray[np.intp]) -> Estimate:
-    """The mean of the estimates with its interval, from the fractions (R, levels) of counts (levels,) above a level."""
+def _estimate(shares: Array, particles: int, batches: Sequence[int]) -> Estimate:
+    """The mean of the estimates with its interval, from the fractions (R, levels) of batches of particles at levels."""
     from scipy import stats
 
     count, levels = shares.shape
     if levels == 1:
-        return rate(round(float(shares.sum()) * int(counts[0])), count * int(counts[0]))
+        vectors = particles * batches[0]
+        return rate(round(float(shares.sum()) * vectors), count * vectors)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
     # Repetitions may agree by chance. Their spread is at least the spread of independent particles at each level.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
-    least = np.sqrt(np.sum((1 - typical) / typical / counts))
+    least = np.sqrt(np.sum((1 - typical) / typical / np.array(batches)) / particles)
     deviation = max(estimates.std(ddof=1) / mean, least)
     half_width = float(stats.t.ppf(0.5 + CONFIDENCE / 2, count - 1) * deviation / np.sqrt(count))
     high = mean / (1 - half_width) if half_width < 1 - mean else 1.0
