@@ -6,8 +6,10 @@
 differences  Success of two policies on the same n trials. The coverage is exact: the sum of the probabilities of all
              outcomes whose interval holds the difference, over a grid of the shares in which only one succeeds.
 rare         `split` of a standard normal number beyond a threshold, whose probability is known, again and again.
+cliff        The same with a second way to fail that the score does not announce.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -17,6 +19,7 @@ import numpy as np
 from runner import Settings, opening, run
 from scipy import stats
 
+from lqrsim.errors import Array
 from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
 
@@ -77,33 +80,56 @@ def differences(config: Config) -> list[dict[str, Any]]:
 
 
 def rare(config: Config) -> list[dict[str, Any]]:
-    found = []
-    for probability, size, particles, repetitions in RARE[::3] if config.quick else RARE:
-        threshold = stats.norm.isf(probability)
-        below = above = none = 0
-        widths = []
-        studies = min(config.studies, 40) if config.quick else config.studies
-        for seed in range(studies):
-            try:
-                one = failure_probability(
-                    lambda z, least=threshold: z[:, 0] - least,
-                    size, particles=particles, repetitions=repetitions, seed=seed,
-                ).probability  # fmt: skip
-            except NoFailure:
-                none += 1
-                continue
-            below += one.high < probability
-            above += one.low > probability
-            widths.append(one.high / one.low)
-        given = studies - none
-        found.append({"probability": probability, "size": size, "particles": particles, "repetitions": repetitions,
-                      "studies": studies, "none": none, "covered": 1 - (below + above) / given, "below": below / given,
-                      "above": above / given, "width": float(np.median(widths))})  # fmt: skip
-    return found
+    cases = RARE[::3] if config.quick else RARE
+    return [coverage(config, beyond(chance), chance, *others) for chance, *others in cases]
+
+
+def cliff(config: Config) -> list[dict[str, Any]]:
+    """Two ways to fail: the score rises towards the one, and not towards the other until it is there."""
+    first, second = 4.0, 4.2
+
+    def hidden(z: Array) -> Array:
+        return np.maximum(z[:, 0] - first, np.where(z[:, 1] > second, z[:, 1] - second, -5 + 0.1 * z[:, 1]))
+
+    chances = stats.norm.sf([first, second])
+    both = float(chances.sum() - chances.prod())
+    return [
+        coverage(config, beyond(float(chances[0])), float(chances[0]), 2, 250, 10),
+        coverage(config, hidden, both, 2, 250, 10),
+    ]
+
+
+def beyond(probability: float) -> Callable[[Array], Array]:
+    """The score of vectors whose first number is that large."""
+    threshold = stats.norm.isf(probability)
+    return lambda z: z[:, 0] - threshold
+
+
+def coverage(
+    config: Config, score: Callable[[Array], Array], probability: float, size: int, particles: int, repetitions: int
+) -> dict[str, Any]:
+    below = above = none = 0
+    widths = []
+    studies = min(config.studies, 40) if config.quick else config.studies
+    for seed in range(studies):
+        try:
+            one = failure_probability(
+                score, size, particles=particles, repetitions=repetitions, seed=seed
+            ).probability  # fmt: skip
+        except NoFailure:
+            none += 1
+            continue
+        below += one.high < probability
+        above += one.low > probability
+        widths.append(one.high / one.low)
+    given = studies - none
+    return {"probability": probability, "size": size, "particles": particles, "repetitions": repetitions,
+            "studies": studies, "none": none, "covered": 1 - (below + above) / given, "below": below / given,
+            "above": above / given, "width": float(np.median(widths))}  # fmt: skip
 
 
 def main(config: Config) -> dict[str, Any]:
-    return opening(config) | {"differences": differences(config), "rare": rare(config)}
+    return opening(config) | {"differences": differences(config), "rare": rare(config), "cliff": cliff(config)}
 
 
 def report(result: dict[str, Any]) -> str:
@@ -111,15 +137,16 @@ def report(result: dict[str, Any]) -> str:
              f"{'trials':>6} {'pairs of shares':>16} {'mean':>7} {'least':>7}  at"]  # fmt: skip
     for one in result["differences"]:
         lines.append(f"{one['trials']:>6} {one['pairs']:>16} {one['mean']:>7.3f} {one['least']:>7.3f}  {one['at']}")
-    lines += ["", f"rare failures, {100 * CONFIDENCE:g} % intervals; coverage, of studies that found a failure",
-              f"{'probability':>11} {'numbers':>8} {'particles':>9} {'repetitions':>11} {'studies':>7} {'none':>5}"
-              f" {'covered':>7} {'too low':>7} {'too high':>8} {'high/low':>8}"]  # fmt: skip
-    for one in result["rare"]:
-        lines.append(
-            f"{one['probability']:>11g} {one['size']:>8} {one['particles']:>9} {one['repetitions']:>11}"
+    for name, what in (("rare", "rare failures"), ("cliff", "one way to fail, and two, of which one is a cliff")):
+        lines += ["", f"{what}, {100 * CONFIDENCE:g} % intervals; coverage, of studies that found a failure",
+                  f"{'probability':>11} {'numbers':>8} {'particles':>9} {'repetitions':>11} {'studies':>7} {'none':>5}"
+                  f" {'covered':>7} {'too low':>7} {'too high':>8} {'high/low':>8}"]  # fmt: skip
+        lines += [
+            f"{one['probability']:>11.3g} {one['size']:>8} {one['particles']:>9} {one['repetitions']:>11}"
             f" {one['studies']:>7} {one['none']:>5} {one['covered']:>7.3f} {one['below']:>7.3f} {one['above']:>8.3f}"
             f" {one['width']:>8.1f}"
-        )
+            for one in result[name]
+        ]
     return "\n".join(lines)
 
 

@@ -2,6 +2,8 @@
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,17 @@ from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
 
 
+@dataclass(frozen=True)
+class Unmoved(ls.disturbances.Disturbance):
+    """A user's: whether it draws during a run is not known."""
+
+    def scaled(self, strength: float) -> "Unmoved":
+        return self
+
+    def start(self, plant: Any, plan: Any, generators: Any) -> ls.disturbances.Effect:
+        return ls.disturbances.Effect()
+
+
 def table_of(outcome: Sequence[str], *, first: int = 0, **columns: ArrayLike) -> Outcomes:
     count = len(outcome)
     over = np.isin(outcome, ("collided", "diverged", "error"))
@@ -24,8 +37,11 @@ def table_of(outcome: Sequence[str], *, first: int = 0, **columns: ArrayLike) ->
         "final": np.where(over, np.nan, 0.02), "clearance": np.where(over, -0.01, 0.3), "effort": 1.0,
         "goal": np.where(over, np.nan, 0.02), "saturated": 0.0, "cost": np.where(over, np.nan, 2.0),
     }  # fmt: skip
+    deterministic = bool(columns.pop("deterministic", False))
     filled = {name: np.broadcast_to(values, count).copy() for name, values in (given | columns).items()}
-    return Outcomes(trial=np.arange(first, first + count), outcome=np.array(outcome), **filled)  # pyright: ignore[reportArgumentType]
+    return Outcomes(
+        deterministic=deterministic, trial=np.arange(first, first + count), outcome=np.array(outcome), **filled
+    )  # pyright: ignore[reportArgumentType]
 
 
 def mixed(reached: int, trials: int) -> Outcomes:
@@ -51,6 +67,51 @@ def test_trials_that_are_all_alike_are_no_sample() -> None:
     cells = Cell("smooth", "calm", 0.0), Cell("open_loop", "calm", 0.0)
     same = table_of(["reached"] * 200, worst=0.1), table_of(["collided"] * 200, worst=0.1)
     assert comparisons(dict(zip(cells, same, strict=True))) == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_equal_outcomes_of_random_trials_are_a_sample(seed: int) -> None:
+    """Exact intervals: of n successes 0.025^(1/n) to 1, and of n failures 0 to 1 - 0.025^(1/n)."""
+    rng = np.random.default_rng(seed)
+    trials, strength, won = int(rng.integers(2, 300)), rng.uniform(0.1, 3), bool(seed % 2)
+    cells = Cell("smooth", "losses", strength), Cell("open_loop", "losses", strength)
+    drawn = table_of(["reached" if won else "timed out"] * trials, worst=0.1)
+    found = success(cells[0], drawn)
+    low, high = found.exact.low, found.exact.high
+    edge = 0.025 ** (1 / trials)
+    assert (low, high) == pytest.approx((edge, 1.0) if won else (0.0, 1 - edge), rel=1e-9)
+    assert not found.alike
+    assert len(comparisons(dict.fromkeys(cells, drawn))) == 1
+    if not won:  # broken only if that is sure
+        assert (breaks({cells[0]: drawn}, below=0.5)[0].strength is None) == (1 - edge >= 0.5)
+    fixed = replace(drawn, deterministic=True)
+    assert success(cells[0], fixed).alike
+    assert comparisons(dict.fromkeys(cells, fixed)) == []
+    assert not success(cells[0], table_of(["reached"] * trials, deterministic=True)).alike  # they differ
+    with pytest.raises(ls.InputError, match="deterministic: got 'yes'"):
+        replace(drawn, deterministic="yes")
+
+
+def test_a_campaign_knows_which_cells_are_random(tmp_path: Path) -> None:
+    """Two trials of each; no command is lost in them."""
+    kinds = ls.disturbances
+    campaign = ls.stress.Campaign(
+        scenario="differential_drive",
+        sweeps={
+            "losses": (kinds.CommandDropouts(1e-5),), "late": (kinds.MeasurementLatency(1),),
+            "both": (kinds.MeasurementLatency(1), kinds.CommandDropouts(1e-5)), "still": (Unmoved(),),
+        },
+        strengths=(0.0, 1.0), policies=("smooth",), trials=2,
+    )  # fmt: skip
+    results = ls.stress.run_campaign(campaign, tmp_path, workers=0)
+    found = {(cell.sweep, cell.strength): one for cell, _, one in results.cell_successes() if one is not None}
+    assert {key: one.alike for key, one in found.items() if key[1]} == {
+        ("losses", 1.0): False, ("late", 1.0): True, ("both", 1.0): False, ("still", 1.0): False,
+    }  # fmt: skip
+    assert all(one.alike for key, one in found.items() if not key[1])
+    assert found["losses", 1.0].exact.low == pytest.approx(0.025**0.5)
+    again = ls.stress.Results(tmp_path)
+    assert [again.outcomes(cell).deterministic for cell in again.cells] == [one.alike for one in found.values()]
 
 
 def test_what_breaks_first_is_sure_to_be_below_the_rate() -> None:

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import lqrsim as ls
 from lqrsim import rotations
 from lqrsim.codegen import compiled_module, disk_cache
 from lqrsim.codegen.compiled_module import CompiledModule
-from lqrsim.codegen.fingerprint import fingerprint
+from lqrsim.codegen.fingerprint import fingerprint, identity
 from lqrsim.codegen.sources import text_source
 from lqrsim.codegen.user_functions import address_of
 
@@ -245,6 +247,54 @@ def scale(x, u, p):
 
 
 FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class Calling:
+    """Has no fingerprint."""
+
+    by: float
+    around: Any = None
+
+    def __call__(self, t: float, x: Any) -> Any:
+        return replace(x, by=self.by)
+
+
+class CallingTwice(Calling):
+    def __call__(self, t: float, x: Any) -> Any:
+        return super().__call__(2 * t, x)
+
+    def method(self, t: float, x: Any) -> Any:
+        return x
+
+
+def test_identities_tell_callables_without_fingerprint_apart() -> None:
+    """By class, fields, arguments, closures, defaults and code; equal ones have one identity, also when new."""
+
+    def made(number: int) -> list[Any]:
+        size, other = 0.1 * number, Calling(number)
+
+        def closure(t: float, x: Any) -> Any:
+            return replace(x, by=size)
+
+        def around(t: float, x: Any, k: float = number) -> Any:
+            return replace(other(t, x), by=1)
+
+        return [
+            Calling(number), CallingTwice(number), Calling(1, Calling(number)), Calling(1, [Calling(number)]),
+            Calling(1, {"a": Calling(number)}), closure, around, partial(closure, number), partial(closure, x=number),
+            partial(Calling(1), number), CallingTwice(number).method,
+        ]  # fmt: skip
+
+    one, again, other = made(3), made(3), made(4)
+    assert all(fingerprint(each) is None for each in one)
+    assert [identity(each) for each in one] == [identity(each) for each in again]
+    assert len({identity(each) for each in (*one, *other)}) == 2 * len(one)
+    assert identity(lambda t, x: replace(x, by=1)) != identity(lambda t, x: replace(x, by=2))
+    assert identity(lambda t, x: replace(x, by=t)) != identity(lambda t, x: replace(x, by=-t))
+    itself = Calling(1, [])
+    itself.around.append(itself)
+    assert identity(itself) == identity(itself)
 
 
 def test_a_fingerprint_covers_what_a_function_refers_to(monkeypatch: pytest.MonkeyPatch) -> None:

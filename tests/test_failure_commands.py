@@ -28,7 +28,7 @@ import dataclasses
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.disturbances import Disturbance, Effect, ForceNoise, Push
+from lqrsim.disturbances import ActuatorLoss, Disturbance, Effect, ForceNoise, MeasurementDropouts, Push
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +55,14 @@ def shifted(std: float = 0.1, most: float = 9.0, steps: int = 1) -> ls.Scenario:
     shift = (Shift(std, most),)  # a robot that is to stay, within its radius of where its plan begins and ends
     near = given.robot.radius
     return dataclasses.replace(given, name="shifted", problem=problem, disturbances=shift, goal_radius=near)
+
+
+def lossy(std: float, *kinds: Disturbance) -> ls.Scenario:
+    return dataclasses.replace(shifted(std), disturbances=(*shifted(std).disturbances, *kinds))
+
+
+def losing(loss: float = 0.1) -> ls.Scenario:
+    return lossy(0.1, MeasurementDropouts(loss), ActuatorLoss("create_wheel_left"))
 
 
 def pushed() -> ls.Scenario:
@@ -164,6 +172,19 @@ def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: 
     rollout = ls.load(tmp_path / "rollout.npz", ls.Rollout)
     assert rollout.outcome == ("collided",)
     assert -0.001 < rollout.clearance[0].min() < 0
+
+
+def test_draws_with_few_values_are_named_where_splitting_may_miss_failures(own: str) -> None:
+    """Not of counted failures, nor draws without such values, nor losses that are not drawn."""
+    losing, shifted = (
+        ls.stress.ReliabilityProblem(f"{own}:{name}", strength=1.5, policy="open_loop")
+        for name in ("losing", "shifted")
+    )
+    named = "few values, as of 15 % of measurements lost; rare_failures(keep=0) counts"
+    options: dict[str, Any] = {"particles": 60, "repetitions": 2}
+    assert named in str(losing.rare_failures(**options))
+    for problem, keep in ((losing, 0.0), (shifted, 0.1)):
+        assert "few values" not in str(problem.rare_failures(**options, keep=keep))
 
 
 def same_files(one: Path, other: Path, name: str) -> None:

@@ -1,6 +1,7 @@
 """A solution that is given in place of a solve: it is what runs, it stays with what was run, and it has to fit."""
 
 import dataclasses
+import hashlib
 import json
 import logging
 import shutil
@@ -20,6 +21,7 @@ from lqrsim.cli import main
 from lqrsim.commands.reliability import Break, Rare
 from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.policies import solve
+from lqrsim.verify.checks import ran_policy_of
 from lqrsim.view import viewer
 
 DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))
@@ -51,6 +53,43 @@ def stored(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> ls.stress.Results:
     return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("given") / "here", workers=0, solution=left)
+
+
+def test_a_campaign_refuses_a_solution_with_other_limits_or_angles(
+    results: ls.stress.Results, left: ls.Solution
+) -> None:
+    controls, states = left.policy.control_coordinates, left.policy.state_coordinates
+    for changed in (
+        {"control_coordinates": controls.limited((-0.1, 0.1))},
+        {"state_coordinates": dataclasses.replace(states, angles=())},
+    ):
+        other = dataclasses.replace(left, policy=dataclasses.replace(left.policy, **changed))
+        with pytest.raises(ls.InputError, match="solution: got another, want "):
+            ls.stress.run_campaign(CAMPAIGN, results.folder, workers=0, solution=other)
+
+
+def test_replanners_are_told_apart_by_what_changes(left: ls.Solution, differential_drive: ls.Scenario) -> None:
+    """Functions that no fingerprint covers."""
+
+    def to(x: float) -> ls.Replanner:
+        def changes(t: float, problem: ls.Problem) -> ls.Problem:
+            return dataclasses.replace(problem, final_cost=ls.QuadraticCost((1.0, 1.0, 1.0), about=(x, 0.0, 0.0)))
+
+        return ls.Replanner(differential_drive.problem, left, every=1.0, changes=changes)
+
+    assert to(1.0).digest == to(1.0).digest != to(2.0).digest
+
+
+def test_rollouts_with_earlier_hashes_are_of_their_policy(left: ls.Solution, differential_drive: ls.Scenario) -> None:
+    """Such a hash leaves out limits and angles; the rollout has them."""
+    policy, run = left.policy, ls.simulate(differential_drive.plant(), left, frames=False)
+    numbers = b"".join(part.tobytes() for part in (policy.gain, policy.offset, policy.nominal, np.array(policy.dt)))
+    earlier = dataclasses.replace(run, policy_digest=hashlib.sha256(numbers).hexdigest()[:16])
+    controls = policy.control_coordinates.limited((-0.1, 0.1))
+    limited = dataclasses.replace(left, policy=dataclasses.replace(policy, control_coordinates=controls))
+    for rollout in (run, earlier):
+        assert ran_policy_of(left, rollout)
+        assert not ran_policy_of(limited, rollout)
 
 
 def shards(folder: Path) -> dict[str, bytes]:

@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,10 @@ from scipy.stats import binom, norm
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import console
+from lqrsim.stress import failure_search
 from lqrsim.stress.hardening import AIM, HardenedPlan, HardeningRound, _Search
+from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
+from lqrsim.stress.statistics import rate
 
 CHANCE, OFFSET = 0.05, 0.25
 FEW: dict[str, Any] = {"chance": CHANCE, "particles": 200, "repetitions": 2}
@@ -140,6 +144,73 @@ def test_it_ends_early_where_all_failing_runs_leave_the_plan(own: str, hardened:
     search.rounds.append(replace(hardened.rounds[0], hit={}, strays=1.0))
     assert search.next() is None
     assert search.shortfall().startswith("all failing runs leave the plan for good")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_splitting_does_not_find_is_counted(
+    own: str, hardened: HardenedPlan, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Splitting that finds nothing; the exact bound of k = 0 in n is 1 - 0.025^(1/n), and n that are too many are not
+    run. Every second plan fails in one of its trials.
+    """
+    chance, asked = 10 ** np.random.default_rng(seed).uniform(-5.5, -2.5), list[tuple[float, int]]()
+
+    def found(self: object, *, particles: int, repetitions: int, keep: float, **_: object) -> Any:
+        asked.append((keep, particles * repetitions))
+        if keep == 0 and seed % 2:
+            return failing
+        raise NoFailure("score: none", particles * repetitions if keep == 0 else 0)
+
+    known = hardened.rare
+    assert known is not None
+    failing = replace(known, splitting=replace(known.splitting, probability=rate(1, 10)))
+    monkeypatch.setattr(ls.stress.ReliabilityProblem, "rare_failures", found)
+    problem = stated(own, solution=hardened.solution)
+    result = ls.stress.harden(problem, chance=chance, particles=100, repetitions=3, rounds=1)
+    needed = np.log(0.025) / np.log1p(-chance)
+    affordable = needed <= 100_000
+    assert result.success == (affordable and seed % 2 == 0)
+    assert [keep for keep, _ in asked] == ([0.1, 0.0] if affordable else [0.1]) * (2 if result.success else 1)
+    assert all(needed <= trials < needed + 60 for keep, trials in asked if keep == 0)
+    if result.success:
+        bound = 1 - 0.025 ** (1 / asked[1][1])
+        assert result.rounds[0].probability.high == pytest.approx(bound, rel=1e-9)
+        assert f"so at most {bound:.2g} of them do" in str(result)
+    elif not affordable:
+        assert "may have missed some, and 0 trials without one prove at most 1; allow more particles:" in result.reason
+        assert result.rounds[0].probability.high == 1.0
+
+
+def test_a_plan_without_failures_is_as_safe_as_its_trials_prove(own: str, hardened: HardenedPlan) -> None:
+    """And is not ranked before a plan that is measured to be safer than that."""
+    search, rng = _Search(stated(own), 1e-6, {}), np.random.default_rng(5)
+    one = hardened.rounds[-1]
+    assert one.rare is not None
+    for _ in range(50):
+        trials = rng.integers(0, 3000, 5)
+        search.rounds = [replace(one, rare=None, unfailing=int(count)) for count in trials]
+        search.rounds.insert(int(rng.integers(6)), one)
+        bounds = [1 - 0.025 ** (1 / count) if count else 1.0 for count in trials]
+        best = search.result("not enough").solution, search.rounds[search.result("not enough").chosen]
+        if min(bounds) > one.rare.probability.value:
+            assert best[1] is one
+        else:
+            assert best[1].unfailing == trials.max()
+
+
+def test_a_plan_that_never_fails_is_proved_by_trials(
+    own: str, hardened: HardenedPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A force of a fiftieth, and a splitting that gives up early."""
+    monkeypatch.setattr(failure_search, "failure_probability", partial(failure_probability, most_levels=2))
+    problem = stated(own, strength=0.02, solution=hardened.solution)
+    found = ls.stress.harden(problem, chance=0.05, particles=20, repetitions=2, rounds=1)
+    assert found.success
+    assert found.rare is None
+    assert found.rounds[0].unfailing == 72  # log(0.025) / log(0.95) = 71.9
+    assert found.save(tmp_path) is None
+    written = json.loads((tmp_path / "harden.json").read_text(encoding="utf-8"))["found"]["rounds"][0]
+    assert written["probability"] == asdict(rate(0, found.rounds[0].unfailing))
 
 
 def test_the_same_seed_gives_the_same_and_another_one_does_not(own: str, hardened: HardenedPlan) -> None:

@@ -53,9 +53,8 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object], *, seals: tup
     manifest = json.loads(path.read_text(encoding="utf-8"))
     change(manifest)
     if "digest" in seals:
-        lasting = {
-            name: manifest[name] for name in ("cells", "model", "problem", "start", "solution", "code", "versions")
-        }
+        names = ("cells", "deterministic", "model", "problem", "start", "solution", "code", "versions")
+        lasting = {name: manifest[name] for name in names}
         lasting["campaign"] = {name: one for name, one in manifest["campaign"].items() if name != "time_limit"}
         lasting["policies"] = {name: hashes["digest"] for name, hashes in manifest["policies"].items()}
         manifest["digest"] = hashlib.sha256(canonical(lasting)).hexdigest()
@@ -102,6 +101,7 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
         m["campaign"].update(sweeps=dict(reversed(m["campaign"]["sweeps"].items()))),
         m.update(cells=m["cells"][4:] + m["cells"][:4]),
     ),
+    "trials that draw nothing": lambda m: m["deterministic"].append(["gusts", 1.0]),
     "another model": lambda m: m.update(model="0" * 64),
     "another policy": lambda m: m["policies"]["smooth"].update(digest="0" * 64),
     "other versions": lambda m: m["versions"].update(numpy="1.0"),

@@ -11,7 +11,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import InputError
 from lqrsim.problem.costs import LimitCost, terms_of
-from lqrsim.scenarios.references import from_anywhere, resolve
+from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 
 
 @pytest.fixture
@@ -104,6 +104,46 @@ def test_numbers_of_the_mjcf_are_by_name(cart: Path) -> None:
 def test_the_path_is_found_from_any_folder(cart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(cart.parent)
     assert from_anywhere("cart.xml,steps=5") == f"{cart},steps=5"
+
+
+@pytest.mark.parametrize("settings", ["", ",start={'slide_x': 1.0}", ",a=1,b={'c': (1, 2)}", ",place=C:/x.py:f"])
+@pytest.mark.parametrize(
+    ("target", "code"),
+    [
+        ("robot.xml", False), (r"C:\robots\arm.xml", False), ("quadrotor", False), ("a/B.XML", False),
+        ("robots.py:arm", True), (r"C:\robots\mine.py:arm", True), ("my_package.robots:hallway", True),
+    ],
+)  # fmt: skip
+def test_what_names_code(target: str, code: bool, settings: str) -> None:
+    """A colon in a setting or a drive's letter does not."""
+    assert names_code(target + settings) == code
+    if code:
+        with pytest.raises(InputError, match="to run that code"):
+            resolve(target + settings, registered_only=True)
+
+
+def test_an_mjcf_is_certified_and_stressed_without_naming_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By a relative path with settings that have colons, found from any folder."""
+    (tmp_path / "slider.xml").write_text(SLIDER, encoding="utf-8")
+    reference = "slider.xml,start={'z': 1.0},goal={'x': 0.5, 'z': 1.0},steps=5"
+    monkeypatch.chdir(tmp_path)
+    problem = ls.stress.ReliabilityProblem(reference, failure="miss", sweep="light", goal_radius=1e-3)
+    assert problem.scenario == ls.stress.Campaign(scenario=reference, sweeps={"none": ()}).scenario
+    assert problem.scenario == f"{tmp_path / 'slider.xml'}{reference[len('slider.xml') :]}"
+    rare = problem.rare_failures(particles=20, repetitions=2, keep=0.0)
+    ls.save(rare.certificate(), tmp_path / "certificate.npz")
+    capsys.readouterr()
+    few = ["--strengths", "1", "--trials", "2", "--policies", "smooth", "--workers", "0", "--out", "run"]
+    assert main(["stress", reference, *few]) == 0
+    report = capsys.readouterr().out.splitlines()[-1].split()
+    monkeypatch.chdir("/")
+    assert main(["certify", str(tmp_path / "certificate.npz")]) == 0
+    assert "as certified, to the last bit" in capsys.readouterr().out
+    results = ls.stress.Results(tmp_path / "run")
+    assert "--scenario" not in (*report, *results.command_of("report").split())
+    assert results.resolved.problem.digest == problem.resolved.problem.digest
 
 
 def test_solve_and_simulate_on_the_command_line(

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import lqrsim as ls
 from lqrsim.control.controllers import Feedback, evaluator, turn_to_nearest
 from lqrsim.solvers import compiled
+from lqrsim.stress.campaign_files import digest_of_solution
 
 
 def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:
@@ -113,7 +114,9 @@ def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fi
 def test_digest_tells_laws_apart(drive_solution: ls.Solution) -> None:
     policy = drive_solution.policy
     parts = policy.gain, policy.offset, policy.nominal, np.array(policy.dt)
-    assert policy.digest == hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()[:16]
+    numbers = b"".join(part.tobytes() for part in parts)
+    rules = policy.state_coordinates.rules + policy.control_coordinates.rules
+    assert policy.digest == hashlib.sha256(numbers + rules.encode()).hexdigest()[:16]
     assert Feedback(policy).digest == policy.digest
     others = [
         dataclasses.replace(policy, **{name: getattr(policy, name) * (1 + 1e-15)})
@@ -121,6 +124,26 @@ def test_digest_tells_laws_apart(drive_solution: ls.Solution) -> None:
     ]
     assert len({policy.digest, *(other.digest for other in others)}) == 5
     assert dataclasses.replace(policy, gain=np.asfortranarray(policy.gain)).digest == policy.digest
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_digests_differ_where_controls_do(drive_solution: ls.Solution, seed: int) -> None:
+    """Drawn limits and wrapping: a digest is the same exactly if both are."""
+    rng, policy = np.random.default_rng(seed), drive_solution.policy
+    controls = policy.control_coordinates.limited((-rng.uniform(0.01, 0.4), rng.uniform(0.01, 0.4)))
+    limited = dataclasses.replace(policy, control_coordinates=controls)
+    straight = dataclasses.replace(policy.state_coordinates, angles=())
+    unwrapped = dataclasses.replace(policy, state_coordinates=straight)
+    state = policy.nominal[0] + (0.0, 0.0, 2 * np.pi)
+    assert not np.array_equal(policy(state, 0.0), unwrapped(state, 0.0))
+    far = policy.nominal[0] + rng.uniform(5, 9, 3)
+    assert not np.array_equal(policy(far, 0.0), limited(far, 0.0))
+    others = [dataclasses.replace(drive_solution, policy=one) for one in (policy, limited, unwrapped)]
+    assert len({one.policy.digest for one in others}) == 3
+    assert len({digest_of_solution(one) for one in others}) == 3
+    same = policy.control_coordinates.limited((policy.control_coordinates.low, policy.control_coordinates.high))
+    again = dataclasses.replace(policy, control_coordinates=same)
+    assert again.digest == policy.digest
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,21 @@ def test_policies_survive(saved: Path, law: ls.OffsetFree, tmp_path: Path, drive
     assert affine.digest == drive_solution.policy.digest
 
 
+def test_digests_differ_where_controls_do(law: ls.OffsetFree) -> None:
+    """Limits, and for output feedback also which states are measured."""
+    policy = law.policy
+    controls, measured = policy.control_coordinates, policy.measured_coordinates
+    others = [
+        policy,
+        replace(policy, control_coordinates=controls.limited((0.0, 0.1))),
+        replace(policy, measured_coordinates=replace(measured, names=measured.names[::-1])),
+        replace(policy, measured_coordinates=replace(measured, units=("",) * len(measured), angles=(0,), position=())),
+    ]
+    assert len({one.digest for one in others}) == 4
+    same = controls.limited((controls.low, controls.high))
+    assert replace(policy, control_coordinates=same).digest == policy.digest
+
+
 def test_the_hash_is_what_the_page_says(saved: Path) -> None:
     arrays, meta = contents(saved)
     assert meta["sha256"] == content_hash(arrays, meta)

@@ -1,6 +1,7 @@
 """Rare failures: trials as functions of numbers, and probabilities by splitting against what is known exactly."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,19 @@ from sampling import rarely
 from scipy import stats
 
 import lqrsim as ls
-from lqrsim.disturbances import Disturbance, ForceNoise, MeasurementNoise, Push
+from lqrsim.disturbances import (
+    DisplacedObstacles,
+    Disturbance,
+    ForceNoise,
+    InitialStateError,
+    MeasurementNoise,
+    Push,
+)
 from lqrsim.simulation.disturbances import preset
 from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import rate
 from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision_score, miss_score
+from lqrsim.templates.my_robot.my_robot import MyRobot
 
 
 def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -254,6 +263,142 @@ def test_what_is_not_rare_needs_no_levels() -> None:
     assert found.probability.low < stats.norm.sf(0.5) < found.probability.high
 
 
+def with_floor(rng: np.random.Generator) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """A score that is the same for nearly all vectors, and its probability. Some jump where they fail."""
+    chance, floor, jump = 10 ** rng.uniform(-3.5, -2.5), rng.uniform(0.01, 0.6), rng.uniform() < 0.5
+    beyond = stats.norm.isf(chance)
+    if jump:
+        return lambda z: np.where(z[:, 0] > beyond, 1.0, -floor), chance
+    return lambda z: np.maximum(z[:, 0] - beyond, -floor), chance
+
+
+def test_scores_that_tie_are_told_apart_by_more_vectors() -> None:
+    """20 drawn scores: each within five standard errors, their mean ratio within four of it. All were refused before,
+    or had an interval up to 1: of 250 vectors none or one is above the tie.
+    """
+    rng, ratios = np.random.default_rng(8), list[float]()
+    for seed in range(20):
+        score, chance = with_floor(rng)
+        found = failure_probability(score, 3, particles=250, repetitions=6, seed=seed)
+        assert abs(found.probability.value - chance) < 5 * found.standard_error, (chance, found)
+        assert found.probability.high < 4 * chance
+        assert (found.scores > 0).all()
+        ratios.append(found.probability.value / chance)
+    assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios, ddof=1) / np.sqrt(len(ratios))
+
+
+def test_more_vectors_at_a_tie_leave_no_bias() -> None:
+    """Few particles, a tie at first and one in the middle: 500 repetitions, against the normal distribution."""
+
+    def score(z: np.ndarray) -> np.ndarray:
+        x = z[:, 0] - 3.2
+        return np.where((x > -0.9) & (x < -0.3), -0.6, np.maximum(x, -1.6))
+
+    found = failure_probability(score, 2, particles=40, moves=2, keep=0.25, repetitions=500, seed=3)
+    assert {-1.6, -0.6} < {*found.levels.tolist()}
+    assert abs(found.probability.value - stats.norm.sf(3.2)) < 4 * found.standard_error
+    assert found.standard_error < 0.1 * stats.norm.sf(3.2)
+
+
+@pytest.mark.parametrize("floor", [0.0, -0.02, -3.0])
+def test_scores_that_all_tie_are_named(floor: float) -> None:
+    with pytest.raises(NoFailure, match=f"scores that tie at {floor:g} after 0 levels, and none of 1,280 ") as refused:
+        failure_probability(lambda z: np.full(len(z), floor), 2, particles=20)
+    assert refused.value.trials == 1280
+    with pytest.raises(NoFailure) as refused:
+        failure_probability(lambda z: np.full(len(z), floor), 2, particles=20, keep=0, repetitions=7)
+    assert refused.value.trials == 140
+    with pytest.raises(NoFailure, match="too rare, or none exist") as refused:
+        failure_probability(along(2, 60.0), 2, particles=20)
+    assert refused.value.trials == 0
+
+
+DOCKED = """
+<mujoco>
+  <option timestep="0.025" integrator="Euler" gravity="0 0 0"/>
+  <worldbody>
+    <geom name="dock" type="cylinder" size="0.1 0.1" pos="{dock} 0 0.07"/>
+    <geom name="pillar" type="cylinder" size="0.15 0.1" pos="0.6 -0.4 0.07"/>
+    <body name="my_robot">
+      <joint name="slide_x" type="slide" axis="1 0 0" damping="0.2"/>
+      <joint name="slide_y" type="slide" axis="0 1 0" damping="0.2"/>
+      <geom type="cylinder" size="0.1 0.03" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push_x" joint="slide_x" ctrlrange="-2 2"/>
+    <motor name="push_y" joint="slide_y" ctrlrange="-2 2"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def docked(gap: float, folder: Path) -> tuple[ls.Plant, ls.Solution]:
+    """A disc that starts at this distance from its dock, and passes a pillar at 0.15 m."""
+    (folder / "docked.xml").write_text(DOCKED.format(dock=-1.2 - gap), encoding="utf-8")
+    robot, scene = MyRobot(), ls.load_scene(folder / "docked.xml")
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.1, steps=40, initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),
+        stage_cost=ls.ControlCost((1.0, 1.0)), final_cost=ls.QuadraticCost((500.0,) * 4, about=(1.2, 0.0, 0.0, 0.0)),
+    )  # fmt: skip
+    return ls.Plant(robot, scene), ls.smooth(problem)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_beside_an_obstacle_hides_no_failure(seed: int, tmp_path: Path) -> None:
+    """Against plain trials. Nearly all have their least clearance at the start, which tells nothing."""
+    gap = np.random.default_rng(seed).uniform(0.005, 0.04)
+    plant, solution = docked(gap, tmp_path)
+    trials = TrialScore(plant, solution, [ForceNoise((0.0, 0.13, 0.0))], threads=1)
+    assert 5 < trials.first < 25
+    numbers = np.random.default_rng(9 + seed).standard_normal((200, trials.size))
+    run, scores = trials.rollout(numbers, frames=False), trials(numbers)
+    assert np.mean(run.clearance.argmin(axis=1) == 0) > 0.97
+    np.testing.assert_array_equal(scores, -run.clearance[:, trials.first :].min(axis=1))
+    assert len(np.unique(scores)) == 200
+    np.testing.assert_array_equal(collision_score(run), -run.clearance.min(axis=1))
+    outside = run.goal_distance - run.goal_radius
+    np.testing.assert_array_equal(miss_score(run, first=trials.first), np.maximum(scores, outside))
+    # What does collide at the start is a failure; what may change the start is not left out.
+    pushed, back = TrialScore(plant, solution, [ForceNoise((0.13, 0.0, 0.0))]), np.full((1, trials.size), -50.0)
+    assert pushed.first > 0
+    assert pushed.rollout(back, frames=False).obstacles == ("dock",)
+    assert pushed(back)[0] > 0
+    for kind in (InitialStateError((0.01, 0.01, 0.0, 0.0)), DisplacedObstacles(0.01)):
+        assert TrialScore(plant, solution, [kind]).first == 0
+    assert docked_far(plant, solution, tmp_path) == 0
+
+
+def docked_far(plant: ls.Plant, solution: ls.Solution, folder: Path) -> int:
+    """The first knot that counts if the pillar is the nearest obstacle, and if nothing is random."""
+    far, plan = docked(0.4, folder)
+    fixed = TrialScore(plant, solution, [Push((0.01, 0.0, 0.0), at=1.0)])
+    return TrialScore(far, plan, [ForceNoise(0.1)]).first + fixed.first
+
+
+def test_the_probability_of_a_start_beside_an_obstacle(tmp_path: Path) -> None:
+    """Against 30,000 plain trials of the equations of motion in NumPy, within four standard errors of the two.
+
+    MuJoCo's Euler step is implicit in the damping: (m + h d) / h (v' - v) = f - d v, x' = x + h v'.
+    """
+    plant, solution = docked(0.02, tmp_path)
+    force, h, rng = 0.15, 0.025, np.random.default_rng(4)
+    x, hit = np.tile([-1.0, 0.0, 0.0, 0.0], (30_000, 1)), np.zeros(30_000, dtype=bool)
+    for gain, offset in zip(solution.policy.gain, solution.policy.offset, strict=True):
+        control = np.clip(x @ gain.T + offset, -2, 2)
+        control[:, 1] += force * rng.standard_normal(len(x))
+        for _ in range(4):
+            v = x[:, 2:] + h * (control - 0.2 * x[:, 2:]) / (0.5 + h * 0.2)
+            x = np.hstack([x[:, :2] + h * v, v])
+            hit |= np.hypot(x[:, 0] - 0.6, x[:, 1] + 0.4) < 0.25
+    p, n = hit.mean(), len(hit)
+    assert 2e-4 < p < 2e-3
+    trials = TrialScore(plant, solution, [ForceNoise((0.0, force, 0.0))], threads=1)
+    found = failure_probability(trials, trials.size, particles=60, moves=2, repetitions=4, seed=1)
+    assert abs(found.probability.value - p) < 4 * np.hypot(found.standard_error, np.sqrt(p / n))
+    assert set(trials.rollout(found.failures, frames=False).obstacles) == {"pillar"}
+
+
 @pytest.mark.long
 def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
@@ -283,7 +428,7 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
         (lambda: failure_probability(lambda z: np.full(len(z), np.nan), 2), "score: got NaN returned"),
         (
             lambda: failure_probability(lambda z: np.minimum(z[:, 0], 1.0) - 2.0, 2),
-            "score: got no failure in .* levels up to -1",
+            "score: got scores that tie at -1 after .* levels, and none of 32,000 above it",
         ),
     ],
 )

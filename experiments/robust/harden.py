@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from runner import interval, progress, table
 
 import lqrsim as ls
+from lqrsim.stress import statistics
 from robust.common import Config
 
 LESS = (1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)  # factors on the predicted chance of the third plan
@@ -55,8 +56,8 @@ def of_query(config: Config, query: int, case: Case) -> dict[str, Any]:
         own = replace(problem, solution=solution)
         try:
             return interval(own.rare_failures(particles=config.hardened, keep=0.0, seed=seed).probability)
-        except ls.stress.NoFailure:
-            return [0.0, 0.0, 0.0]
+        except ls.stress.NoFailure as none:
+            return interval(statistics.rate(0, none.trials))  # counted
 
     first = predicted(asked)
     found = ls.stress.harden(
@@ -64,8 +65,8 @@ def of_query(config: Config, query: int, case: Case) -> dict[str, Any]:
     )
     row: dict[str, Any] = {"query": query, "asked": asked, "success": found.success, "reason": found.reason}
     row["plans"] = len(found.rounds)
-    fresh = [0.0, 0.0, 0.0] if found.rare is None else interval(found.rare.probability)
-    row["hardened"] = {"cost": found.rounds[found.chosen].cost, "measured": fresh}
+    chosen = found.rounds[found.chosen]
+    row["hardened"] = {"cost": chosen.cost, "measured": interval(chosen.probability)}
     row["first"] = {"cost": first.cost, "predicted": first.tube.collision_chance, "measured": measured(first.solution)}
     row["wider"] = None
     for less in LESS if config.hardened >= 100 else LESS[:2]:  # `--quick` tries two

@@ -6,6 +6,8 @@ that it refers to, recursively. NumPy, SymPy and numba count by their versions. 
 cached.
 """
 
+import contextlib
+import dataclasses
 import dis
 import functools
 import importlib.metadata
@@ -13,7 +15,7 @@ import inspect
 import sys
 import types
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -45,6 +47,61 @@ def fingerprint(function: Any) -> str | None:
         return disk_cache.key(*_versions(), *_function(function, {}))
     except (_NoFingerprint, RecursionError):
         return None
+
+
+def identity(function: Any) -> str:
+    """A hash of what can be told of any callable, the same in every process.
+
+    It covers what `fingerprint` covers where that is possible. Of other parts it covers the name, and the bytecode,
+    arguments, closure and globals of functions, the fields of dataclasses, and digests. Two callables that differ only
+    in something else, such as a file that they read, have the same identity.
+    """
+    return fingerprint(function) or disk_cache.key(*_versions(), *_described(function, set()))
+
+
+def _described(value: Any, seen: set[int]) -> Iterator[str]:
+    """The parts of any value, as far as they can be told."""
+    try:
+        parts = list(_value(value, {}))
+    except (_NoFingerprint, RecursionError):
+        parts = [f"{type(value).__qualname__} {getattr(value, '__module__', '')} {getattr(value, '__qualname__', '')}"]
+        if id(value) not in seen:
+            seen.add(id(value))
+            for name, part in _parts(value):
+                parts += [name, *_described(part, seen)]
+    yield from parts
+
+
+def _parts(value: Any) -> Iterator[tuple[str, Any]]:
+    """The parts, by name, of a value that cannot be covered as a whole; of Python's and lqrsim's functions none."""
+    value = getattr(value, "py_func", value)
+    home = str(getattr(value, "__module__", "")).split(".")[0]
+    if isinstance(value, types.FunctionType) and (home == "lqrsim" or home in sys.stdlib_module_names):
+        return
+    if isinstance(digest := getattr(value, "digest", None), str):
+        yield "digest", digest
+    elif isinstance(value, functools.partial):
+        yield from (("func", value.func), ("args", value.args), ("keywords", value.keywords))
+    elif isinstance(value, types.MethodType):
+        yield from (("function", value.__func__), ("self", value.__self__))
+    elif isinstance(value, types.FunctionType):
+        code = value.__code__
+        yield from (("code", code.co_code), ("names", code.co_names), ("defaults", value.__defaults__))
+        yield from (("constant", one) for one in code.co_consts if not isinstance(one, types.CodeType))
+        yield from sorted((value.__kwdefaults__ or {}).items())
+        for name, cell in zip(code.co_freevars, value.__closure__ or (), strict=True):
+            with contextlib.suppress(ValueError):  # not yet assigned
+                yield name, cell.cell_contents
+        yield from ((name, value.__globals__[name]) for name in code.co_names if name in value.__globals__)
+    elif isinstance(value, Mapping):
+        yield from ((f"key {key}" if isinstance(key, str) else "key", one) for key, one in value.items())
+    elif isinstance(value, list | tuple):
+        yield from (("item", one) for one in value)
+    elif not isinstance(value, type | types.ModuleType):
+        if dataclasses.is_dataclass(value):
+            yield from ((field.name, getattr(value, field.name, None)) for field in dataclasses.fields(value))
+        if callable(value):
+            yield "call", type(value).__call__
 
 
 def _version(name: str) -> str:

@@ -220,8 +220,8 @@ class Certify:
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.results.certificate import FailureCertificate
-        from lqrsim.stress.failure_search import certify
         from lqrsim.stress.multilevel_splitting import NoFailure
+        from lqrsim.stress.recheck import certify
 
         certificate = save_load.load(self.file, FailureCertificate)
         console.say(certificate.summary())

@@ -70,7 +70,7 @@ class Stress:
 
     def run(self) -> int:
         from lqrsim.commands import as_json, console
-        from lqrsim.scenarios.references import disturbance_set, folder_name, resolve
+        from lqrsim.scenarios.references import disturbance_set, folder_name, names_code, resolve
         from lqrsim.scenarios.solutions import given
         from lqrsim.stress.campaign import Campaign, run_resolved
         from lqrsim.stress.policies import DEFAULT_POLICIES, impossible_policies
@@ -105,7 +105,7 @@ class Stress:
             results = run_resolved(campaign, scenario, folder, progress=progress, **options)
         console.say(results.summary())
         console.wrote(folder)
-        own = ["--scenario", self.scenario] if ":" in self.scenario else []  # files never choose code to run
+        own = ["--scenario", self.scenario] if names_code(self.scenario) else []  # files never choose code to run
         console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *own])}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))

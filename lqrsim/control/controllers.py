@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
-from lqrsim.codegen.fingerprint import fingerprint
+from lqrsim.codegen.fingerprint import identity
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.kernels import policy_evaluation
@@ -251,9 +251,8 @@ class FunctionController(Controller):
 
     @property
     def digest(self) -> str:
-        """Hash of what the function does, if that can be determined, else of its name."""
-        known = fingerprint(self.function) or f"function {getattr(self.function, '__qualname__', type(self.function))}"
-        return sha256(f"{known} {self.dt!r}")[:16]
+        """Hash of what the function does, as far as that can be told: see `fingerprint.identity`."""
+        return sha256(f"{identity(self.function)} {self.dt!r}")[:16]
 
     @property
     def coordinates(self) -> Spaces:

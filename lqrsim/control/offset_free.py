@@ -251,7 +251,8 @@ class OffsetFree(Controller):
             if self._rule is None
             else (f"{self.problem.digest} {self._rule.periods} {self.replan_always}", self.filter.corrected)
         )
-        return sha256(*parts, numbers, *sources, *again)[:16]
+        rules = (space.rules for space in self.coordinates)
+        return sha256(*parts, numbers, *sources, *again, *rules)[:16]
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.fingerprint import fingerprint
+from lqrsim.codegen.fingerprint import identity
 from lqrsim.control.controllers import Controller, ControllerRun, evaluator
 from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveRequest
 from lqrsim.errors import (
@@ -289,8 +289,8 @@ class Replanner(Controller):
     @property
     def digest(self) -> str:
         rule, when = self.rule, self.rule.when
-        computing = fingerprint(self.computing) if callable(self.computing) else repr(self.computing)
-        changes = fingerprint(rule.changes) if rule.changes is not None else ""
+        computing = identity(self.computing) if callable(self.computing) else repr(self.computing)
+        changes = identity(rule.changes) if rule.changes is not None else ""
         funnel = "" if when is None else f"{when.digest}{rule.share}"
         parts = rule.periods, rule.delay, rule.horizon, rule.predict, self.seed
         return sha256(f"{self.solution.policy.digest} {self.problem.digest} {parts} {computing} {changes}{funnel}")[:16]

@@ -126,6 +126,11 @@ class Coordinates:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def rules(self) -> str:
+        """Limits, and which entries wrap, as text: what controls depend on, for hashes."""
+        return f"{self.low} {self.high} {self.angles} {self.rotation_vectors}"
+
     def _plane(self) -> str:
         """The plane: as given, from the names, or the default. Raises InputError if these contradict each other."""
         check_kind("plane", self.plane, str, f"one of: {', '.join(PLANES)}")

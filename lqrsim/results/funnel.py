@@ -235,8 +235,8 @@ class Funnel:
 
     @property
     def digest(self) -> str:
-        """Hash of the plan, the ellipsoids and their levels."""
-        texts = f"{self.states} {self.plan.dt!r}"
+        """Hash of the plan, the ellipsoids and their levels, and which states wrap."""
+        texts = f"{self.states} {self.plan.dt!r} {self.state_coordinates.rules}"
         return sha256(texts, self.plan.states, self.shape, self.knots, self.levels)[:16]
 
     def summary(self) -> str:

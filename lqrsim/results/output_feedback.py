@@ -80,9 +80,12 @@ class OutputFeedbackPolicy:
 
     @property
     def digest(self) -> str:
-        """Hash of the recursions and their times, 16 hexadecimal digits."""
+        """Hash of everything that the controls depend on, 16 hexadecimal digits."""
         recursions = (value for value in vars(self).values() if isinstance(value, np.ndarray))
-        return sha256(*recursions, np.float64(self.dt))[:16]
+        spaces = self.state_coordinates, self.control_coordinates, self.measured_coordinates
+        # The names say which states are measured.
+        rules = (f"{one.names} {one.rules}" for one in spaces)
+        return sha256(*recursions, np.float64(self.dt), *rules)[:16]
 
     def start(self) -> Array:
         """The state of the filter before the first measurement, (Z,)."""

@@ -53,8 +53,9 @@ class AffinePolicy:
 
     @property
     def digest(self) -> str:
-        """Hash of the laws and their times, 16 hexadecimal digits; `policy_digest` of this policy's rollouts."""
-        return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
+        """Hash of everything that the controls depend on, 16 hexadecimal digits; `policy_digest` of its rollouts."""
+        rules = self.state_coordinates.rules, self.control_coordinates.rules
+        return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt), *rules)[:16]
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "AffinePolicy":
         """The rest of the policy after `steps` steps; see `Solution.shifted`.

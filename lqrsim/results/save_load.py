@@ -36,7 +36,7 @@ FORMATS: dict[type, tuple[str, int]] = {
     AffinePolicy: ("policy", 2),
     OutputFeedbackPolicy: ("output feedback policy", 1),
     Funnel: ("funnel", 2),
-    FailureCertificate: ("certificate", 1),
+    FailureCertificate: ("certificate", 2),
 }
 VERSIONS = dict(FORMATS.values())
 # Fields that older files of the same version lack.

@@ -46,11 +46,11 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     from lqrsim.scenarios.packaged import Scenario
 
     target, settings = _parts(reference)
-    if target.lower().endswith(".xml"):
+    if _is_mjcf(target):
         from lqrsim.scenarios.mjcf import mjcf
 
         return mjcf(target, **_keywords(target, mjcf, settings))  # pyright: ignore[reportArgumentType]
-    if ":" in target:
+    if names_code(reference):
         if registered_only:
             option = shlex.join(["--scenario", reference])
             raise InputError(f"scenario: got a file made with {target!r}, want {option} to run that code")
@@ -82,13 +82,26 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
     return tuple(one for one in found if type(one).__name__ == kind)
 
 
+def names_code(reference: str) -> bool:
+    """Whether the reference names a user's function. Files never choose code to run; MJCFs and names may come from one.
+
+    A colon alone does not tell: settings may have one, and paths on Windows.
+    """
+    target, _ = _parts(reference)
+    return ":" in target and not _is_mjcf(target)
+
+
+def _is_mjcf(target: str) -> bool:
+    return target.lower().endswith(".xml")
+
+
 def from_anywhere(reference: str) -> str:
     """The same reference with absolute paths, so that it works in any working directory."""
     target, settings = _parts(reference)
     place, colon, name = target.rpartition(":")
     if colon and place.endswith(".py"):
         target = f"{Path(place).absolute()}:{name}"
-    if target.lower().endswith(".xml"):
+    if _is_mjcf(target):
         target = str(Path(target).absolute())
     return ",".join([target, *settings])
 

@@ -47,7 +47,7 @@ class Success:
 
     Attributes:
       exact: the rate with Clopper and Pearson's interval, for claims. band: the rate with Wilson's interval, for plots.
-      alike: whether all trials are the same run, as without disturbances; the rate is then exact.
+      alike: whether all trials are the same run, because nothing was drawn; the rate is then exact.
     """
 
     cell: Cell
@@ -63,15 +63,21 @@ def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -
     check_kind("cell", cell, Cell, "a Cell")
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
     exact, band = rate(reached, trials, confidence=confidence), wilson(reached, trials, confidence=confidence)
-    same = alike(outcomes)
+    same = alike(cell, outcomes)
     if same:
         exact = band = Estimate(exact.value, exact.value, exact.value, confidence)
     return Success(cell, reached, trials, exact, band, same)
 
 
-def alike(outcomes: Outcomes) -> bool:
-    """Whether there are several trials, and all are the same run. Trials of which nothing was simulated are none."""
+def alike(cell: Cell, outcomes: Outcomes) -> bool:
+    """Whether there are several trials, and all are the same run: nothing was drawn, as at strength 0.
+
+    Equal outcomes alone are no reason: losses may be so rare that no trial has one. Trials of which nothing was
+    simulated are no runs, and trials that differ, though nothing was drawn, are not the same run.
+    """
     if len(_checked(outcomes)) < 2 or np.isnan(outcomes.ended).any():
+        return False
+    if cell.strength and not outcomes.deterministic:
         return False
     numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
     same = all(np.array_equal(one, np.full_like(one, one[0]), equal_nan=True) for one in numbers)
@@ -140,7 +146,7 @@ def comparisons(table: Table) -> list[Comparison]:
     """Compare the first policy of the table with each other policy, for every sweep and strength that both have.
 
     Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
-    Student's. If all trials of both policies are the same run, there is nothing to test.
+    Student's. If nothing was drawn, all trials of a policy are the same run, and there is nothing to test.
 
     Raises:
       InputError: two policies have different trials.
@@ -152,7 +158,7 @@ def comparisons(table: Table) -> list[Comparison]:
             second = Cell(other, cell.sweep, cell.strength)
             if cell.policy != policies[0] or second not in table:
                 continue
-            if not (alike(table[cell]) and alike(table[second])):
+            if not (alike(cell, table[cell]) and alike(second, table[second])):
                 compared.append(_compared(cell, second, table[cell], table[second]))
     adjusted = holm([one.pairs.p_value for one in compared])
     return [replace(one, adjusted=float(p)) for one, p in zip(compared, adjusted, strict=True)]

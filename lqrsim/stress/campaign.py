@@ -28,6 +28,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
+from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import executors
 from lqrsim.stress.campaign_files import (
     GIVEN,
@@ -118,12 +119,12 @@ def run_resolved(
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
     check_function("progress", progress, "a function of the numbers of finished trials and of all trials", arguments=2)
     given = None if solution is None else solving.given(scenario, solution)
-    _check_runnable(campaign, scenario, given)
+    deterministic = _check_runnable(campaign, scenario, given)
     _check_folder(folder)
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(sole_writer(folder))
-        _write_or_check_manifest(campaign, scenario, folder, given)
+        _write_or_check_manifest(campaign, scenario, folder, given, deterministic)
         results = Results(folder, scenario=campaign.scenario)
         results.resolved = scenario
         unfinished = _unfinished(results)
@@ -156,8 +157,12 @@ def run_resolved(
     return results
 
 
-def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:
-    """Raise InputError for errors that would occur in every trial, before anything is solved or written."""
+def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> list[tuple[str, float]]:
+    """Raise InputError for errors that would occur in every trial, before anything is solved or written.
+
+    Returns:
+      The sweeps and strengths whose disturbances are lqrsim's own and draw nothing. Others may draw during a run.
+    """
     problem, plant = scenario.problem, scenario.plant()
     impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
@@ -171,18 +176,29 @@ def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | No
     if problem.duration is None:
         plant.substeps(problem.dt)
     scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
+    fixed = {(cell.sweep, cell.strength): True for cell in campaign.cells}
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):
+            generator = np.random.default_rng(campaign.seed)
+            untouched, known = generator.bit_generator.state, _is_own(type(disturbance))
             try:
-                disturbance.start(plant, standing, [np.random.default_rng(campaign.seed)])
+                disturbance.start(plant, standing, [generator])
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
             except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
+                known = False
+            fixed[cell.sweep, cell.strength] &= known and generator.bit_generator.state == untouched
     if {*DESIGNED} & {*campaign.policies}:
         design_uncertainty(scenario, campaign.design_disturbances)
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
+    return [pair for pair, drew_nothing in fixed.items() if drew_nothing]
+
+
+def _is_own(kind: type[Disturbance]) -> bool:
+    """Whether a class of disturbances is lqrsim's own."""
+    return kind.__module__.partition(".")[0] == "lqrsim"
 
 
 def _check_folder(folder: Path) -> None:
@@ -195,7 +211,13 @@ def _check_folder(folder: Path) -> None:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty folder or a campaign's")
 
 
-def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path, given: Solution | None) -> None:
+def _write_or_check_manifest(
+    campaign: Campaign,
+    scenario: Scenario,
+    folder: Path,
+    given: Solution | None,
+    deterministic: list[tuple[str, float]],
+) -> None:
     """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
@@ -221,7 +243,10 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
         save_load.save(given, folder / GIVEN)
     remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
     missing = left_out(campaign.policies, impossible_policies(scenario, given))
-    about = {"versions": versions(), "machine": description(), "left_out": missing, "remarks": remarks}
+    about = {
+        "versions": versions(), "machine": description(), "left_out": missing, "remarks": remarks,
+        "deterministic": [list(pair) for pair in deterministic],
+    }  # fmt: skip
     write_manifest(folder, specification | {"policies": policies} | about)
 
 
@@ -248,7 +273,7 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
     used = (*campaign.sweeps.values(), campaign.design_disturbances or ())
     hashes: dict[str, str | None] = {}
     for kind in sorted({type(one) for one in itertools.chain(*used)}, key=lambda kind: kind.__qualname__):
-        if kind.__module__.partition(".")[0] != "lqrsim":
+        if not _is_own(kind):
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
             hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
     return hashes

@@ -154,7 +154,7 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
     return sha256(*parts)
 
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 6, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 7, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST = 1 << 26  # bytes, largest manifest
 
@@ -173,6 +173,7 @@ class _Manifest:
     code: Mapping[str, Line | None]
     policies: Mapping[str, Mapping[str, Line]]
     cells: object
+    deterministic: object
     versions: Mapping[str, Line]
     digest: Line
     machine: Line
@@ -221,6 +222,9 @@ def _check(manifest: dict[str, Any]) -> None:
     _check_names("campaign", campaign, Campaign)
     if canonical(manifest["cells"]) != canonical(_cells(campaign)):
         raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
+    pairs = [[sweep, strength] for _, sweep, strength in manifest["cells"]]
+    if not isinstance(fixed := manifest["deterministic"], list) or any(one not in pairs for one in fixed):
+        raise InputError(f"deterministic: got {excerpt(fixed)}, want a list of pairs of a sweep and a strength")
     if set(manifest["policies"]) != set(campaign["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     for policy, hashes in manifest["policies"].items():
@@ -255,8 +259,8 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
-    """Hash of everything that the rows depend on. It is the same when the same campaign is begun again."""
-    fields = ("cells", "model", "problem", "start", "solution", "code", "versions")
+    """Hash of everything that the rows and their intervals depend on. A campaign that is begun again has the same."""
+    fields = ("cells", "deterministic", "model", "problem", "start", "solution", "code", "versions")
     hashed = {name: manifest[name] for name in fields} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
@@ -272,4 +276,5 @@ def digest_of_solution(solution: Solution) -> str:
     if solution.cost_to_go is not None:  # re-planning begins with the cost-to-go and the multipliers
         arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
     arrays += [one.values for one in solution.multipliers]
-    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))
+    rules = policy.state_coordinates.rules, policy.control_coordinates.rules
+    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)), *rules)

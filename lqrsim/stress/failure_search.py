@@ -38,7 +38,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import disturbance_set, resolve
+from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.campaign_files import digest_of_solution
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
@@ -47,9 +47,12 @@ from lqrsim.stress.policies import POLICIES, check_designed, make_policy
 from lqrsim.stress.specification import disturbances_as_json
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
-from lqrsim.versions import changed, versions
+from lqrsim.versions import versions
 
 FAILURES = {"collision": collision_score, "miss": miss_score}
+ASKED = (  # the fields of a problem that its certificate names
+    "scenario", "sweep", "strength", "policy", "design_disturbances", "failure", "goal_radius", "goal_tolerance",
+)  # fmt: skip
 Report = Callable[[str], object]
 
 
@@ -58,7 +61,7 @@ class ReliabilityProblem:
     """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
 
     Attributes:
-      scenario: as in `lqrsim solve`.
+      scenario: as in `lqrsim solve`. Relative paths become absolute.
       sweep: the name of a set of disturbances, as in `lqrsim stress`; by default the disturbances of the scenario's
         demo.
       strength: factor by which they are scaled.
@@ -87,6 +90,7 @@ class ReliabilityProblem:
 
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=10_000)
+        keep(self, scenario=from_anywhere(self.scenario))
         check_text("sweep", self.sweep, "a name, such as 'light'")
         keep(self, strength=check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)
@@ -139,6 +143,14 @@ class ReliabilityProblem:
     def disturbances(self) -> list[Disturbance]:
         """The disturbances of the set, scaled by the strength. Raises InputError if there is no such set."""
         return [one.scaled(self.strength) for one in disturbance_set(self.sweep, self.resolved)]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The present meaning of the names: disturbances, model and policy. Raises InputError as `score`."""
+        score = self.score
+        law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
+        described = tuple(one.describe(score.plant) for one in self.disturbances)
+        return {"disturbances": described, "model": sha256(self.resolved.scene.xml), "policy_digest": law.digest}
 
     def summary(self) -> str:
         """Lines that describe the run, the failure, and the plan's end. Raises InputError as `score`."""
@@ -305,7 +317,7 @@ class RareFailures:
         return plain if np.isfinite(plain) else None
 
     def summary(self) -> str:
-        """Two lines: the probability with its interval, and the number of simulated trials; a third if stopped."""
+        """The probability with its interval; the number of simulated trials; what splitting may miss; if stopped."""
         one, plain = self.probability, self.plain_trials
         interval = f"{100 * one.confidence:g} % interval, {len(self.splitting.repetitions)} repetitions"
         needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
@@ -313,9 +325,22 @@ class RareFailures:
             f"probability of failure: {one:.2g} ({interval})",
             f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}",
         ]
+        if self._may_miss:
+            lines.append(
+                f"splitting may miss failures by draws with few values, as of {self._may_miss}; rare_failures(keep=0)"
+                " counts failures"
+            )
         return "\n".join([f"stopped {self.stopped}", *lines] if self.stopped else lines)
 
     __str__ = summary
+
+    @property
+    def _may_miss(self) -> str:
+        """The disturbances whose draws have few values, if there were levels between no failure and failures."""
+        score = self.problem.score
+        drawn = zip(self.problem.disturbances, score.sizes, strict=True)
+        few = [one.describe(score.plant) for one, size in drawn if one.discrete and size]
+        return "; ".join(few) if len(self.splitting.levels) > 1 else ""
 
     def typical(self, count: int = 8) -> Array:
         """The random numbers of at most `count` failures, (k, d): first the worst, then a sample of the others.
@@ -333,9 +358,9 @@ class RareFailures:
     def certificate(self) -> FailureCertificate:
         """The probability with everything needed to measure it again; `save` writes it, and `certify` checks it."""
         problem, one = self.problem, self.probability
-        asked = {name: getattr(problem, name) for name in _ASKED}
+        asked = {name: getattr(problem, name) for name in ASKED}
         return FailureCertificate(
-            **asked, **_facts(problem), solution=problem.score.solution, probability=one.value, low=one.low,
+            **asked, **problem.facts, solution=problem.score.solution, probability=one.value, low=one.low,
             high=one.high, confidence=one.confidence, repetitions=self.splitting.repetitions,
             particles=self.options["particles"], seed=self.options["seed"], versions=versions(),
             keep=self.options["keep"],
@@ -359,112 +384,6 @@ class RareFailures:
         written = _write(self.problem, folder, "rare", asked, found, numbers, self.stopped)
         save_load.save(self.certificate(), folder / "certificate.npz")
         return written
-
-
-_ASKED = (
-    "scenario", "sweep", "strength", "policy", "design_disturbances", "failure", "goal_radius", "goal_tolerance",
-)  # fmt: skip
-
-
-def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
-    """The present meaning of the names in a problem: disturbances, model and policy."""
-    score = problem.score
-    law, _ = as_controller(score.controller, score.solution, score.plant.robot.dynamics)
-    described = tuple(one.describe(score.plant) for one in problem.disturbances)
-    return {"disturbances": described, "model": sha256(problem.resolved.scene.xml), "policy_digest": law.digest}
-
-
-@dataclass(frozen=True)
-class Recheck:
-    """The repeated measurement of a certificate.
-
-    Attributes:
-      certificate: the FailureCertificate.
-      measured: the RareFailures with the same seed.
-      differences: a line for each difference of the two; empty if there is none.
-      changed: the reason why the bits may differ, so that only the intervals were compared: another seed, or changed
-        versions; else empty.
-    """
-
-    certificate: FailureCertificate
-    measured: RareFailures
-    differences: tuple[str, ...]
-    changed: str
-
-    def summary(self) -> str:
-        """Lines that describe the repeated measurement and the comparison."""
-        done, asked = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
-        lines = [f"measured again: {done} of {asked} repetitions, {self.measured.splitting.simulations:,} trials"]
-        if self.changed:
-            lines.append(
-                f"{self.measured.probability:.2g}; intervals are compared, for the bits may differ: got {self.changed}"
-            )
-        lines += [f"NOT as certified: {one}" for one in self.differences]
-        if not self.differences:
-            lines.append("as certified: the intervals overlap" if self.changed else "as certified, to the last bit")
-        return "\n".join(lines)
-
-    __str__ = summary
-
-
-def certify(
-    certificate: FailureCertificate,
-    *,
-    repetitions: int | None = None,
-    seed: int | None = None,
-    scenario: str | None = None,
-    report: Report | None = None,
-    progress: Progress | None = None,
-) -> Recheck:
-    """Repeat the measurement of a certificate, in whole or in part.
-
-    Args:
-      certificate: from `RareFailures.certificate`, or `ls.load`.
-      repetitions: number of its repetitions to run, at least 2; by default all.
-      seed: another seed, for fresh random numbers; by default the seed of the certificate.
-      scenario: reference to the scenario if it is your own function: files never choose code to run.
-      report: as in `ReliabilityProblem.rare_failures`.
-      progress: as in `ReliabilityProblem.rare_failures`.
-
-    Returns:
-      A Recheck.
-
-    Raises:
-      InputError: an option is out of range; or the scenario is a user's function, and is not given.
-      NoFailure: no failure was found.
-    """
-    check_kind("certificate", certificate, FailureCertificate, "a FailureCertificate, such as rare.certificate()")
-    every = len(certificate.repetitions)
-    count = every if repetitions is None else check_count("repetitions", repetitions, at_least=2, at_most=every)
-    if scenario is None and ":" in certificate.scenario:
-        raise InputError(f"scenario: got none, want the certificate's scenario, {certificate.scenario}, which is code")
-    asked: dict[str, Any] = {name: getattr(certificate, name) for name in _ASKED} | {"solution": certificate.solution}
-    if scenario is not None:
-        asked["scenario"] = scenario
-    problem = ReliabilityProblem(**asked)
-    now = _facts(problem)
-    differences = [
-        f"{name}: got {value}, want {was}"
-        for name, value in now.items()
-        if value != (was := getattr(certificate, name))
-    ]
-    options: dict[str, Any] = {"particles": certificate.particles, "keep": certificate.keep}
-    options["seed"] = certificate.seed if seed is None else seed
-    measured = problem.rare_failures(repetitions=count, **options, report=report, progress=progress)
-    fresh = f"seed {seed} (was {certificate.seed})" if options["seed"] != certificate.seed else ""
-    others, one = fresh or changed(certificate.versions), measured.probability
-    if others:
-        if one.low > certificate.high or certificate.low > one.high:
-            differences.append(f"probability: got {one:.2g}, want an interval that overlaps")
-    else:
-        pairs = zip(measured.splitting.repetitions.tolist(), certificate.repetitions.tolist(), strict=False)
-        differences += [
-            f"repetition {i}: got {got!r}, want {want!r}" for i, (got, want) in enumerate(pairs) if got != want
-        ]
-        ends = (one.value, one.low, one.high), (certificate.probability, certificate.low, certificate.high)
-        if count == every and ends[0] != ends[1]:
-            differences.append(f"probability with its interval: got {ends[0]}, want {ends[1]}")
-    return Recheck(certificate, measured, tuple(differences), others)
 
 
 @dataclass(frozen=True)
@@ -563,7 +482,7 @@ def write_json(
     asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
         "format": f"lqrsim {name}",
-        "version": 1,
+        "version": 2,
         "asked": asked,
         "disturbances": disturbances_as_json(problem.disturbances),
         "model": sha256(problem.resolved.scene.xml),

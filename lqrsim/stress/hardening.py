@@ -8,12 +8,15 @@ probability. Obstacles that are never hit need no more room than before; there t
 they are most wrong. The law is designed again for each plan.
 
 Room does not help a robot that leaves its plan for good. Such failures are counted separately.
+
+A splitting that finds no failure says nothing about the probability: it may have missed a way to fail. Independent
+trials are then run, and the exact upper bound of their count decides.
 """
 
 import os
 from dataclasses import asdict, dataclass, replace
 from itertools import count
-from math import ceil
+from math import ceil, log, log1p
 from typing import Any
 
 import numpy as np
@@ -46,12 +49,14 @@ from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report, write_json
 from lqrsim.stress.multilevel_splitting import NoFailure, Progress
 from lqrsim.stress.policies import DESIGNED, design_uncertainty, make_controller
+from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 POLICIES = ("smooth", *DESIGNED)  # whose law can be designed for any plan, and predicted
 AIM = 0.5  # of the requested probability, so that the whole interval of the measured one is likely to be below it
 LESS, MORE = 0.8, 2.0  # limits of the factor on a number of standard deviations, from one plan to the next
 COUNTED = 5e-3  # requests from which failures are counted by default; smaller probabilities are cheaper by splitting
 FAILING = 10  # trials of each repetition that fail at the requested probability, if failures are counted
+MOST_COUNTED = 100_000  # trials that are run where splitting found no failure: about as many as two splittings
 SHOWN = 300  # failing runs that are run again, to see where they fail
 MOST = 20  # rounds
 REMEDY = "more range of the controls, less lag, or other tolerances may help"
@@ -65,6 +70,7 @@ class HardeningRound:
       solution: the plan.
       cost: its cost in the scenario's problem.
       rare: its failures; None if none was found.
+      unfailing: number of independent trials that were run if none was found; none of them failed.
       hit: fraction of the failing runs that return to the plan, but hit an obstacle before, by the obstacle's name.
       strays: fraction of the failing runs that leave the plan for good: their simulation diverges, or they end farther
         from it than six standard deviations of the position, where these are largest.
@@ -75,10 +81,19 @@ class HardeningRound:
     rare: RareFailures | None
     hit: dict[str, float]
     strays: float
+    unfailing: int = 0
+
+    @property
+    def probability(self) -> Estimate:
+        """The measured probability of failure; without failures, 0 with the exact upper bound, 1 without trials."""
+        if self.rare is not None:
+            return self.rare.probability
+        return rate(0, self.unfailing) if self.unfailing else Estimate(0.0, 0.0, 1.0, CONFIDENCE)
 
     def __str__(self) -> str:
         if self.rare is None:
-            return f"cost {self.cost:.6g}, no failure found"
+            found = f"none of {self.unfailing:,} trials failed, so at most {self.probability.high:.2g} of them do"
+            return f"cost {self.cost:.6g}, no failure found{f': {found}' if self.unfailing else ''}"
         ranked = sorted(self.hit.items(), key=lambda one: -one[1])
         parts = [f"{100 * share:.0f} % hit {name}" for name, share in ranked if share >= 0.005]
         parts += [f"{100 * self.strays:.0f} % leave the plan for good"] if self.strays >= 0.005 else []
@@ -111,7 +126,10 @@ class HardenedPlan:
 
     @property
     def rare(self) -> RareFailures | None:
-        """The plan's failures; `rare.save` writes them with their certificate. None if none was found."""
+        """The plan's failures; `rare.save` writes them with their certificate. None if none was found.
+
+        A splitting may miss failures, so `success` without them rests on trials that were counted.
+        """
         return self.rounds[self.chosen].rare
 
     @property
@@ -148,7 +166,7 @@ class HardenedPlan:
         """
         folder = check_path("folder", folder, "the path of a folder")
         rounds = [
-            {"cost": one.cost, "hit": one.hit, "strays": one.strays, "probability": _as_json(one.rare)}
+            {"cost": one.cost, "hit": one.hit, "strays": one.strays, "probability": asdict(one.probability)}
             for one in self.rounds
         ]
         found = {
@@ -158,11 +176,6 @@ class HardenedPlan:
         asked = {"chance": self.chance, **self.options}
         write_json(self.problem, self.solution, folder, "harden", asked, found, self.stopped)
         return None if self.rare is None else self.rare.save(folder, shown=shown)
-
-
-def _as_json(rare: RareFailures | None) -> dict[str, float] | None:
-    """The probability with its interval; None if no failure was found."""
-    return None if rare is None else asdict(rare.probability)
 
 
 def harden(
@@ -215,7 +228,7 @@ def harden(
     search, say = _Search(problem, chance, options), report or (lambda line: None)
     seeds, total = count(seed), 2 * rounds * repetitions
 
-    def measure(solution: Solution, what: str) -> RareFailures | None:
+    def measure(solution: Solution, what: str) -> RareFailures | NoFailure:
         used = next(seeds)
         begun = repetitions * (used - seed)
 
@@ -243,6 +256,11 @@ def harden(
                 if search.enough():
                     break
     return search.result(search.shortfall())
+
+
+def _trials_for(chance: float) -> int:
+    """The number of trials without a failure whose exact upper bound is at most the chance."""
+    return ceil(log((1 - CONFIDENCE) / 2) / log1p(-chance))
 
 
 class _Search:
@@ -276,6 +294,8 @@ class _Search:
         if not self.rounds:
             return self.asked.given or self.first()
         last = self.rounds[-1]
+        if last.rare is None:  # nothing tells where the plan needs more room
+            return None
         if not any(name in last.hit for name in self.names):
             self.ended = f"all failing runs leave the plan for good, which more room does not prevent; {REMEDY}"
             return None
@@ -310,17 +330,26 @@ class _Search:
         wanted[critical] = near[critical] * np.clip(quantile / measured, LESS, MORE)
         return wanted
 
-    def failures(self, solution: Solution, seed: int, progress: Progress) -> RareFailures | None:
-        """The failures of a plan; None if none is found."""
+    def failures(self, solution: Solution, seed: int, progress: Progress) -> RareFailures | NoFailure:
+        """The failures of a plan; the NoFailure if none is found, also by enough trials, unless these are too many."""
         options: dict[str, Any] = {name: self.options[name] for name in ("particles", "repetitions")} | {"seed": seed}
         keep = 0.0 if self.chance * options["particles"] >= FAILING else 0.1
+        problem = replace(self.asked, solution=solution)
         try:
-            return replace(self.asked, solution=solution).rare_failures(**options, keep=keep, progress=progress)
-        except NoFailure:
-            return None
+            return problem.rare_failures(**options, keep=keep, progress=progress)
+        except NoFailure as none:
+            needed = _trials_for(self.chance)
+            if none.trials >= needed or needed > MOST_COUNTED:
+                return none
+        options["particles"] = max(20, ceil(needed / options["repetitions"]))
+        try:
+            return problem.rare_failures(**options, keep=0.0, progress=progress)
+        except NoFailure as none:
+            return none
 
-    def add(self, solution: Solution, rare: RareFailures | None) -> None:
+    def add(self, solution: Solution, measured: RareFailures | NoFailure) -> None:
         """Add a plan with its failures, and see how it fails."""
+        rare, unfailing = (None, measured.trials) if isinstance(measured, NoFailure) else (measured, 0)
         plan, place = solution.trajectory, list(self.surroundings.place)
         # Trials of the model, which take long, are needed for moments with a latency or a delay alone.
         samples = None if self.uncertainty.latency or self.uncertainty.delay else 0
@@ -338,25 +367,34 @@ class _Search:
             hits = np.array(run.obstacles)[(away <= STRAY * widest) & (np.array(run.outcome) == "collided")]
             hit = {str(name): float(np.sum(hits == name)) / run.trials for name in np.unique(hits)}
             strays = 1 - len(hits) / run.trials
-        self.rounds.append(HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays))
+        self.rounds.append(
+            HardeningRound(solution=solution, cost=cost, rare=rare, hit=hit, strays=strays, unfailing=unfailing)
+        )
 
     def enough(self) -> bool:
         """Whether the last plan's failures are surely as rare as requested."""
-        rare = self.rounds[-1].rare
-        return rare is None or rare.probability.high <= self.chance
+        return self.rounds[-1].probability.high <= self.chance
 
     def shortfall(self) -> str:
         """Why the last plan is not safe enough, and what may help; empty if it is."""
         if self.enough() or self.ended:
             return self.ended
-        after, strays = f"not after {len(self.rounds)} plans", self.rounds[-1].strays
+        last = self.rounds[-1]
+        if last.rare is None:
+            return (
+                f"splitting found no failure of plan {len(self.rounds)} but may have missed some, and"
+                f" {last.unfailing:,} trials without one prove at most {last.probability.high:.2g}; allow more"
+                f" particles: from {ceil(FAILING / self.chance):,} on failures are counted"
+            )
+        after, strays = f"not after {len(self.rounds)} plans", last.strays
         if strays < 0.5:
             return f"{after}; allow more rounds, or a higher chance"
         return f"{after}, because {100 * strays:.0f} % of the failing runs leave the last one for good; {REMEDY}"
 
     def result(self, reason: str) -> HardenedPlan:
         """The last plan if there is no reason against it, else the safest of the plans so far."""
-        measured = [0.0 if one.rare is None else one.rare.probability.value for one in self.rounds]
+        # A plan without failures is as safe as its trials prove.
+        measured = [(one.probability.high if one.rare is None else one.probability.value) for one in self.rounds]
         chosen = int(np.argmin(measured)) if reason else len(self.rounds) - 1
         return HardenedPlan(
             problem=self.asked, chance=self.chance, options=self.options, rounds=tuple(self.rounds), chosen=chosen,

@@ -10,6 +10,11 @@ unbiased, for any number of particles and moves (Del Moral, Feynman-Kac Formulae
 from the particles themselves, as in subset simulation, would bias it by the order of 1/N (Cerou, Del Moral, Furon &
 Guyader, Statistics and Computing 22, 2012).
 
+The best scores may tie, as the clearance does if the nearest place is the same in all trials. No level then separates
+any of them. The pilot run draws further batches of N vectors until some are above the tie, up to MOST_BATCHES. The
+tie is the level, and each repetition draws as many batches for it, so that some of its vectors are above it too. The
+number of vectors at a level is thus also fixed beforehand, and the estimate stays unbiased.
+
 The interval uses the relative error. The standard deviation of a product grows with its mean, so repetitions that
 happen to be low also vary too little, and Student's interval about them misses the probability. The ratio of standard
 deviation and mean does not depend on the mean. The interval therefore contains each probability p from which the mean
@@ -17,7 +22,7 @@ is at most t standard errors away, with the standard error that belongs to p. It
 vary so much that they give no upper bound, it ends at 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,10 +35,22 @@ Score = Callable[[Array], Array]
 Progress = Callable[[int, int, str], object]  # called with the amount done, the whole amount, and the result so far
 MOST = 10_000  # largest number of repetitions, moves, levels and rounds
 ACCEPTANCE = 0.4  # fraction of accepted moves at which the pilot run aims
+ABOVE = 10  # vectors above a tie with which the pilot run goes on; their number then varies by a third
+MOST_BATCHES = 64  # batches of vectors that the pilot run draws at a tie
 
 
 class NoFailure(InputError):
-    """No failure was found: failures are too rare, or do not exist."""
+    """No failure was found: failures are too rare, do not exist, or the score does not tell what is near them.
+
+    It bounds the probability only as far as independent trials were run.
+
+    Attributes:
+      trials: number of independent trials, none of which failed; 0 after a splitting beyond the first level.
+    """
+
+    def __init__(self, message: str, trials: int = 0) -> None:
+        super().__init__(message)
+        self.trials = trials
 
 
 @dataclass(frozen=True)
@@ -113,10 +130,10 @@ def failure_probability(
     check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
     counted = CountedScore(score)
     first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
-    levels, step_sizes = np.zeros(1), np.zeros(0)
+    levels, step_sizes, batches = np.zeros(1), np.zeros(0), [1]
     if keep:
         rng = np.random.default_rng(first)
-        levels, step_sizes = _pilot_run(counted, size, particles, keep, moves, most_levels, rng, level)
+        levels, step_sizes, batches = _pilot_run(counted, size, particles, keep, moves, most_levels, rng, level)
     done: list[tuple[Array, Array, Array]] = []
 
     def so_far() -> SplittingResult | None:
@@ -126,7 +143,7 @@ def failure_probability(
         estimates = shares.prod(axis=1)
         error = float(estimates.std(ddof=1) / np.sqrt(len(done)))
         failures, scores = (np.concatenate([one[i] for one in done]) for i in (1, 2))
-        interval = _estimate(shares, particles)
+        interval = _estimate(shares, particles, batches)
         return SplittingResult(interval, error, estimates, levels, step_sizes, counted.evaluations, failures, scores)
 
     with keeping(lambda _: so_far()):
@@ -134,12 +151,14 @@ def failure_probability(
             if progress is not None:
                 mean = np.mean([shares.prod() for shares, _, _ in done]) if done else None
                 progress(number, repetitions, "" if mean is None else f"{mean:.2g}")
-            done.append(_repetition(counted, size, particles, moves, levels, step_sizes, np.random.default_rng(key)))
+            rng = np.random.default_rng(key)
+            done.append(_repetition(counted, size, particles, moves, levels, step_sizes, batches, rng))
     found = so_far()
     if progress is not None:
         progress(repetitions, repetitions, f"{0.0 if found is None else found.probability.value:.2g}")
     if found is None:
-        raise NoFailure(f"particles: got {particles}, none of which failed, want more of them")
+        trials = repetitions * particles * batches[0] if len(levels) == 1 else 0
+        raise NoFailure(f"particles: got {particles}, none of which failed, want more of them", trials)
     return found
 
 
@@ -149,19 +168,20 @@ def check_keep(keep: object, particles: int) -> float:
     return check_number("keep", kept, at_least=2 / particles) if kept else kept
 
 
-def _estimate(shares: Array, particles: int) -> Estimate:
-    """The mean of the estimates with its interval, from the fractions (R, levels) above each level."""
+def _estimate(shares: Array, particles: int, batches: Sequence[int]) -> Estimate:
+    """The mean of the estimates with its interval, from the fractions (R, levels) of batches of particles at levels."""
     from scipy import stats
 
     count, levels = shares.shape
     if levels == 1:
-        return rate(round(float(shares.sum()) * particles), count * particles)
+        vectors = particles * batches[0]
+        return rate(round(float(shares.sum()) * vectors), count * vectors)
     estimates = shares.prod(axis=1)
     mean = float(estimates.mean())
     # Repetitions may agree by chance. Their spread is at least the spread of independent particles at each level.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
-    least = np.sqrt(np.sum((1 - typical) / typical) / particles)
+    least = np.sqrt(np.sum((1 - typical) / typical / np.array(batches)) / particles)
     deviation = max(estimates.std(ddof=1) / mean, least)
     half_width = float(stats.t.ppf(0.5 + CONFIDENCE / 2, count - 1) * deviation / np.sqrt(count))
     high = mean / (1 - half_width) if half_width < 1 - mean else 1.0
@@ -192,22 +212,49 @@ def _pilot_run(
     most_levels: int,
     rng: np.random.Generator,
     on_level: Callable[[float], object] | None,
-) -> tuple[Array, Array]:
-    """Find the levels, the last of which is 0, and the step size at all levels except the last."""
+) -> tuple[Array, Array, list[int]]:
+    """Find the levels, the last of which is 0; the step size at all levels except the last; the batches at each."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     levels: list[float] = []
     step_sizes: list[float] = []
+    batches: list[int] = []
     b = 0.5
+
+    def another_batch(vectors: Array, scores: Array) -> tuple[Array, Array]:
+        """As many vectors again, from the distribution above the last level."""
+        if not levels:
+            drawn = rng.standard_normal((particles, size))
+            return drawn, score(drawn)
+        for _ in range(moves):
+            vectors, scores, _ = _crank_nicolson_step(score, vectors, scores, levels[-1], b, rng)
+        return vectors, scores
+
     while len(levels) < most_levels:
-        level = _exceeded_by(keep, scores)
+        level, drawn = min(_exceeded_by(keep, scores), 0.0), 1
         if on_level is not None:
-            on_level(min(level, 0.0))
-        if level >= 0 and (scores > 0).any():
-            return np.array([*levels, 0.0]), np.array(step_sizes)
-        if not (scores > level).any():
-            break
-        vectors, scores = _resample(vectors, scores, level, rng)
+            on_level(level)
+        above, enough = scores > level, min(ABOVE, int(keep * particles))
+        # Later vectors are copies, a few of which may always tie.
+        tie = not levels and np.sum(scores == level) > 1 and above.sum() < enough
+        if tie or not above.any():
+            found = [(vectors[above], scores[above])]
+            while sum(len(some) for _, some in found) < enough and drawn < MOST_BATCHES:
+                vectors, scores = another_batch(vectors, scores)
+                above, drawn = scores > level, drawn + 1
+                found.append((vectors[above], scores[above]))
+            vectors, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        if not len(scores):
+            tied = drawn * particles
+            raise NoFailure(
+                f"score: got scores that tie at {level:g} after {len(levels)} levels, and none of {tied:,} above it:"
+                " the score does not tell which vectors are nearer to failing",
+                0 if levels else tied,
+            )
+        batches.append(drawn)
+        if level == 0:
+            return np.array([*levels, 0.0]), np.array(step_sizes), batches
+        vectors, scores = _resample(vectors, scores, level, particles, rng)
         for _ in range(moves):
             vectors, scores, accepted = _crank_nicolson_step(score, vectors, scores, level, b, rng)
             b = _adapted(b, accepted)
@@ -229,28 +276,41 @@ def _adapted(b: float, accepted: float) -> float:
 
 
 def _repetition(
-    score: Score, size: int, particles: int, moves: int, levels: Array, step_sizes: Array, rng: np.random.Generator
+    score: Score,
+    size: int,
+    particles: int,
+    moves: int,
+    levels: Array,
+    step_sizes: Array,
+    batches: Sequence[int],
+    rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
     """One repetition: the fraction above each level, 0 once no vector is left; and the failures with their scores."""
-    vectors = rng.standard_normal((particles, size))
-    scores = score(vectors)
-    shares = np.zeros(len(levels))
-    for number, (level, b) in enumerate(zip(levels[:-1], step_sizes, strict=True)):
-        shares[number] = np.mean(scores > level)
+    vectors, scores, shares = np.zeros((0, size)), np.zeros(0), np.zeros(len(levels))
+    for number, level in enumerate(levels):
+        kept: list[tuple[Array, Array]] = []
+        for _ in range(batches[number]):
+            if number == 0:
+                moved = rng.standard_normal((particles, size))
+                moved_scores = score(moved)
+            else:
+                last, b = levels[number - 1], step_sizes[number - 1]
+                moved, moved_scores = _resample(vectors, scores, last, particles, rng)
+                for _ in range(moves):
+                    moved, moved_scores, _ = _crank_nicolson_step(score, moved, moved_scores, last, b, rng)
+            above = moved_scores > level
+            kept.append((moved[above], moved_scores[above]))
+        vectors, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+        shares[number] = len(scores) / (particles * batches[number])
         if shares[number] == 0:
-            return shares, vectors[:0], scores[:0]
-        vectors, scores = _resample(vectors, scores, level, rng)
-        for _ in range(moves):
-            vectors, scores, _ = _crank_nicolson_step(score, vectors, scores, level, b, rng)
-    failed = scores > levels[-1]
-    shares[-1] = failed.mean()
-    return shares, vectors[failed], scores[failed]
+            break
+    return shares, vectors, scores
 
 
-def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Replace all vectors by copies of those above the level, equally often, with a random choice for the remainder."""
+def _resample(vectors: Array, scores: Array, level: float, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """As many copies of the vectors above the level, equally often, with a random choice for the remainder."""
     above = np.flatnonzero(scores > level)
-    times, left = divmod(len(scores), len(above))
+    times, left = divmod(count, len(above))
     chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
     return vectors[chosen], scores[chosen]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, keep, numbers_of, shaped
+from lqrsim.errors import Array, InputError, check_flag, check_kind, check_shape, excerpt, keep, numbers_of, shaped
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
 from lqrsim.results.goal import OUTCOMES as OUTCOMES
@@ -30,6 +30,7 @@ class Outcomes:
       effort: integral of the squared applied controls over time, in their unit squared times s.
       saturated: fraction of the control periods with a command at a limit.
       cost: cost of the problem, for the true states and the applied controls; NaN if the trial ended before.
+      deterministic: whether the trials drew nothing, so that all are the same run.
     """
 
     trial: npt.NDArray[np.int64]
@@ -44,6 +45,7 @@ class Outcomes:
     effort: Array
     saturated: Array
     cost: Array
+    deterministic: bool = False
 
     def __post_init__(self) -> None:
         trial = numbers_of("Outcomes: trial", self.trial)
@@ -52,10 +54,11 @@ class Outcomes:
             raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
         if type(self.trial) is not np.ndarray or self.trial.dtype != np.int64:
             keep(self, trial=trial.astype(np.int64))
-        for field in fields(self)[1:]:
-            value, name = getattr(self, field.name), f"Outcomes: {field.name}"
-            if field.name not in ("outcome", "obstacle"):
-                keep(self, **{field.name: shaped(name, value, trial.shape)})
+        check_flag("Outcomes: deterministic", self.deterministic)
+        for field in COLUMNS[1:]:
+            value, name = getattr(self, field), f"Outcomes: {field}"
+            if field not in ("outcome", "obstacle"):
+                keep(self, **{field: shaped(name, value, trial.shape)})
                 continue
             if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
                 raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")
@@ -68,7 +71,10 @@ class Outcomes:
 
     def columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """Name -> column, in order."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: getattr(self, name) for name in COLUMNS}
+
+
+COLUMNS = tuple(field.name for field in fields(Outcomes) if field.name != "deterministic")
 
 
 def outcomes(

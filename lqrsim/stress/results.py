@@ -16,7 +16,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import from_anywhere, resolve
+from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
@@ -102,7 +102,8 @@ class Results:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
-        return Outcomes(**columns)
+        deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest["deterministic"]
+        return Outcomes(**columns, deterministic=deterministic)
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """Count the outcomes of a cell's trials, reading one file after the other.
@@ -338,7 +339,7 @@ class Results:
         for option in options:
             check_text("options", option, "an option, such as --cell", at_most=4000)
         reference = self.manifest["campaign"]["scenario"]
-        own = ["--scenario", reference] if ":" in reference else []
+        own = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
 
 

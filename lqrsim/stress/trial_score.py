@@ -116,7 +116,7 @@ class _CountedDraws(PrescribedDraws):
 LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 
 
-def collision_score(rollout: Rollout) -> Array:
+def collision_score(rollout: Rollout, *, first: int = 0) -> Array:
     """The depth in metres to which each trial enters obstacles, (K,); minus the least clearance without a collision.
 
     The score is positive exactly for trials that collide, diverge or have a failing controller; infinite for the latter
@@ -124,28 +124,43 @@ def collision_score(rollout: Rollout) -> Array:
 
     Args:
       rollout: K trials.
+      first: the first knot whose clearance counts in trials without a collision. See `TrialScore`.
 
     Returns:
       (K,), in metres; positive if the trial fails.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
+    first = check_count("first", first, at_least=0, at_most=rollout.plan.steps)
     depth = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
     outcome = np.array(rollout.outcome)
-    score = np.where(outcome == "collided", np.maximum(depth, LEAST_DEPTH), -rollout.least_clearance())
+    clearance = np.where(rollout.counts, rollout.clearance, np.inf)[:, first:].min(axis=1)
+    score = np.where(outcome == "collided", np.maximum(depth, LEAST_DEPTH), -clearance)
     return np.where(np.isin(outcome, ("diverged", "error")), np.inf, score)
 
 
-def miss_score(rollout: Rollout) -> Array:
+def miss_score(rollout: Rollout, *, first: int = 0) -> Array:
     """The distance by which each trial misses its goal, or a larger `collision_score`, (K,); positive if it fails.
 
     The unit is metres; for a goal without a position, it is the scaled error by which the trial is judged.
 
     Args:
       rollout: K trials.
+      first: as in `collision_score`.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
-    return np.maximum(collision_score(rollout), outside)
+    return np.maximum(collision_score(rollout, first=first), outside)
+
+
+PROBES = 32  # trials that show whether the disturbances can change the clearance of a departure
+STEADY = 20.0  # standard deviations between a clearance and a collision that tells nothing
+
+
+def _departure(clearance: Array) -> int:
+    """The knots (T+1,) before the clearance first falls by a tenth, if it is least there; else 0."""
+    fallen = clearance < 0.9 * np.maximum.accumulate(clearance)
+    first = int(fallen.argmax())
+    return first if first and clearance[:first].min() <= clearance[first:].min() else 0
 
 
 @dataclass
@@ -154,6 +169,10 @@ class TrialScore:
 
     A trial fails if its score is positive. Standard normal numbers give trials with the same distribution as in
     `simulate`.
+
+    If the robot starts close beside an obstacle and leaves it, its least clearance is the same in nearly all trials and
+    does not tell which of them are near a failure. `collision_score` and `miss_score` then leave out the knots until it
+    has left, as far as the clearance there is more than 20 of its standard deviations.
 
     Args:
       plant: the simulated robot.
@@ -169,6 +188,7 @@ class TrialScore:
 
     Attributes:
       sizes: number of random numbers that each disturbance draws.
+      first: the first knot whose clearance counts in trials without a collision.
       simulations: number of trials that have been run.
     """
 
@@ -192,8 +212,18 @@ class TrialScore:
         check_count("batch", self.batch)
         check_count("simulations", self.simulations, at_least=0)
         draws = [_CountedDraws() for _ in self.disturbances]
-        self._simulate(1, lambda trial, stream: draws[stream], frames=False)
+        usual = self._simulate(1, lambda trial, stream: draws[stream], frames=False)
         self.sizes = tuple(one.used for one in draws)
+        self.first = self._first(_departure(usual.clearance[0])) if self.failure in (collision_score, miss_score) else 0
+
+    def _first(self, departure: int) -> int:
+        """The first knot whose clearance counts, at most `departure`."""
+        if not (departure and self.size):
+            return 0
+        numbers = np.random.default_rng(0).standard_normal((PROBES, self.size))
+        clearance = self.rollout(numbers, frames=False).clearance[:, :departure]
+        steady = clearance.mean(axis=0) > STEADY * clearance.std(axis=0)
+        return departure if steady.all() else int(steady.argmin())
 
     @property
     def size(self) -> int:
@@ -217,7 +247,9 @@ class TrialScore:
 
     def _score(self, rollout: Rollout) -> Array:
         """The scores of a rollout. Raises InputError unless they are one number per trial."""
-        scores = shaped("failure: returned", self.failure(rollout), (rollout.trials,))
+        # Only lqrsim's own scores leave knots out.
+        found = self.failure(rollout, first=self.first) if self.first else self.failure(rollout)  # pyright: ignore[reportCallIssue]
+        scores = shaped("failure: returned", found, (rollout.trials,))
         if np.isnan(scores).any():
             raise InputError(f"failure: returned {excerpt(scores.tolist())}, want numbers: positive is failure")
         return scores

@@ -2,7 +2,7 @@
 
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.stress.campaign_files import Table, pack
-from lqrsim.stress.outcome_table import Outcomes, outcomes
+from lqrsim.stress.outcome_table import COLUMNS, Outcomes, outcomes
 from lqrsim.stress.policies import POLICY_KINDS, make_controller
 from lqrsim.stress.specification import Campaign, Cell, Shard
 
@@ -143,6 +143,6 @@ _prepared: dict[str, Trials] = {}  # trials of the last job that this process wo
 
 
 def _failed_rows(first: int, count: int, reason: str) -> Table:
-    columns: Table = {column.name: np.full(count, np.nan) for column in fields(Outcomes)}
+    columns: Table = dict.fromkeys(COLUMNS, np.full(count, np.nan))
     columns |= {"trial": np.arange(first, first + count), "outcome": np.full(count, "error")}
     return columns | {"obstacle": np.full(count, ""), "reason": np.full(count, reason)}

@@ -176,6 +176,8 @@ class ActuatorLoss(Disturbance):
     at: float = 0.0
     remaining: float = 0.0
 
+    discrete = True
+
     def __post_init__(self) -> None:
         if self.actuator is not None and not isinstance(self.actuator, str):
             raise InputError(f"ActuatorLoss: actuator: got {excerpt(self.actuator)}, want a name, or None to draw one")

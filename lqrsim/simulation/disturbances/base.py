@@ -94,8 +94,14 @@ class Effect:
 
 
 class Disturbance(abc.ABC):
-    """Base class of all disturbances."""
+    """Base class of all disturbances.
 
+    Attributes:
+      discrete: whether its draws have few values, such as those that decide on a loss. Failures that such draws alone
+        cause can be missed by a splitting.
+    """
+
+    discrete: ClassVar[bool] = False
     _scales: ClassVar[str] = ""  # the field of a dataclass that is proportional to the effect
 
     def describe(self, plant: Plant) -> str:

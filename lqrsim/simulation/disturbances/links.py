@@ -146,6 +146,7 @@ class Dropouts(Disturbance):
     loss: float | GilbertElliott
 
     what: ClassVar[str]
+    discrete = True
     known_as: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:

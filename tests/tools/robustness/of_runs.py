@@ -232,8 +232,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "TrialScore": ({field: getattr(score, field) for field in fields}, 0.5),
         "TrialScore.__call__": ({"self": score, "numbers": np.zeros((2, score.size))},),
         "TrialScore.rollout": ({"self": score, "numbers": np.zeros((2, score.size)), "frames": False},),
-        "collision_score": ({"rollout": place.rollout},),
-        "miss_score": ({"rollout": place.rollout},),
+        "collision_score": ({"rollout": place.rollout, "first": 1},),
+        "miss_score": ({"rollout": place.rollout, "first": 1},),
         "failure_probability": (searching | {
             "particles": 20, "keep": 0.25, "moves": 1, "repetitions": 2, "most_levels": 5,
             "level": print_nothing, "progress": print_nothing,

@@ -37,6 +37,7 @@ HOOKS |= {
 }
 HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for name in ("step", "states", "place")}
 HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
+HOOKS |= {"TrialScore.failure"}  # a field, whose default is a function
 
 RAISES = {"Results.read": (Damaged,)}
 
