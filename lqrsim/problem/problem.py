@@ -404,7 +404,8 @@ class Problem:
             return
         low, high = check_array("duration", self.duration, (2,)).tolist()
         stated = self.steps * self.dt
-        if not 0 < low < high or not low <= stated <= high:
+        spare = 1e-9 * stated  # rounding: 3 * 0.1 is more than 0.3
+        if not 0 < low < high or not low - spare <= stated <= high + spare:
             raise InputError(
                 f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
             )
