@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
+from lqrsim.errors import check_symmetric
 from lqrsim.solvers import compiled
 
 
@@ -250,6 +251,31 @@ def test_bad_parts_get_one_line(make, message: str) -> None:
     with pytest.raises(ls.InputError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=examples(50), deadline=None)
+@given(
+    st.integers(0, 2**32 - 1), st.integers(2, 6), st.sampled_from([(), (5,), (2, 3)]), st.sampled_from([1e-200, 1, 1e9])
+)
+def test_what_is_symmetric_is_measured_by_the_largest_entry_of_its_matrix(
+    seed: int, n: int, leading: tuple[int, ...], size: float
+) -> None:
+    """An entry off by 1e-12 of that is rounding; one that is off by 1e-8 is an error, and the message names it."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(*leading, n, n))
+    matrices = size * 10.0 ** rng.uniform(-9, 0, (*leading, 1, 1)) * (roots + np.swapaxes(roots, -1, -2))
+    np.testing.assert_array_equal(check_symmetric("it", matrices), matrices)
+    where, (i, j) = tuple(int(rng.integers(k)) for k in leading), rng.choice(n, 2, replace=False).tolist()
+    largest, before = np.abs(matrices[where]).max(), matrices[(*where, i, j)]
+    matrices[(*where, i, j)] = before + 1e-12 * largest
+    found = check_symmetric("it", matrices)
+    np.testing.assert_array_equal(found, np.swapaxes(found, -1, -2))
+    np.testing.assert_allclose(found, matrices, rtol=0, atol=1e-12 * largest)
+    matrices[(*where, i, j)] = before + 1e-8 * largest
+    with pytest.raises(ls.InputError, match=r"it: got .* and .*, want a symmetric matrix") as caught:
+        check_symmetric("it", matrices)
+    assert str([*where, i, j]) in str(caught.value)
+    assert str([*where, j, i]) in str(caught.value)
 
 
 def test_an_obstacle_cost_needs_a_position() -> None:

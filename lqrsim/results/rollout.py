@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
+from lqrsim.errors import Array, InputError, check_count, check_symmetric, excerpt, vectors_of
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
@@ -169,15 +169,11 @@ class Rollout:
                     f"{size} by {size} matrices, as the position has entries" if size else "None without a position"
                 )
                 raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {wanted}")
-            scale = np.abs(self.tube).max(axis=(1, 2), keepdims=True)
-            relative = self.tube / np.where(scale > 0, scale, 1.0)
-            # Rounding may leave the last digits asymmetric.
-            skewed = np.abs(relative - relative.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-9
-            negative = np.linalg.eigvalsh(relative)[:, 0] < -1e-9
-            for wrong, want in ((skewed, "a symmetric matrix"), (negative, "no negative variance")):
-                if wrong.any():
-                    at = int(np.argmax(wrong))
-                    raise InputError(f"Rollout: tube: got {excerpt(self.tube[at].tolist())} at knot {at}, want {want}")
+            check_symmetric("Rollout: tube", self.tube)
+            negative = np.linalg.eigvalsh(self.tube)[:, 0] < -1e-9 * np.abs(self.tube).max(axis=(1, 2))
+            if negative.any():
+                at, want = int(np.argmax(negative)), "no negative variance"
+                raise InputError(f"Rollout: tube: got {excerpt(self.tube[at].tolist())} at knot {at}, want {want}")
 
     def _check_endings(self) -> None:
         """Raises InputError unless trials ended within the run, by named events."""
