@@ -48,7 +48,7 @@ from lqrsim.scenes.world import World
 FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CostTerm(Term):
     """A cost term, for one system: the source to compile, and the numbers that it reads.
 

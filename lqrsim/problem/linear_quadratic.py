@@ -10,7 +10,7 @@ from lqrsim.errors import Array, InputError, check_array, check_memory, check_sy
 from lqrsim.results.value_functions import Quadratic
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
     """Linear dynamics and a quadratic cost.
 

@@ -30,7 +30,7 @@ FAMILIES = ("cost_to_go", "tube", "given")
 FLAT = 1e-13  # smallest eigenvalue of a shape scaled to a unit diagonal, below which the ellipsoid is flat
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
     """Ellipsoids about a plan, at some knots, from which runs succeed at a stated rate.
 

@@ -16,7 +16,7 @@ from lqrsim.results.goal import Target, endings, scale_of, tracking_error, track
 from lqrsim.results.solution_parts import Trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BallRecord:
     """Positions of a robot's balls in its runs and in the plan, for pictures.
 
@@ -54,7 +54,7 @@ class BallRecord:
         return int(body), np.array(place)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rollout:
     """Closed-loop runs of one controller in MuJoCo, with all data for drawing them.
 

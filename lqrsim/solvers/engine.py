@@ -204,7 +204,7 @@ def check_finite_at_start(
     return ending
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 

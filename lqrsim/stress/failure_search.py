@@ -53,7 +53,7 @@ FAILURES = {"collision": collision_score, "miss": miss_score}
 Report = Callable[[str], object]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReliabilityProblem:
     """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
 
@@ -271,7 +271,7 @@ class ReliabilityProblem:
         return report_level
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RareFailures:
     """The probability that a policy fails, and typical failures.
 
@@ -371,7 +371,7 @@ def _facts(problem: ReliabilityProblem) -> dict[str, Any]:
     return {"disturbances": described, "model": sha256(problem.resolved.scene.xml), "policy_digest": law.digest}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recheck:
     """The repeated measurement of a certificate.
 
@@ -464,7 +464,7 @@ def certify(
     return Recheck(certificate, measured, tuple(differences), others)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SmallestFailure:
     """The failure nearest to the undisturbed trial, and the contribution of each disturbance.
 

@@ -205,7 +205,7 @@ def _search(
         progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}; {run:,} trials")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FunnelCheck:
     """New trials at a knot of a funnel.
 

@@ -36,7 +36,7 @@ class NoFailure(InputError):
     """No failure was found: failures are too rare, or do not exist."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SplittingResult:
     """An estimate of the probability of failure.
 

@@ -148,7 +148,7 @@ def miss_score(rollout: Rollout) -> Array:
     return np.maximum(collision_score(rollout), outside)
 
 
-@dataclass
+@dataclass(eq=False)
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 
