@@ -13,12 +13,39 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import check_symmetric
+from lqrsim.problem.costs import CostSum
 from lqrsim.solvers import compiled
 
 
 def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
     a, b, c = (ls.ControlCost([weight], about=[0.0]) for weight in (1.0, 2.0, 3.0))
     assert ((a + b) + c).terms == (a + (b + c)).terms == (a, b, c)
+    summed = sum([a, b + c])
+    assert isinstance(summed, CostSum)
+    assert summed.terms == (a, b, c)
+    assert sum([a]) is a
+    for other in (1, 0.5, None):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            _ = other + a  # pyright: ignore[reportOperatorIssue]
+
+
+@given(seed=st.integers(0, 2**32 - 1), m=st.integers(1, 4), count=st.integers(0, 4))
+@settings(max_examples=examples(30), deadline=None)
+def test_the_nominal_control_is_where_all_control_costs_together_are_least(seed: int, m: int, count: int) -> None:
+    """By least squares of the roots, to 1e-9: the weights are well conditioned."""
+    rng, names = np.random.default_rng(seed), [f"u{i}" for i in range(m)]
+    roots = np.eye(m) + 0.3 * rng.normal(size=(count, m, m))
+    abouts = rng.normal(size=(count, m))
+    costs = [ls.ControlCost(root.T @ root, about=about) for root, about in zip(roots, abouts, strict=True)]
+    problem = ls.Problem(
+        dynamics=ls.Dynamics(lambda x, u, p: [sum(u)], states={"x": ""}, controls=dict.fromkeys(names, "")),
+        dt=0.1, steps=2, initial=ls.FixedState([0.0]), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+        stage_cost=sum(costs, start=ls.QuadraticCost([1.0], about=[0.0])),
+    )  # fmt: skip
+    least = np.zeros(m)
+    if count:
+        least = np.linalg.lstsq(roots.reshape(-1, m), np.einsum("kij,kj->ki", roots, abouts).ravel())[0]
+    np.testing.assert_allclose(problem.nominal_control, least, rtol=0, atol=1e-9 * max(1, np.abs(least).max()))
 
 
 @pytest.mark.parametrize("constant", [0, 3, -2, 0.5])

@@ -229,7 +229,8 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
         given = space._by_name(field, numbers, check_number)
         missing = [name for i, name in enumerate(space.names) if i not in given]
         if missing and above is not None:
-            raise InputError(f"{field}: got none for {', '.join(missing)}, want one for each state, by name or unit")
+            wanted = f"one for each of {', '.join(space.names)}, by name or unit"
+            raise InputError(f"{field}: got none for {', '.join(missing)}, want {wanted}")
         values = np.array([given.get(i, 0.0) for i in range(len(space))])
     elif real(field, numbers).ndim == 0:
         values = np.full(len(space), check_number(field, numbers))

@@ -164,6 +164,10 @@ class Cost(ProblemPart[CostTerm]):
     def __add__(self, other: "Cost") -> "CostSum":
         return CostSum((*terms_of(self), *terms_of(other)))
 
+    def __radd__(self, other: object) -> "Cost":
+        """`sum(costs)` begins with 0."""
+        return self if type(other) is int and other == 0 else NotImplemented
+
 
 class CostSum(Cost):
     """The result of `+`: the terms, in order."""

@@ -304,9 +304,14 @@ class Problem:
 
     @property
     def nominal_control(self) -> Array:
-        """u*, (m,), at which the control cost is zero; zeros if there is no control cost."""
-        abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
-        return abouts[0] if abouts else np.zeros(len(self.dynamics.control_coordinates))
+        """u*, (m,), at which the sum of the ControlCosts is least; zeros if there is none."""
+        costs = [cost for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
+        if len(costs) == 1:
+            return costs[0].about
+        if not costs:
+            return np.zeros(len(self.dynamics.control_coordinates))
+        weighed = sum(cost.weight @ cost.about for cost in costs)
+        return np.linalg.solve(sum(cost.weight for cost in costs), weighed)
 
     @property
     def obstacle_costs(self) -> tuple[ObstacleCost, ...]:
