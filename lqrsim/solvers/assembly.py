@@ -111,7 +111,8 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
         return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of one like it"
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
-        return f"raise max_iterations: the cost still fell in the last one, by {fell:.2g} to {log[-1].cost:.6g}"
+        costs = f"by {fell:.2g}; the plan costs {found.cost:.6g}"
+        return f"raise max_iterations: the cost still fell in the last one, {costs}"
     limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
     if status is not Status.TIME_LIMIT and can_be_exact(problem) and paper and (problem.constraints or limited):
