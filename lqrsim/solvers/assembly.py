@@ -47,9 +47,10 @@ def assemble(
             control_coordinates=problem.applied_coordinates,
         )  # fmt: skip
 
+    nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
-        "inverse_policy": lambda: policy(*inverse_law, states[1:]) if inverse_law is not None else None,
-        "clearance": lambda: clearance_of(problem, states),
+        "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
+        "clearance": lambda: clearance_of(problem, nominal),
         "problem_digest": lambda: problem.digest,
     }
     return Solution._assembled(
@@ -57,7 +58,7 @@ def assemble(
         status=found.status,
         detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
         remedy=remedy_of(problem, found, log, options),
-        policy=policy(*law, states[:-1]),
+        policy=policy(*law, nominal[:-1]),
         cost_to_go=_copied(found.values.get("cost_to_go")),
         cost_to_come=_copied(found.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
