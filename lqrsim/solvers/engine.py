@@ -524,26 +524,25 @@ class SolveRun:
         """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
         values = self.work.constraint_values(found.states, found.controls)
         violation = self.work.violation(values)
-        value, plan = found.values.get("cost_to_go"), Motion(found.states, found.controls)
+        value = found.values.get("cost_to_go")
         certificate, wrong = certified(
-            self.problem,
-            lambda task, to_go, out: self._loop(*self._check_arguments(task, plan, found.law, to_go, out)),
+            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, found, to_go, out)),
             found.states, value, violation=violation, kept=self.work.keeps(values),
             claimed=self.budget.log[-1].cost if found.success else None,
             tolerance=self.final if found.status is Status.CONVERGED else None,
         )  # fmt: skip
         if self.problem.noise_term is not None and self.problem.constraint_terms:
-            certificate = replace(certificate, cost=self._expected_cost(plan, found.law))
+            certificate = replace(certificate, cost=self._expected_cost(found))
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
             return found
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
-    def _expected_cost(self, plan: Motion, law: tuple[Array, Array]) -> float:
+    def _expected_cost(self, found: RunResult) -> float:
         """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
-        out, none = np.zeros(1, CERTIFICATE), _no_value(plan)
-        task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, plan, law, none, out)
+        out, none = np.zeros(1, CERTIFICATE), _no_value(found.states)
+        task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
         self._loop(task, first, last, options, self._without_penalties(), *rest)
         return float(out[0]["cost"])
 
@@ -565,7 +564,7 @@ class SolveRun:
         term, arrays = self.problem.noise_term, self.work.arrays
         if term is None or not (term.active or self.problem.risk):
             return
-        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), _no_value(plan)
+        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), _no_value(plan.states)
         task, first, last, options, _, *_ = self._plan_arguments(declarations.LINEARIZE, 0, 0, rows)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
@@ -621,11 +620,11 @@ class SolveRun:
         return task, first, last, options, work.model, arrays, work.memory_rows, rows
 
     def _check_arguments(
-        self, task: int, plan: Motion, law: tuple[Array, Array], to_go: CostToGo, certificate: StructuredArray
+        self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
-        work = self.work
-        arrays = work.arrays._replace(to_go=to_go, last=plan, last_policy=Policy(*law), certificate=certificate)
+        work, plan = self.work, Motion(found.states, found.controls)
+        arrays = work.arrays._replace(to_go=to_go, last=plan, last_policy=Policy(*found.law), certificate=certificate)
         options = self._options(self._rows, self.final)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
@@ -641,9 +640,9 @@ class SolveRun:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
 
 
-def _no_value(plan: Motion) -> CostToGo:
-    """An empty cost-to-go along a plan."""
-    knots, n = plan.states.shape
+def _no_value(states: Array) -> CostToGo:
+    """An empty cost-to-go along states (T+1, n)."""
+    knots, n = states.shape
     return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
