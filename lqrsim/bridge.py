@@ -55,7 +55,7 @@ ODOMETRY = ("x", "y", "z", "vx", "vy", "vz", "rx", "ry", "rz", "wx", "wy", "wz",
 Bridgeable = Plan | AffinePolicy | OutputFeedbackPolicy | Controller | LiveReplanner
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Bridged:
     """The record of a controller's run, up to the safe command.
 

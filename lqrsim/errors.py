@@ -304,19 +304,35 @@ def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) ->
             wanted += "; for weights that change with time, one matrix for each knot: rows[:, :, None] * np.eye(n)"
         raise InputError(f"{field}: got {got}, want {wanted}")
     matrix = check_array(field, matrix, matrix.shape)
-    scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)
-    skew = np.abs(matrix - matrix.T)
-    if skew.max(initial=0.0) > 1e-9 * scale:
-        i, j = (int(k) for k in np.argwhere(skew == skew.max())[0])
-        raise InputError(
-            f"{field}: got {matrix[i, j]:g} at [{i}, {j}] and {matrix[j, i]:g} at [{j}, {i}], want a symmetric matrix"
-        )
-    smallest = float(np.linalg.eigvalsh(matrix).min(initial=np.inf))
+    symmetric = check_symmetric(field, matrix)
+    smallest = float(np.linalg.eigvalsh(symmetric).min(initial=np.inf))
     if definite and smallest <= 0.0:
         raise InputError(f"{field}: got smallest eigenvalue {smallest:g}, want a positive-definite matrix")
-    if smallest < -1e-9 * scale:
+    if smallest < -1e-9 * np.abs(symmetric).max():
         raise InputError(f"{field}: got smallest eigenvalue {smallest:g}, want a positive-semidefinite matrix")
-    symmetric = np.ascontiguousarray(0.5 * (matrix + matrix.T))
+    return symmetric
+
+
+def check_symmetric(field: str, matrices: Array) -> Array:
+    """Finite matrices (..., n, n) that are symmetric up to rounding, without that rounding, as a read-only array.
+
+    Raises:
+      InputError: entries across the diagonal differ by more than 1e-9 of the largest entry of their matrix.
+    """
+    across = np.swapaxes(matrices, -1, -2)
+    skew = np.abs(matrices - across)
+    wrong = skew > 1e-9 * np.abs(matrices).max(axis=(-2, -1), keepdims=True, initial=0.0)
+    if wrong.any():
+        # The worst entry of the first matrix that is wrong.
+        *first, _, _ = (int(k) for k in np.argwhere(wrong)[0])
+        worst = np.argmax(skew[(*first,)])
+        i, j = (int(k) for k in np.unravel_index(worst, skew.shape[-2:]))
+        one, other = [*first, i, j], [*first, j, i]
+        raise InputError(
+            f"{field}: got {matrices[tuple(one)]:g} at {one} and {matrices[tuple(other)]:g} at {other}, want a"
+            " symmetric matrix"
+        )
+    symmetric = np.ascontiguousarray(0.5 * (matrices + across))
     symmetric.setflags(write=False)
     return symmetric
 

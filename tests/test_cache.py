@@ -209,10 +209,26 @@ def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago(
         disk_cache.save(f"item{i}", bytes(1000), "a test")
         os.utime(tmp_path / f"item{i}.item", (i, i))
     assert disk_cache.load("item0") is not None  # used now
-    disk_cache.save("item3", bytes(1000), "a test")
-    assert {item.path.stem for item in disk_cache.items()} == {"item0", "item2", "item3"}
+    disk_cache.save("00item", bytes(1000), "a test")
+    assert {item.path.stem for item in disk_cache.items()} == {"item0", "item2", "00item"}
     assert disk_cache.clear() == 3
     assert list(tmp_path.iterdir()) == []
+
+
+def test_saving_reads_no_other_item(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """And looks for the size of others after one item in 256, by its name; the cache stays within its bound."""
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(disk_cache, "LIMIT", 200_000)
+    shrink, shrunk = disk_cache._shrink, []
+    monkeypatch.setattr(disk_cache, "_shrink", lambda: shrunk.append(shrink()))
+    monkeypatch.setattr(disk_cache, "_object_of", lambda text: pytest.fail("read an item"))
+    most, count = 0, 800
+    for i in range(count):
+        disk_cache.save(disk_cache.key(str(i)), bytes(1000), "a test")
+        if i % 100 == 0:
+            most = max(most, sum(path.stat().st_size for path in tmp_path.glob("*.item")))
+    assert 1 <= len(shrunk) <= 10  # 3 on average
+    assert 200_000 < most < 200_000 + 2 * 256 * 1200
 
 
 def test_what_killed_processes_left_goes_when_it_is_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -222,7 +238,7 @@ def test_what_killed_processes_left_goes_when_it_is_old(monkeypatch: pytest.Monk
         path.write_bytes(b"half of ")
     for path in left[:2]:
         os.utime(path, (0, 0))
-    disk_cache.save("kept", b"contents", "a test")
+    disk_cache.save("00kept", b"contents", "a test")
     assert [path.exists() for path in left] == [False, False, True]  # the last may be another process's
     assert disk_cache.clear() == 1
     assert list(tmp_path.iterdir()) == []

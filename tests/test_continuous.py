@@ -169,6 +169,21 @@ def test_the_prior_acts_in_both_passes_of_its_iterations_and_not_in_the_cost() -
     assert found.cost == pytest.approx(linear_swing().cost, abs=1e-6)
 
 
+# Periods and numbers of steps for which steps * dt / dt is rounded up.
+LATE = [(dt, steps) for dt in (0.05, 0.1, 0.02, 1 / 6, 1 / 30) for steps in range(1, 60) if steps * dt / dt > steps]
+
+
+@pytest.mark.parametrize(("dt", "steps"), [*LATE[:3], *LATE[-3:]])
+def test_a_prior_with_a_row_for_each_knot_reaches_a_rounded_horizon(dt: float, steps: int) -> None:
+    """Equal rows are the prior of one state, up to rounding."""
+    problem = dataclasses.replace(swing(bend=1, quartic=0, steep=0), dt=dt, steps=steps)
+    one, rows = (
+        smooth_continuous(problem, start=ls.InitialPrior((0.1, 0.02), about=about), max_iterations=1)
+        for about in (np.array([0.5, 0.0]), np.tile([0.5, 0.0], (steps + 1, 1)))
+    )
+    assert rows.cost == pytest.approx(one.cost, rel=1e-9)
+
+
 def test_costs_that_are_not_quadratic_at_the_ends() -> None:
     """Against BFGS over the first state and a control that is a polynomial of degree 11, in NumPy alone.
 

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -482,6 +483,37 @@ def test_what_cannot_be_exported_is_refused_in_a_line(
     with pytest.raises(ls.InputError, match=message):
         ls.export_c(**{"policy": policy, "folder": tmp_path / "c"} | options)
     assert not (tmp_path / "c").exists()
+
+
+def read_from_the_system(compiler: str, headers: list[str]) -> set[str]:
+    """Names of the headers that a compiler reads for these from the folders that it searches, by its own account."""
+    text = "".join(f"#include <{header}>\n" for header in headers)
+    command = [compiler, "-x", "c++" if compiler == "c++" else "c", "-E", "-v", "-"]
+    said = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    folders = {Path(one).resolve() for one in re.findall(r"^ (/.*)$", said.stderr, re.MULTILINE)}
+    folders = {one for one in folders if one.name != "backward"}  # whose files are read as <backward/binders.h>
+    files = {Path(one).resolve() for one in re.findall(r'^# \d+ "(/.*?)"', said.stdout, re.MULTILINE)}
+    return {file.stem for file in files if file.parent in folders and file.suffix == ".h"}
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other headers inside")
+def test_names_of_headers_are_refused_and_keywords_are_not(drive_solution: ls.Solution, tmp_path: Path) -> None:
+    """A file of such a name would be read in their place, with the folder on the include path."""
+    own = "assert complex ctype errno fenv float inttypes limits locale math setjmp signal stdarg stdbool stddef stdint"
+    standard = [f"{name}.h" for name in f"{own} stdio stdlib string time uchar wchar wctype".split()]
+    found = read_from_the_system("cc", [*standard, "tgmath.h", "stdatomic.h", "threads.h"])
+    if shutil.which("c++"):
+        found |= read_from_the_system("c++", [*standard, "cmath", "string", "vector"])
+    found = {name for name in found if re.fullmatch("[a-z][a-z0-9_]*", name)}
+    assert {"math", "stddef", "features"} <= found
+    for name in found:
+        with pytest.raises(ls.InputError, match=f"name: got '{name}', the name of a header of C, want another"):
+            ls.export_c(drive_solution, tmp_path / "c", name=name)
+    for name in ("int", "register", "class", "maths", "vector"):
+        ls.export_c(drive_solution, tmp_path / name, name=name)
+        command = ["cc", *WARNINGS, "-I", ".", "-o", "example", "main.c", f"{name}.c", "-lm"]
+        subprocess.run(command, cwd=tmp_path / name, check=True)
 
 
 def test_controllers_that_solve_or_estimate_are_named(

@@ -220,6 +220,30 @@ def test_what_makes_no_sense_is_refused(changes: dict[str, Any], said: str) -> N
         problem(**changes)
 
 
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.02, 1 / 6])
+def test_a_bound_that_is_the_stated_duration_in_decimals_contains_it(dt: float) -> None:
+    """3 * 0.1 is more than 0.3, and 3 * 0.7 is less than 2.1; a millionth further is outside."""
+    free = problem()
+    for steps in range(1, 50):
+        stated = round(steps * dt, 10)
+        for duration in ((stated / 2, stated), (stated, 2 * stated)):
+            assert dataclasses.replace(free, dt=dt, steps=steps, duration=duration).duration == duration
+        for duration in ((stated / 2, stated * (1 - 1e-6)), (stated * (1 + 1e-6), 2 * stated)):
+            with pytest.raises(ls.InputError, match="between"):
+                dataclasses.replace(free, dt=dt, steps=steps, duration=duration)
+
+
+@pytest.mark.parametrize("duration", [(0.1, 0.3), (0.3, 0.9)])
+def test_a_duration_is_found_from_a_bound_that_rounding_exceeds(duration: tuple[float, float]) -> None:
+    """In three steps of h (push, coast, brake) the cart goes 2 h^2. The result may be stated again with the bounds."""
+    free = dataclasses.replace(problem(way=0.02, steps=3), dt=0.1, duration=duration)
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(0.3, rel=1e-6)
+    again = dataclasses.replace(free, dt=solution.trajectory.dt)
+    assert ls.smooth(again).trajectory.horizon == pytest.approx(0.3, rel=1e-6)
+
+
 def test_solvers_that_cannot_free_it_say_so() -> None:
     free = problem()
     with pytest.raises(ls.InputError, match="duration"):

@@ -32,6 +32,7 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.simulation.closed_loop import simulate_from
+from lqrsim.stress import funnels
 from lqrsim.stress.funnels import points_of
 from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
 
@@ -179,6 +180,21 @@ def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:
         ls.funnel(**({"plant": ice, "solution": PLAN} | wrong))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@hypothesis.given(st.integers(0, 2**32 - 1), st.booleans())
+@hypothesis.settings(max_examples=examples(40), deadline=None)
+def test_rotated_covariances_are_symmetric_up_to_rounding(seed: int, at_each_knot: bool) -> None:
+    """U diag(w) U' of equal variances has entries beside its diagonal that are rounding alone."""
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))
+    covariance = rotation @ np.diag(np.full(4, 3.0)) @ rotation.T
+    given = np.tile(covariance, (STEPS + 1, 1, 1)) if at_each_knot else covariance
+    found = funnels._shapes(PLAN, given, [0, 2])
+    np.testing.assert_array_equal(found, found.transpose(0, 2, 1))
+    np.testing.assert_allclose(found, np.tile(3.0 * np.eye(2), (STEPS + 1, 1, 1)), rtol=0, atol=1e-14)
+    given = covariance + 1e-8 * np.eye(4, k=1)
+    with pytest.raises(InputError, match=r"shape: got 1e-08 at .* and .*, want a symmetric matrix"):
+        funnels._shapes(PLAN, given, [0, 2])
 
 
 WHOLE = st.fixed_dictionaries(

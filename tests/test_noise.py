@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
-from stochastic_lq import CONTROLS, SIZE, STATES, affine, draw, parameters_of_noise, problem_of, riccati
+from scipy.linalg import block_diag
+from scipy.optimize import LinearConstraint, minimize
+from stochastic_lq import CONTROLS, DT, SIZE, STATES, STEPS, affine, draw, parameters_of_noise, problem_of, riccati
 
 import lqrsim as ls
 from lqrsim.codegen.compiled_module import compilations
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.solvers.compiled import costs_of
 
 FORMS = [(True, "dual"), (False, "dual"), pytest.param(False, "primal", marks=pytest.mark.long)]
@@ -423,3 +425,118 @@ def test_the_expected_cost_has_no_penalties(seed: int) -> None:
         mean, covariance = A @ mean + B * control, closed @ covariance @ closed.T + M @ M.T
     cost += 0.5 * end @ ((mean - goal) ** 2 + np.diag(covariance))
     np.testing.assert_allclose(solution.cost, cost, rtol=1e-8)
+
+
+def cut_off(problem: ls.Problem, free: ls.Solution, rng: np.random.Generator) -> ls.Problem:
+    """The problem with a bound on one state, a fifth within the range that the plan without bounds takes."""
+    states, i = free.trajectory.states, int(rng.integers(STATES))
+    low, high = states[STEPS // 4 :, i].min(), states[STEPS // 4 :, i].max()
+    least, most = low + 0.2 * (high - low), high - 0.2 * (high - low)
+    sides = (low - 99, most) if states[0, i] < most else (least, high + 99)
+    return dataclasses.replace(problem, constraints=[ls.StateBounds({f"x{i}": sides})])
+
+
+def closed_loop_cost(numbers: Any, problem: ls.Problem, policy: ls.AffinePolicy) -> float:
+    """The expected cost of affine laws, from the moments of the state, by NumPy."""
+    A, B, c = problem.dynamics.linearize(np.zeros(STATES), np.zeros(CONTROLS), DT)
+    AB: Any = np.hstack([A, B])
+    both: Any = block_diag(numbers.state_weight, numbers.control_weight)
+    goal, x = np.append(numbers.goal, np.zeros(CONTROLS)), numbers.start
+    covariance: Any = np.zeros((STATES, STATES))
+    cost = 0.0
+    for gain, offset in zip(policy.gain, policy.offset, strict=True):
+        z, closed = np.append(x, gain @ x + offset), np.vstack([np.eye(STATES), gain])
+        joint = closed @ covariance @ closed.T
+        cost += 0.5 * (z - goal) @ both @ (z - goal) + 0.5 * np.trace(both @ joint)
+        x, covariance = AB @ z + c, AB @ joint @ AB.T
+        for J, e in zip(numbers.J, numbers.e, strict=True):
+            covariance += J @ joint @ J.T + np.outer(J @ z + e, J @ z + e)
+    off = x - numbers.goal
+    return float(cost + 0.5 * off @ numbers.end_weight @ off + 0.5 * np.trace(numbers.end_weight @ covariance))
+
+
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
+@given(st.integers(0, 2**32 - 1))
+def test_bounds_under_noise_that_depends_on_the_plan(seed: int) -> None:
+    """Against SLSQP: the mean of least cost within the bound, with noise weighed by the stochastic Riccati recursion.
+
+    As the bound is that of the mean, it does not act on the feedback of the optimum, nor on the weights. It is kept
+    with 0 to 2e-3 to spare, twice the tolerance; the cost is between those at these margins, to the solver's 1e-4.
+    """
+    rng = np.random.default_rng(seed)
+    numbers = draw(rng, multiplicative=10.0 ** rng.uniform(-1.5, -0.5))
+    problem = problem_of(numbers)
+    problem = cut_off(problem, ls.smooth(problem), rng)
+    solution = ls.smooth(problem, max_iterations=100)
+    assert solution.status is ls.Status.CONVERGED, solution.summary()
+    assert solution.violation == 0
+    A, B, c = problem.dynamics.linearize(np.zeros(STATES), np.zeros(CONTROLS), DT)
+    S = riccati(numbers, problem).S
+    goal, one = np.append(numbers.goal, np.zeros(CONTROLS)), np.eye(CONTROLS * STEPS)
+    both = block_diag(numbers.state_weight, numbers.control_weight)
+    # Rows of a least-squares problem in all controls at once: each is half the square of a root times (slope u + at).
+    slope, at = np.zeros((STATES, CONTROLS * STEPS)), numbers.start
+    rows, slopes, ats = [], [], []
+    for t in range(STEPS):
+        z, beside = np.vstack([slope, one[CONTROLS * t : CONTROLS * (t + 1)]]), np.append(at, np.zeros(CONTROLS))
+        rows.append((both, z, beside - goal))
+        rows += [(S[t + 1], J @ z, J @ beside + e) for J, e in zip(numbers.J, numbers.e, strict=True)]
+        slope, at = np.hstack([A, B]) @ z, np.hstack([A, B]) @ beside + c
+        slopes, ats = [*slopes, slope], [*ats, at]
+    rows.append((numbers.end_weight, slope, at - numbers.goal))
+    roots = [np.linalg.cholesky(weight).T for weight, _, _ in rows]
+    F = np.vstack([root @ slope for root, (_, slope, _) in zip(roots, rows, strict=True)])
+    f = np.concatenate([root @ at for root, (_, _, at) in zip(roots, rows, strict=True)])
+
+    def cost(u: Array) -> float:
+        return 0.5 * float(np.sum((F @ u + f) ** 2))
+
+    bound: Any = problem.constraints[0]
+    ((i, (low, high)),) = bound._of(problem.dynamics).items()
+    G, g = np.array(slopes)[:, i], np.array(ats)[:, i]
+
+    own = cost(solution.trajectory.controls.ravel())
+
+    def least(margin: float) -> float:
+        inside = LinearConstraint(G, low + margin - g, high - margin - g)
+        found = minimize(
+            lambda u: cost(u) / own, solution.trajectory.controls.ravel(), jac=lambda u: F.T @ (F @ u + f) / own,
+            constraints=[inside], method="SLSQP", options={"ftol": 1e-9, "maxiter": 1000},
+        )  # fmt: skip
+        assert found.success
+        return own * found.fun
+
+    assert least(0.0) - 1e-4 * own <= own <= least(2e-3) + 1e-4 * own
+    assert solution.cost == pytest.approx(closed_loop_cost(numbers, problem, solution.policy), rel=1e-9)
+
+
+@pytest.mark.parametrize("multiplicative", [0.0, 0.1])
+@settings(max_examples=examples(12), deadline=None, derandomize=True)
+@given(st.integers(0, 2**32 - 1))
+def test_bounds_under_noise_with_a_risk(multiplicative: float, seed: int) -> None:
+    """A small one: whatever the active set, the iterations end."""
+    rng = np.random.default_rng(seed)
+    numbers = draw(rng, multiplicative=multiplicative)
+    problem = problem_of(numbers, noise=None if multiplicative else ls.Noise(numbers.e.T))
+    free = ls.smooth(problem)
+    bounded = dataclasses.replace(cut_off(problem, free, rng), risk=0.1 * ls.largest_risk(problem, free))
+    solution = ls.smooth(bounded, max_iterations=100)
+    assert solution.status is ls.Status.CONVERGED, solution.summary()
+    assert solution.violation == 0
+
+
+@pytest.mark.parametrize("noise", [ls.Noise([[0.0], [0.04]]), ls.Noise(lambda x, u, p: [[0], [0.05 * x.v]], size=1)])
+def test_the_remedy_names_the_cost_of_the_plan(noise: ls.Noise) -> None:
+    """Which is that of the policy; costs in the log contain penalties."""
+    problem = ls.Problem(
+        dynamics=ls.Dynamics(lambda x, u, p: [x.v, u.a], states={"x": "m", "v": "m/s"}, controls={"a": "m/s2"}),
+        dt=0.1, steps=40, initial=ls.FixedState([0.0, 0.0]), final_cost=ls.QuadraticCost([50.0, 5.0], about=[1.0, 0.0]),
+        stage_cost=ls.ControlCost([0.1]) + ls.QuadraticCost([0.5, 0.1], about=[1.0, 0.0]),
+        constraints=[ls.StateBounds(v=(-0.6, 0.6))], noise=noise,
+    )  # fmt: skip
+    solution = ls.smooth(problem, max_iterations=4)
+    assert solution.status is ls.Status.MAX_ITERATIONS
+    assert "the cost still fell in the last one, by " in solution.remedy
+    assert solution.remedy.endswith(f"; the plan costs {solution.cost:.6g}")
+    assert abs(solution.iterations[-1].cost - solution.cost) > 1e-3
+    assert ls.smooth(problem, max_iterations=20).status is ls.Status.CONVERGED

@@ -2,6 +2,8 @@
 
 import dataclasses
 import hashlib
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,6 +70,46 @@ def test_whole_turns_change_nothing(drive_solution: ls.Solution, quadrotor_solut
     turned[6:9] *= (angle - 2 * np.pi) / angle
     assert (Rotation.from_rotvec(turned[6:9]) * Rotation.from_rotvec(state[6:9]).inv()).magnitude() < 1e-7
     assert quadrotor_solution.policy(turned, 2.5) == pytest.approx(quadrotor_solution.policy(state, 2.5), abs=1e-9)
+
+
+def solved_by_lq(form: str) -> ls.Solution:
+    stage = ls.lq.Stage(A=np.tile(np.eye(3), (9, 1, 1)), B=np.eye(3)[:, :2], R=np.eye(2), Q=np.eye(3))
+    ends = ls.types.Quadratic(np.eye(3), np.ones(3), np.array(0.0))
+    return ls.lq.smooth_lq(stage, initial=ends, final=ends, form=form)
+
+
+@pytest.mark.parametrize(
+    "solve",
+    [
+        lambda problem, solution: ls.smooth(problem, starts=1),
+        lambda problem, solution: ls.smooth(problem, starts=1, form="primal"),
+        lambda problem, solution: ls.ilqr(problem),
+        lambda problem, solution: ls.prepare(problem).solve(solution.trajectory.states[0], solution),
+        lambda problem, solution: solved_by_lq("dual"),
+        lambda problem, solution: solved_by_lq("primal"),
+        lambda problem, solution: (solution.trajectory, ls.track(problem, solution, tolerate=0.1)),
+    ],
+)
+def test_what_is_written_into_a_plan_does_not_reach_its_policy(
+    drive_solution: ls.Solution, differential_drive: ls.Scenario, solve: Callable[..., Any]
+) -> None:
+    """As angles that are converted in place for a plot; nor does it reach what a solution computes later."""
+    found = solve(differential_drive.problem, drive_solution)
+    plan, policy = found if isinstance(found, tuple) else (found.trajectory, found.policy)
+    records = [policy]
+    if not isinstance(found, tuple):
+        others = (getattr(found, name, None) for name in ("inverse_policy", "cost_to_go", "cost_to_come"))
+        records += [one for one in others if one is not None]
+    arrays = [array for one in records for array in vars(one).values() if isinstance(array, np.ndarray)]
+    assert len(arrays) >= 3
+    assert not any(np.shares_memory(one, array) for one in (plan.states, plan.controls) for array in arrays)
+    if isinstance(found, ls.Solution):
+        again = solve(differential_drive.problem, drive_solution)
+        state, before = plan.states[3].copy(), policy(plan.states[3], 0.5)
+        again.trajectory.states[...] *= 180 / np.pi
+        np.testing.assert_array_equal(again.policy(state, 0.5), before)
+        if found.clearance is not None:
+            np.testing.assert_array_equal(again.clearance, found.clearance)
 
 
 def test_commands_keep_the_limits(drive_solution: ls.Solution) -> None:

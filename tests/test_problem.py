@@ -12,12 +12,40 @@ from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
+from lqrsim.errors import check_symmetric
+from lqrsim.problem.costs import CostSum
 from lqrsim.solvers import compiled
 
 
 def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
     a, b, c = (ls.ControlCost([weight], about=[0.0]) for weight in (1.0, 2.0, 3.0))
     assert ((a + b) + c).terms == (a + (b + c)).terms == (a, b, c)
+    summed = sum([a, b + c])
+    assert isinstance(summed, CostSum)
+    assert summed.terms == (a, b, c)
+    assert sum([a]) is a
+    for other in (1, 0.5, None):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            _ = other + a  # pyright: ignore[reportOperatorIssue]
+
+
+@given(seed=st.integers(0, 2**32 - 1), m=st.integers(1, 4), count=st.integers(0, 4))
+@settings(max_examples=examples(30), deadline=None)
+def test_the_nominal_control_is_where_all_control_costs_together_are_least(seed: int, m: int, count: int) -> None:
+    """By least squares of the roots, to 1e-9: the weights are well conditioned."""
+    rng, names = np.random.default_rng(seed), [f"u{i}" for i in range(m)]
+    roots = np.eye(m) + 0.3 * rng.normal(size=(count, m, m))
+    abouts = rng.normal(size=(count, m))
+    costs = [ls.ControlCost(root.T @ root, about=about) for root, about in zip(roots, abouts, strict=True)]
+    problem = ls.Problem(
+        dynamics=ls.Dynamics(lambda x, u, p: [sum(u)], states={"x": ""}, controls=dict.fromkeys(names, "")),
+        dt=0.1, steps=2, initial=ls.FixedState([0.0]), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+        stage_cost=sum(costs, start=ls.QuadraticCost([1.0], about=[0.0])),
+    )  # fmt: skip
+    least = np.zeros(m)
+    if count:
+        least = np.linalg.lstsq(roots.reshape(-1, m), np.einsum("kij,kj->ki", roots, abouts).ravel())[0]
+    np.testing.assert_allclose(problem.nominal_control, least, rtol=0, atol=1e-9 * max(1, np.abs(least).max()))
 
 
 @pytest.mark.parametrize("constant", [0, 3, -2, 0.5])
@@ -251,6 +279,31 @@ def test_bad_parts_get_one_line(make, message: str) -> None:
     with pytest.raises(ls.InputError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=examples(50), deadline=None)
+@given(
+    st.integers(0, 2**32 - 1), st.integers(2, 6), st.sampled_from([(), (5,), (2, 3)]), st.sampled_from([1e-200, 1, 1e9])
+)
+def test_what_is_symmetric_is_measured_by_the_largest_entry_of_its_matrix(
+    seed: int, n: int, leading: tuple[int, ...], size: float
+) -> None:
+    """An entry off by 1e-12 of that is rounding; one that is off by 1e-8 is an error, and the message names it."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(*leading, n, n))
+    matrices = size * 10.0 ** rng.uniform(-9, 0, (*leading, 1, 1)) * (roots + np.swapaxes(roots, -1, -2))
+    np.testing.assert_array_equal(check_symmetric("it", matrices), matrices)
+    where, (i, j) = tuple(int(rng.integers(k)) for k in leading), rng.choice(n, 2, replace=False).tolist()
+    largest, before = np.abs(matrices[where]).max(), matrices[(*where, i, j)]
+    matrices[(*where, i, j)] = before + 1e-12 * largest
+    found = check_symmetric("it", matrices)
+    np.testing.assert_array_equal(found, np.swapaxes(found, -1, -2))
+    np.testing.assert_allclose(found, matrices, rtol=0, atol=1e-12 * largest)
+    matrices[(*where, i, j)] = before + 1e-8 * largest
+    with pytest.raises(ls.InputError, match=r"it: got .* and .*, want a symmetric matrix") as caught:
+        check_symmetric("it", matrices)
+    assert str([*where, i, j]) in str(caught.value)
+    assert str([*where, j, i]) in str(caught.value)
 
 
 def test_an_obstacle_cost_needs_a_position() -> None:

@@ -2,10 +2,16 @@
 tests/tools/benchmark_robustness.py tries, and the cases that once were not refused."""
 
 import ast
+import contextlib
+import copy
 import dataclasses
+import inspect
 import itertools
 import math
+import pkgutil
+import re
 import signal
+import typing
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +22,8 @@ import pytest
 from sampling import examples
 
 import lqrsim as ls
+from lqrsim.codegen.language import Group
+from lqrsim.codegen.printer import Value
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import (
     LONGEST,
@@ -33,6 +41,7 @@ from lqrsim.errors import (
 from lqrsim.machine import memory
 from lqrsim.problem.costs import CostTerm
 from lqrsim.simulation.uncertainty_of import tube_under
+from lqrsim.stress import Campaign
 from lqrsim.stress.statistics import rate
 
 api: Any = import_module("robustness.api")
@@ -72,8 +81,56 @@ def test_every_public_callable_is_tried(tmp_path: Path, monkeypatch: pytest.Monk
             made = subject.call(**subject.arguments)
             api.exercise(made)
             assert not api.printed_address(made), name
+            if dataclasses.is_dataclass(made) and not isinstance(made, type):
+                other = copy.copy(made)
+                assert made == made, name
+                assert isinstance(made == other, bool), name
+                assert made in [other, made], name
+                if type(made).__eq__ is object.__eq__:
+                    assert len({made, other, made}) == 2, name
         except InputError as error:
             raise AssertionError(name) from error
+
+
+def annotation(kind: type, field: dataclasses.Field[Any]) -> str:
+    """Type of a field with the full names of classes; as written if a class is imported for the type checker alone."""
+    with contextlib.suppress(NameError):
+        return str(typing.get_type_hints(kind)[field.name])
+    return str(field.type)
+
+
+def test_records_of_arrays_equal_themselves_alone() -> None:
+    """All records of the package, by their annotations: those with an array, and those with such a record in them.
+
+    Exceptions are stated by arrays and keep tuples, or are types of compiled code, which are no arrays.
+    """
+    values = (ls.disturbances.Disturbance, Uncertainty, Campaign, Group, Value)
+    kinds = {
+        kind
+        for module in pkgutil.walk_packages(ls.__path__, "lqrsim.")
+        for kind in vars(import_module(module.name)).values()
+        if inspect.isclass(kind) and dataclasses.is_dataclass(kind) and kind.__module__.startswith("lqrsim.")
+    }
+    texts = {kind: [annotation(kind, field) for field in dataclasses.fields(kind) if field.compare] for kind in kinds}
+    found: set[type] = set()
+    while True:
+        names = "|".join([r"numpy\.ndarray", *(re.escape(f"{kind.__module__}.{kind.__name__}") for kind in found)])
+        more = {kind for kind in kinds if any(re.search(rf"({names})\b", text) for text in texts[kind])}
+        more |= {kind for kind in kinds if any(issubclass(kind, one) for one in found)}
+        if more == found:
+            break
+        found = more
+    assert len(found) > 60
+    assert not [kind.__name__ for kind in found if kind.__eq__ is not object.__eq__ and not issubclass(kind, values)]
+
+
+@pytest.mark.parametrize("numbers", [0.1, (0.1, 0.2), np.array([0.1, 0.2])])
+@pytest.mark.parametrize("kind", [lambda it: Uncertainty(measurement=it), ls.disturbances.MeasurementNoise])
+def test_what_is_stated_by_numbers_equals_the_same_numbers(kind: Callable[[Any], Any], numbers: Any) -> None:
+    one, same, other = kind(numbers), kind(copy.copy(numbers)), kind(np.add(numbers, 0.1))
+    assert one == same
+    assert one != other
+    assert len({one, same, other}) == 2
 
 
 class TestTheFuzzer:

@@ -373,7 +373,8 @@ def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
     [
         ({"effort": 1.0}, "track: tolerate: got none, want how far"),
         ({"tolerate": {"feet": 1.0}, "effort": 1.0}, "tolerate: got 'feet', want one of: s0, s1, m"),
-        ({"tolerate": {"s0": 1.0}, "effort": 1.0}, "tolerate: got none for s1, want one for each state"),
+        ({"tolerate": {"s0": 1.0}, "effort": 1.0}, "tolerate: got none for s1, want one for each of s0, s1, by name"),
+        ({"tolerate": 1.0, "effort": {}}, "effort: got none for u0, want one for each of u0, by name or unit"),
         ({"tolerate": -1.0, "effort": 1.0}, "tolerate: got -1 for s0, want more than 0"),
         ({"tolerate": [1.0, 0.0], "effort": 1.0}, "tolerate: got 0 for s1, want more than 0"),
         ({"tolerate": [1.0] * 3, "effort": 1.0}, "tolerate: got 3 numbers, want 2: s0"),

@@ -2,7 +2,7 @@
 
 An item's name is a hash of everything that it depends on, so it cannot be stale. Its first line contains a checksum, so
 a damaged item counts as missing. A cache that cannot be read or written costs time, never an error. When the items
-exceed `LIMIT`, the least recently used are removed.
+exceed `LIMIT`, the least recently used are removed, now and then.
 
 Items are programs: compiled functions are run, and sources are executed. The checksum protects against damage, not
 against people: anyone who can write to the folder can run code in the name of its readers.
@@ -23,6 +23,8 @@ from lqrsim.results.archive import replacing, sha256
 
 LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"
+# The items after which the cache is shrunk begin so. Names are hashes: one in 256 does, after some 25 MB of solvers.
+_SHRINKING = "00"
 _DURATIONS = "durations.json"
 _LONGEST = 100_000  # largest size in bytes of a header, and of the durations
 _ABANDONED = 3600.0  # s, after which an unfinished file is abandoned
@@ -72,7 +74,8 @@ def save(name: str, contents: bytes, what: str, **said: Any) -> None:
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)
-        _shrink()
+        if name.startswith(_SHRINKING):
+            _shrink()
 
 
 def note(name: str, seconds: float) -> None:
@@ -106,12 +109,10 @@ def _object_of(text: bytes) -> dict[str, Any]:
 def items() -> list[Item]:
     """All items, the most recently used first."""
     found = []
-    for path in _files(f"[!.]*{_SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process may have removed it
-            status = path.stat()
-            with path.open("rb") as file:
-                what = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
-            found.append(Item(str(what), path, status.st_size, status.st_mtime))
+    for used, path, size in _files(_SUFFIX):
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            what = _object_of(file.readline(_LONGEST)).get("what", "damaged; will be made again")
+            found.append(Item(str(what), path, size, used))
     return sorted(found, key=lambda item: -item.used)
 
 
@@ -126,28 +127,36 @@ def clear() -> int:
 
 
 def _shrink() -> None:
-    """Remove the least recently used items beyond `LIMIT`, and files that killed processes left."""
-    total = 0
-    for item in items():
-        total += item.size
-        if total > LIMIT:
-            item.path.unlink(missing_ok=True)
+    """Remove the least recently used items beyond `LIMIT`, and files that killed processes left.
+
+    It opens no file: there may be tens of thousands.
+    """
+    kept = _files(_SUFFIX)
+    total = sum(size for _, _, size in kept)
+    for _, path, size in sorted(kept) if total > LIMIT else ():
+        if total <= LIMIT:
+            break
+        path.unlink(missing_ok=True)
+        total -= size
     for path in _unfinished(_ABANDONED):
         path.unlink(missing_ok=True)
 
 
-def _files(pattern: str) -> list[Path]:
-    try:
-        return list(folder().glob(pattern))
-    except OSError:  # a folder that cannot be read
-        return []
+def _files(suffix: str = "", prefix: str = "") -> list[tuple[float, Path, int]]:
+    """Files with such a name: the times of their last use, in seconds since 1970, and their sizes in bytes.
+
+    Hidden files count only if their prefix is given. Empty for a folder that cannot be read.
+    """
+    found = []
+    with contextlib.suppress(OSError), os.scandir(folder()) as entries:
+        for entry in entries:
+            if entry.name.endswith(suffix) and entry.name.startswith(prefix) and (prefix or entry.name[0] != "."):
+                with contextlib.suppress(OSError):  # another process may have removed it
+                    status = entry.stat()
+                    found.append((status.st_mtime, Path(entry.path), status.st_size))
+    return found
 
 
 def _unfinished(age: float) -> list[Path]:
     """Files that a killed process left unfinished at least `age` seconds ago."""
-    found = []
-    for path in _files(".unfinished-*"):
-        with contextlib.suppress(OSError):
-            if time.time() - path.stat().st_mtime >= age:
-                found.append(path)
-    return found
+    return [path for used, path, _ in _files(prefix=".unfinished-") if time.time() - used >= age]

@@ -380,7 +380,7 @@ class Part(Protocol):
     def data(self) -> Array: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Term:
     """A part of a problem, for one system: the source to compile, and the numbers that it reads.
 

@@ -46,7 +46,7 @@ HEAVIER = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)  # factors of the weight of
 MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SafePlan:
     """A plan with its predicted chance of collision.
 

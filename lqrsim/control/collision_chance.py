@@ -35,7 +35,7 @@ class Spread(NamedTuple):
     normal: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surroundings:
     """Obstacles of a problem, as its robot sees them.
 

@@ -21,7 +21,7 @@ from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Plan
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Design:
     """A filter with the law that follows it, or with C laws.
 
@@ -48,7 +48,7 @@ class Design:
         return replace(self, weights=self.weights.pick(i), laws=(gain[i], offset[i]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 

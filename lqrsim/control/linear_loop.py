@@ -22,7 +22,7 @@ from lqrsim.kernels import loop_moments
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """C laws in L systems: y' = F X + G (u - planned) + c + w with the commands K X + command + r, limited to u.
 
@@ -73,7 +73,7 @@ def kernels() -> CompiledModule:
     return module_of(source_of(loop_moments), "moments of closed loops")
 
 
-@dataclass
+@dataclass(eq=False)
 class LinearLoop:
     """A closed loop about a plan.
 

@@ -151,7 +151,7 @@ class Step(NamedTuple):
     c: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanModel:
     """A plan and its uncertainty, linearised.
 

@@ -33,7 +33,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.prepared import prepare
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ActivePlan:
     """A plan that is in force, or will be.
 
@@ -57,7 +57,7 @@ class ActivePlan:
         return min(max(step - self.first, 0), self.plan.trajectory.steps - 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SolveRequest:
     """A solve to be done at a step, from a state (n,) and with a law, for a plan that begins at a later step."""
 

@@ -35,7 +35,7 @@ from lqrsim.solvers.parallel import workers
 SPARE = 0.5e-3  # s, time between the end of a solve and its deadline, for handing over the answer
 
 
-@dataclass
+@dataclass(eq=False)
 class _Solve:
     """A requested solve, and its answer as soon as there is one."""
 

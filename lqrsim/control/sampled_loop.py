@@ -26,7 +26,7 @@ PRIOR = 4.0
 REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions has a tail probability below this
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SampledLoop:
     """The result of K trials.
 

@@ -311,7 +311,7 @@ def track(
     return AffinePolicy(
         gain=gain,
         offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
-        nominal=plan.states[:-1],
+        nominal=plan.states[:-1].copy(),
         dt=plan.dt,
         state_coordinates=dynamics.state_coordinates,
         control_coordinates=solution.policy.control_coordinates,

@@ -37,7 +37,7 @@ CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to 
 AT_END = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Weights:
     """Weights of deviations from a plan: a deviation that is just tolerated costs 1.
 
@@ -102,7 +102,7 @@ def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
     return CONTROL_SHARE * ranges
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Averse:
     """Noise on the states about a plan, and the aversion to large deviations.
 

@@ -34,7 +34,7 @@ NUMBERS, FEWEST, MOST = 15_000_000, 4000, 20_000
 STRAY = 6.0  # largest standard deviations of the position, over directions and knots
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Tube:
     """Predicted distribution of the closed loop about its plan.
 

@@ -141,8 +141,10 @@ class Uncertainty:
             numbers = getattr(self, name)
             for key, value in numbers.items() if isinstance(numbers, Mapping) else ():
                 check_number(f"Uncertainty: {name}: {excerpt(key)}", value, at_least=0.0)
-            if not isinstance(numbers, Mapping) and real(f"Uncertainty: {name}", numbers).ndim > 1:
-                raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
+            if not isinstance(numbers, Mapping) and (given := real(f"Uncertainty: {name}", numbers)).ndim:
+                if given.ndim > 1:
+                    raise InputError(f"Uncertainty: {name}: got {excerpt(numbers)}, want one number, or one per entry")
+                keep(self, **{name: tuple(given.tolist())})
         keep(self, lag=check_number("Uncertainty: lag", self.lag, at_least=0.0))
         for name in ("delay", "latency"):
             keep(self, **{name: check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)})
@@ -227,7 +229,8 @@ def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float
         given = space._by_name(field, numbers, check_number)
         missing = [name for i, name in enumerate(space.names) if i not in given]
         if missing and above is not None:
-            raise InputError(f"{field}: got none for {', '.join(missing)}, want one for each state, by name or unit")
+            wanted = f"one for each of {', '.join(space.names)}, by name or unit"
+            raise InputError(f"{field}: got none for {', '.join(missing)}, want {wanted}")
         values = np.array([given.get(i, 0.0) for i in range(len(space))])
     elif real(field, numbers).ndim == 0:
         values = np.full(len(space), check_number(field, numbers))

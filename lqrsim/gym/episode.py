@@ -199,7 +199,7 @@ class CommandedRun(ControllerRun):
         return self.commands
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Moment:
     """The result of a control period of K trials: observations (K, n+1), rewards and flags, (K,) each."""
 

@@ -55,13 +55,14 @@ def certify(settings, own, plan, policy, to_go, model, found):
         cost += cost_alone(x, u, t, model.stage, 0.0, stage.hessian, stage.gradient)
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
+            given = model.noise.risk[2] > 0  # a cost-to-go about the origin
             ahead = NextStep(
                 step.jacobian,
-                nowhere if own else arrived,
+                nowhere if own and not given else arrived,
                 hessians[t + 1],
                 costate if own else to_go.gradient[t + 1],
             )
-            cost += noise_quadratic(x, u, model.noise, ahead, False, stage)
+            cost += noise_quadratic(x, u, t, model.noise, ahead, False, stage)
         scale += scale_of(x, u, stage)
         for i in range(N):
             difference = abs(states[t + 1, i] - arrived[i])

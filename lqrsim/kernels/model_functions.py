@@ -4,8 +4,9 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 `records.ProblemModel`.
 """
 
-from lqrsim.kernels.declarations import W, call, call_for_value, stack
-from lqrsim.kernels.linear_algebra import clear, copy_matrix, fill
+from lqrsim.kernels.declarations import N, W, call, call_for_value, stack
+from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill
+from lqrsim.kernels.records import NextStep
 
 VALUE, DERIVATIVES = 0, 1  # columns of `CostModel.functions`
 # Columns of `Constraints.functions`.
@@ -134,14 +135,31 @@ def slope_of_constraint(which, row, x, u, t, constraints, gradient):
     call(constraints.functions[which, SLOPE], x, u, t, row, constraints.data[which], gradient)
 
 
-def noise_value(x, u, noise, ahead):
-    """The expected cost of noise at (x, u); see `noise.py`."""
-    return call_for_value(noise.value, x, u, noise.data, noise.risk, ahead)
+def noise_value(x, u, t, noise, ahead):
+    """The expected cost of noise at (x, u); see `noise.py`. `ahead` is the rest of the problem after step t."""
+    hessian, gradient = stack(N, N), stack(N)
+    weigh_noise(t, noise, ahead, hessian, gradient)
+    weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
+    return call_for_value(noise.value, x, u, noise.data, noise.risk, weighed)
 
 
-def noise_quadratic(x, u, noise, ahead, convex, stage):
+def noise_quadratic(x, u, t, noise, ahead, convex, stage):
     """Add the quadratic model of the expected cost of noise to a stage; return its value."""
-    return call_for_value(noise.quadratic, x, u, noise.data, noise.risk, ahead, convex, stage)
+    hessian, gradient = stack(N, N), stack(N)
+    weigh_noise(t, noise, ahead, hessian, gradient)
+    weighed = NextStep(ahead.jacobian, ahead.arrived, hessian, gradient)
+    return call_for_value(noise.quadratic, x, u, noise.data, noise.risk, weighed, convex, stage)
+
+
+def weigh_noise(t, noise, ahead, hessian, gradient):
+    """Write the cost-to-go that weighs the noise of step t, Hessian (N, N) and gradient (N,): that ahead, or a given
+    one.
+    """
+    copy_matrix(ahead.hessian, N, N, hessian)
+    copy(ahead.gradient, N, gradient)
+    if noise.risk[2] > 0:
+        copy_matrix(noise.hessian[t + 1], N, N, hessian)
+        copy(noise.gradient[t + 1], N, gradient)
 
 
 def costs_of(count, steps, plans, model, costs):

@@ -5,7 +5,8 @@ With x' = g(x, u) + M(x, u) w and w ~ N(0, I), a quadratic cost-to-go v with Hes
     E v(g + M w) = v(g) + 1/2 tr M'SM
 
 so noise is an additional cost of the stage, which depends on S alone. The backward pass has just computed S; the
-forward pass uses S from the last backward pass. If dynamics and M are linear and costs quadratic, this is exact.
+forward pass uses S from the last backward pass. If dynamics and M are linear and costs quadratic, this is exact. With
+constraints another S may be given, without their penalties; see `SolveRun.weigh_noise`.
 
 With a risk theta it is (1/theta) log E exp(theta v(g + M w)), and with d = S g + s, the gradient of v there,
 

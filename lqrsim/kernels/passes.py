@@ -176,7 +176,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
     value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
     if NOISY:
-        value += noise_quadratic(x, u, model.noise, ahead, convex, stage)
+        value += noise_quadratic(x, u, t, model.noise, ahead, convex, stage)
     if t > 0:
         for i in range(N):
             value += add_square(i, prior.weight[i], x[i] - prior.about[t, i], hessian, gradient)

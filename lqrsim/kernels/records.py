@@ -66,12 +66,19 @@ class CostModel(NamedTuple):
 
 
 class NoiseModel(NamedTuple):
-    """Addresses of the functions of noise; their data (any,); and (2,) the risk, and 1 if it was too high."""
+    """Noise: addresses of its functions, and what they read.
+
+    Attributes:
+      data: (any,). risk: (3,) the risk; 1 if it was too high; and 1 if a given cost-to-go weighs the noise.
+      hessian, gradient: (T+1, N, N) and (T+1, N), that cost-to-go; see `SolveRun.weigh_noise`.
+    """
 
     value: float
     quadratic: float
     data: Arrays
     risk: Arrays
+    hessian: Arrays
+    gradient: Arrays
 
 
 class ProblemModel(NamedTuple):

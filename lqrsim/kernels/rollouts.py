@@ -40,7 +40,7 @@ def noise_cost(steps, plan, model, to_go):
     total, none = 0.0, stack(N, W)
     for t in range(steps):
         ahead = NextStep(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
-        total += noise_value(plan.states[t], plan.controls[t], model.noise, ahead)
+        total += noise_value(plan.states[t], plan.controls[t], t, model.noise, ahead)
     return total
 
 
@@ -92,7 +92,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
             beyond = NextStep(jacobian, arrived, curve, s[(t + 1) * keep])
             if share > 0:
                 beyond = NextStep(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
-            ahead += noise_quadratic(x, u, model.noise, beyond, False, stage)
+            ahead += noise_quadratic(x, u, t, model.noise, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += order.damping

@@ -24,7 +24,7 @@ from lqrsim.scenes.world import signed_distance as signed_distance_of_one
 TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GeomDistances(Term):
     """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
 

@@ -43,7 +43,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SphereCenters(Term):
     """Positions of balls, for one system: the source to compile, and its data.
 

@@ -36,7 +36,7 @@ STEPS = ("all", "final")  # the steps at which a constraint can act
 _Value = TypeVar("_Value")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConstraintTerm(Term):
     """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
 

@@ -63,7 +63,7 @@ PerKnot = npt.ArrayLike | Mapping[str, npt.ArrayLike]
 FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CostTerm(Term):
     """A cost term, for one system: the source to compile, and the numbers that it reads.
 
@@ -199,6 +199,10 @@ class Cost(ProblemPart[CostTerm]):
 
     def __add__(self, other: "Cost") -> "CostSum":
         return CostSum((*terms_of(self), *terms_of(other)))
+
+    def __radd__(self, other: object) -> "Cost":
+        """`sum(costs)` begins with 0."""
+        return self if type(other) is int and other == 0 else NotImplemented
 
 
 class CostSum(Cost):

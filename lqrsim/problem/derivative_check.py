@@ -129,7 +129,7 @@ class PlainTerm:
         return at, moves
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DerivativeCheck:
     """The largest deviation of derivatives from central differences.
 

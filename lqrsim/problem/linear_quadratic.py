@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_memory, excerpt, keep
+from lqrsim.errors import Array, InputError, check_array, check_memory, check_symmetric, excerpt, keep
 from lqrsim.results.value_functions import Quadratic
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
     """Linear dynamics and a quadratic cost.
 
@@ -70,8 +70,8 @@ class Stage:
                 if time and np.ndim(value) == len(want):  # the same at each step
                     value = np.broadcast_to(value, (*time, *np.shape(value)))
             array = check_array(f"Stage: {field.name}", value, (*time, *want))
-            if field.name in ("Q", "R") and not np.allclose(array, np.swapaxes(array, -1, -2), rtol=1e-9, atol=0):
-                raise InputError(f"Stage: {field.name}: got a matrix that is not symmetric, want a symmetric one")
+            if field.name in ("Q", "R"):
+                array = check_symmetric(f"Stage: {field.name}", array)
             keep(self, **{field.name: array})
 
     @property
@@ -93,9 +93,7 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
     """
     if not isinstance(cost, Quadratic):
         raise InputError(f"{field}: got {excerpt(cost)}, want a Quadratic")
-    hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
-    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
-        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
+    hessian = check_symmetric(f"{field}: hessian", check_array(f"{field}: hessian", cost.hessian, (n, n)))
     gradient = check_array(f"{field}: gradient", cost.gradient, (n,))
     return hessian, gradient, float(check_array(f"{field}: constant", cost.constant, ()))
 

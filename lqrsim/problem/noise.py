@@ -35,7 +35,7 @@ from lqrsim.problem.dynamics import Dynamics
 MOST = 100  # largest number of independent normal numbers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NoiseTerm(Term):
     """A noise, for one system: the source to compile, and its data.
 

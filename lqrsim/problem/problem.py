@@ -32,7 +32,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True, init=False, eq=False)
 class FixedState:
     """An initial state that is given exactly, in place of an initial cost.
 
@@ -79,7 +79,7 @@ class FixedState:
         return self
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
 
@@ -315,7 +315,7 @@ class Problem:
 
     @property
     def nominal_control(self) -> Array:
-        """u*, (m,), at which the control cost is zero; zeros if there is no control cost. The mean if it has one for
+        """u*, (m,), at which the sum of the ControlCosts is least; zeros if there is none. The mean if it has one for
         each step.
         """
         controls = self.nominal_controls
@@ -324,10 +324,16 @@ class Problem:
     @property
     def nominal_controls(self) -> Array:
         """u*, (m,); or (T, m) if the control cost has one for each step."""
-        abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
-        if not abouts:
+        costs = [cost for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
+        if not costs:
             return np.zeros(len(self.dynamics.control_coordinates))
-        return abouts[0] if abouts[0].ndim == 1 else abouts[0][: self.steps]
+        if len(costs) == 1:
+            about = costs[0].about
+            return about if about.ndim == 1 else about[: self.steps]
+        weights = [cost.weight if cost.weight.ndim == 2 else cost.weight[: self.steps] for cost in costs]
+        abouts = [cost.about if cost.about.ndim == 1 else cost.about[: self.steps] for cost in costs]
+        pulls = sum(weight @ about[..., None] for weight, about in zip(weights, abouts, strict=True))
+        return np.linalg.solve(sum(weights), pulls)[..., 0]
 
     @property
     def obstacle_costs(self) -> tuple[ObstacleCost, ...]:
@@ -430,7 +436,8 @@ class Problem:
             return
         low, high = check_array("duration", self.duration, (2,)).tolist()
         stated = self.steps * self.dt
-        if not 0 < low < high or not low <= stated <= high:
+        spare = 1e-9 * stated  # rounding: 3 * 0.1 is more than 0.3
+        if not 0 < low < high or not low - spare <= stated <= high + spare:
             raise InputError(
                 f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
             )

@@ -9,7 +9,7 @@ from lqrsim.results.fields import LINE, SHARE, Bounds, Line, check_fields
 from lqrsim.results.solution import Solution
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FailureCertificate:
     """The probability that a policy fails, as measured by multilevel splitting, and a description of the measurement.
 

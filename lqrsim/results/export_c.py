@@ -27,6 +27,14 @@ from lqrsim.results.solution import Solution
 TEMPLATES = Path(__file__).parent.parent / "templates" / "c"
 PREFIX = "my_policy"  # the name in the templates
 STATIC = ("CMakeLists.txt", "main.c", "stm32f405.c", "stm32f405.ld")
+# Headers of C and C++, and those that they include from the C library. A file of such a name would be found in their
+# place wherever the folder is on the include path.
+HEADERS = (
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic"
+    " stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
+    " alloca byteswap endian features libintl malloc memory newlib pthread reent sched strings syslimits unistd"
+    " xlocale"
+)
 LARGEST = 32767  # largest integer in 16 bits
 # The tolerance of main.c, relative to the largest sum of magnitudes in a command: well above rounding, about 1e-15
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
@@ -88,7 +96,8 @@ def export_c(
       number: the type of all numbers except the time, "float" or "double".
       gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
       interpolate: whether to blend the laws of two knots, as in `AffinePolicy`; not with a filter.
-      name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter.
+      name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter;
+        not that of a header of C, such as math.
 
     Raises:
       InputError: the policy cannot be exported, a number does not fit into a float, or a file cannot be written.
@@ -101,6 +110,8 @@ def export_c(
     gains, name = check_name("gains", gains, GAINS), check_text("name", name, at_most=40)
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or name in ("main", "stm32f405"):
         raise InputError(f"name: got {excerpt(name)}, want lower-case letters, digits and _, such as policy")
+    if name in HEADERS.split():
+        raise InputError(f"name: got {excerpt(name)}, the name of a header of C, want another, such as policy")
     law = policy.policy if isinstance(policy, Solution) else policy
     if check_flag("interpolate", interpolate) and isinstance(law, OutputFeedbackPolicy):
         raise InputError("interpolate: got True for an OutputFeedbackPolicy, want False: a filter has one law a period")

@@ -15,6 +15,7 @@ from lqrsim.errors import (
     check_kind,
     check_name,
     check_number,
+    check_symmetric,
     excerpt,
     shaped,
     vectors_of,
@@ -29,7 +30,7 @@ FAMILIES = ("cost_to_go", "tube", "given")
 FLAT = 1e-13  # smallest eigenvalue of a shape scaled to a unit diagonal, below which the ellipsoid is flat
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
     """Ellipsoids about a plan, at some knots, from which runs succeed at a stated rate.
 
@@ -97,9 +98,7 @@ class Funnel:
             raise InputError(f"Funnel: states: got {excerpt(self.states)}, want different names, at least one")
         for name in self.states:
             check_name("Funnel: states", name, self.state_coordinates.names)
-        skew = np.abs(self.shape - self.shape.transpose(0, 2, 1)).max(initial=0.0)
-        if skew > 1e-9 * max(np.abs(self.shape).max(initial=0.0), np.finfo(float).tiny):
-            raise InputError("Funnel: shape: got a matrix that is not symmetric, want symmetric matrices")
+        check_symmetric("Funnel: shape", self.shape)
         last = self.plan.steps - 1
         if not len(self.knots) or (np.diff(self.knots) <= 0).any() or self.knots[-1] > last:
             raise InputError(f"Funnel: knots: got {excerpt(self.knots.tolist())}, want some of 0 to {last}, in order")

@@ -43,7 +43,7 @@ def tracking_unit(space: Coordinates) -> str:
     return "m" if space.position else OF_RANGE
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Target:
     """The goal of a run, or the end of its plan if the final cost names no goal.
 

@@ -16,7 +16,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, check_fields, repr_of
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class OutputFeedbackPolicy:
     """Output feedback about a plan, from measurements to controls. Its entire state is one vector z.
 

@@ -15,7 +15,7 @@ from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Traject
 from lqrsim.results.value_functions import Quadratic
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """A plan with its feedback law, and everything with which a later solve can begin.
 
@@ -105,7 +105,7 @@ class Plan:
         return {}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Replan(Plan):
     """The result of a prepared solver: a plan from a given state, no worse than the rollout of the initial law.
 

@@ -18,7 +18,7 @@ from lqrsim.results.fields import Bounds, check_fields, repr_of
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AffinePolicy:
     """The feedback law `u_t = gain_t x + offset_t`, with everything that a robot needs to run it.
 

@@ -16,7 +16,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Solution(Plan):
     """A locally optimal feedback policy, and how it was found.
 

@@ -21,7 +21,7 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
     return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """States and the controls held between them.
 
@@ -279,7 +279,7 @@ class Certificate:
         check_fields(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Multipliers:
     """The multipliers of a constraint, one for each row at each step; zero where an inequality is inactive.
 
@@ -297,7 +297,7 @@ class Multipliers:
         check_fields(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """One of several starts that a search tried; or a plan for softer contacts, from which the next plan begins.
 

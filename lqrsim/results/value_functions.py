@@ -27,7 +27,7 @@ def _invertible(what: str) -> Iterator[None]:
         raise InputError(f"{what}: got a singular matrix ({error}), want an invertible one") from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Quadratic:
     """A quadratic function of the state, or one for each knot: `1/2 x'Hx + x'g + const`.
 
@@ -81,7 +81,7 @@ class Quadratic:
         return self(self.minimizer())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Moments:
     """Quadratic functions of the state by moments, one for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) +
     const`.
@@ -121,7 +121,7 @@ class Moments:
         return np.asarray(self.constant)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TotalCost:
     """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, for each knot. Paper: Eq. (20).
 

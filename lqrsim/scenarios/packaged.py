@@ -33,7 +33,7 @@ from lqrsim.simulation.simulator import Simulator
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, resolve
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scenario:
     """A robot in a scene with a problem.
 

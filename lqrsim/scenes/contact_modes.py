@@ -26,7 +26,7 @@ _STAGE, _FORCE, _CONTACT, _GEOM, _NUMBER, _EDGE = 1 << 48, 1 << 47, 1 << 46, 1 <
 Names = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Switches:
     """Switches of a control period, (k,): their names, ascending, and their values, negative for active ones."""
 
@@ -62,7 +62,7 @@ class Switches:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Period:
     """A control period, linearised in its contact mode.
 

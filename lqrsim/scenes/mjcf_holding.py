@@ -16,7 +16,7 @@ _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those t
 _LIGHT = 1e-9  # weight of the controls relative to the forces: selects the smallest controls that hold
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Holding:
     """Controls, and the forces that they leave.
 

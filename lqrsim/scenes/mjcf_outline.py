@@ -13,7 +13,7 @@ from lqrsim.scenes.mjcf_obstacles import solid_geoms
 TOLERANCE = 0.25
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outline:
     """B balls.
 

@@ -20,7 +20,7 @@ KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
 OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Obstacle:
     """One primitive, with sizes and axes as in MuJoCo.
 
@@ -82,7 +82,7 @@ class Obstacle:
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), self.size])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class World:
     """A set of obstacles.
 

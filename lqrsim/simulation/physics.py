@@ -15,7 +15,7 @@ from lqrsim.simulation.simulator import Simulator, states_of
 FRAME_PERIOD = 1 / 30  # s; positions are checked and recorded at least this often, unless the physics step is longer
 
 
-@dataclass
+@dataclass(eq=False)
 class Period:
     """The result of a control period, in S parts of equal length.
 

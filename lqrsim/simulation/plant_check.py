@@ -24,7 +24,7 @@ MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one
 PRINTED = 8  # pairs of geoms in contact
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlantCheck:
     """The differences between a robot's dynamics and MuJoCo, or another simulator, over one control period.
 

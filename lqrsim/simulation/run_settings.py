@@ -37,7 +37,7 @@ Progress = Callable[[int, int], object]
 Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class RunSettings:
     """The arguments of `simulate`, with the same names, meanings and defaults, and what follows from them.
 

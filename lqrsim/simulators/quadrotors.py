@@ -23,7 +23,7 @@ from lqrsim.versions import outdated
 TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The body axes of `Quadrotor` relative to the simulator's body axes.
 

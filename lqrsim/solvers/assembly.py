@@ -48,9 +48,10 @@ def assemble(
             control_coordinates=problem.applied_coordinates,
         )  # fmt: skip
 
+    nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
-        "inverse_policy": lambda: policy(*inverse_law, states[1:]) if inverse_law is not None else None,
-        "clearance": lambda: clearance_of(problem, states),
+        "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
+        "clearance": lambda: clearance_of(problem, nominal),
         "problem_digest": lambda: problem.digest,
         "problem_parts": lambda: {name: _line(text) for name, text in problem.parts.items() if text},
     }
@@ -59,7 +60,7 @@ def assemble(
         status=found.status,
         detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
         remedy=remedy_of(problem, found, log, options),
-        policy=policy(*law, states[:-1]),
+        policy=policy(*law, nominal[:-1]),
         cost_to_go=_copied(found.values.get("cost_to_go")),
         cost_to_come=_copied(found.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
@@ -119,7 +120,8 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
         return f"raise time_limit: {len(log)} iterations took {took:.2g} s; or begin with start=solution of one like it"
     if status is Status.MAX_ITERATIONS and log and 0 < log[-1].improvement < np.inf and not found.violation > 0:
         fell = log[-1].improvement * abs(log[-1].cost)
-        return f"raise max_iterations: the cost still fell in the last one, by {fell:.2g} to {log[-1].cost:.6g}"
+        costs = f"by {fell:.2g}; the plan costs {found.cost:.6g}"
+        return f"raise max_iterations: the cost still fell in the last one, {costs}"
     limited = bool(np.isfinite([problem.control_coordinates.low, problem.control_coordinates.high]).any())
     paper = options.get("finish", "newton") is None or options["stop"] == "cost"
     if status is not Status.TIME_LIMIT and can_be_exact(problem) and paper and (problem.constraints or limited):

@@ -76,11 +76,13 @@ def meet_constraints(run: SolveRun, found: RunResult | None, *, stale: int = STA
     if found is None:
         run.roll_out()
         lagrangian.evaluate(*run.work.last)
+        run.weigh_noise(run.work.last)
     else:
         lagrangian.evaluate(found.states, found.controls)
         if lagrangian.kept:
             return found
         lagrangian.start()
+        run.weigh_noise(Motion(found.states, found.controls))
         # The arrays will be overwritten.
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     undamped = _undamped(run, lagrangian, known=found is None, patience=stale)
@@ -151,6 +153,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
         if settled or rough or since == PATIENCE:
             since = 0
             lagrangian.update()
+            run.weigh_noise(work.last)
     found = run.result(ending)
     detail = found.detail or ("" if found.success else f"with constraints; {lagrangian.worst()}")
     if found.success and not lagrangian.solved:
@@ -211,6 +214,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
     rounds, rough = 0, True
     while True:
         rounds += 1
+        run.weigh_noise(work.best)
         # Until the multipliers are approximately right, an accurate minimum is not worth its time.
         ending = run.damped(added=lagrangian.added(), least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
         lagrangian.evaluate(*work.best)

@@ -163,7 +163,9 @@ def _noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
 
 def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:
     value, quadratic = _noise_module(problem, term).addresses("noise_value", "noise_quadratic")
-    return NoiseModel(value, quadratic, numbers_of(term), np.array([problem.risk, 0.0]))
+    n = len(problem.dynamics.state_coordinates)
+    hessian, gradient = np.zeros((problem.steps + 1, n, n)), np.zeros((problem.steps + 1, n))
+    return NoiseModel(value, quadratic, numbers_of(term), np.array([problem.risk, 0.0, 0.0]), hessian, gradient)
 
 
 def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) -> Array:

@@ -45,7 +45,7 @@ PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, rel
 SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
 
 
-@dataclass
+@dataclass(eq=False)
 class Known:
     """Results that the runs of one search share.
 

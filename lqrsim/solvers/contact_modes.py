@@ -47,7 +47,7 @@ SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its 
 SAMPLES, RAY = 50, 8  # number of sampled neighbouring plans; number of doublings of a ray across a switch
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CostedPlan:
     """A plan and its cost: states (T+1, n) and controls (T, m)."""
 
@@ -120,7 +120,7 @@ class ModeModel:
         return gains
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModeStep:
     """A minimiser of the model, (T m,), and the decrease that it predicts.
 

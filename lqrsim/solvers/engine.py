@@ -24,6 +24,7 @@ from lqrsim.kernels.records import (
     Motion,
     Policy,
     Prior,
+    ProblemModel,
     SmootherGains,
     StructuredArray,
 )
@@ -204,7 +205,7 @@ def check_finite_at_start(
     return ending
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RunResult:
     """Result of a run, from which `assemble` makes a `Solution`.
 
@@ -540,15 +541,40 @@ class SolveRun:
 
     def _expected_cost(self, found: RunResult) -> float:
         """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
-        size = found.states.shape
-        to_go = CostToGo(np.zeros((*size, size[1])), np.zeros(size), np.zeros(size[0]))
-        out = np.zeros(1, CERTIFICATE)
-        task, first, last, options, model, *rest = self._check_arguments(declarations.EVALUATE, found, to_go, out)
+        out, none = np.zeros(1, CERTIFICATE), _no_value(found.states)
+        task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
+        self._loop(task, first, last, options, self._without_penalties(), *rest)
+        return float(out[0]["cost"])
+
+    def _without_penalties(self) -> ProblemModel:
+        """The model without constraints, whose noise is weighed by its own cost-to-go."""
+        model = self.work.model
         stage, final = (
             cost._replace(constraints=cost.constraints._replace(size=0)) for cost in (model.stage, model.final)
         )
-        self._loop(task, first, last, options, model._replace(stage=stage, final=final), *rest)
-        return float(out[0]["cost"])
+        return model._replace(stage=stage, final=final, noise=model.noise._replace(risk=model.noise.risk * (1, 1, 0)))
+
+    def weigh_noise(self, plan: Motion) -> None:
+        """From now on, weigh noise whose cost depends on the plan by the cost-to-go about this plan without penalties.
+
+        A penalty's curvature comes and goes with the active set, and with it the cost of the noise would: a step that
+        lowers the cost for one active set raises it for the next, and the iterations repeat themselves for ever. Nor
+        are penalties costs of a run, for constraints are those of the plan.
+        """
+        term, arrays = self.problem.noise_term, self.work.arrays
+        if term is None or not (term.active or self.problem.risk):
+            return
+        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), _no_value(plan.states)
+        task, first, last, options, _, *_ = self._plan_arguments(declarations.LINEARIZE, 0, 0, rows)
+        apart = arrays._replace(
+            best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
+            x_hats=arrays.x_hats.copy(), policy=Policy(*map(np.copy, arrays.policy)),
+            to_come=CostToCome(*map(np.copy, arrays.to_come)), smoothing=SmootherGains(*map(np.copy, arrays.smoothing)),
+        )  # fmt: skip
+        *_, failed = self._loop(task, first, last, options, self._without_penalties(), apart, memory, rows)
+        if failed < 0:
+            noise = self.work.model.noise
+            noise.hessian[...], noise.gradient[...], noise.risk[2] = to_go.hessian, to_go.gradient, 1.0
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
         """This run as a candidate of a search; `found` is its result if it was run to its end."""
@@ -612,6 +638,12 @@ class SolveRun:
 
     def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
+
+
+def _no_value(states: Array) -> CostToGo:
+    """An empty cost-to-go along states (T+1, n)."""
+    knots, n = states.shape
+    return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
 class Workspace:

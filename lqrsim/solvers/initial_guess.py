@@ -107,7 +107,7 @@ Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Plan | No
 StartLike = Beginning | Callable[[Problem], Beginning]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InitialGuess:
     """The initial guess of a solve, from which the first pass starts.
 

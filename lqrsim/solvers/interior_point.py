@@ -81,7 +81,7 @@ class Measures(NamedTuple):
         laps.record(method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation)
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class Found:
     """Result of a run.
 

@@ -208,7 +208,7 @@ class PreparedSolver:
         if value is not None:
             value = Quadratic(value.hessian.copy(), value.gradient.copy(), np.array(value.constant))
         policy = AffinePolicy(
-            gain=gain, offset=offset, nominal=states[:-1], dt=problem.dt, state_coordinates=self._states,
+            gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt, state_coordinates=self._states,
             control_coordinates=self._controls,
         )  # fmt: skip
         return Replan(

@@ -226,7 +226,7 @@ class System:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         self.n, self.m, self.dt, self.horizon = n, m, problem.dt, problem.steps * problem.dt
         self.knots = np.linspace(0.0, self.horizon, problem.steps + 1)
-        self._last, self._data = max(problem.steps - 1, 1), data
+        self._steps, self._last, self._data = problem.steps, max(problem.steps - 1, 1), data
         self._none = np.zeros(m)
         # Buffers into which compiled code writes.
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
@@ -270,7 +270,8 @@ class System:
             u = law[:, :-1] @ x + law[:, -1]
             value = self._expand(t, x, u)
             if prior is not None:
-                weight, error = prior.weight / self.dt, x - prior.at(t / self.dt)
+                # Rounding may put the horizon a little after the last step.
+                weight, error = prior.weight / self.dt, x - prior.at(min(t / self.dt, self._steps))
                 self._hessian[range(self.n), range(self.n)] += weight
                 self._gradient[: self.n] += weight * error
                 value += 0.5 * float(error @ (weight * error))

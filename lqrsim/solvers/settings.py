@@ -29,7 +29,7 @@ INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the
 MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Settings:
     """Options that all solvers share; see `ilqr`."""
 
@@ -60,7 +60,7 @@ class Settings:
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SmootherSettings(Settings):
     """Options of `smooth`."""
 

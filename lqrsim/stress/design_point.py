@@ -42,7 +42,7 @@ TOLERANCE = 0.01  # share of the distance that may be left to gain
 GRID, REFINED = 16, 3  # number of points on a ray, and number of refinements of the grid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DesignPoint:
     """The nearest failure that was found.
 

@@ -56,7 +56,7 @@ ASKED = (  # the fields of a problem that its certificate names
 Report = Callable[[str], object]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReliabilityProblem:
     """A policy of a scenario under disturbances, and a definition of its failure. It is solved when first needed.
 
@@ -286,7 +286,7 @@ class ReliabilityProblem:
         return report_level
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RareFailures:
     """The probability that a policy fails, and typical failures.
 
@@ -386,7 +386,7 @@ class RareFailures:
         return written
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SmallestFailure:
     """The failure nearest to the undisturbed trial, and the contribution of each disturbance.
 

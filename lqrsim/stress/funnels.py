@@ -20,6 +20,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     check_seed,
+    check_symmetric,
     excerpt,
     keep,
     numbers_of,
@@ -204,7 +205,7 @@ def _search(
         progress(size, size, f"level {found[-1].level:.3g} at knot {whole.knots[-1]}; {run:,} trials")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FunnelCheck:
     """New trials at a knot of a funnel.
 
@@ -366,14 +367,10 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     if isinstance(shape, Tube):
         if not np.array_equal(shape.plan.states, plan.states):
             raise InputError("shape: got a tube of another plan, want a tube of the solution")
-        given = shape.covariance
-    else:
-        given = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
-        given = check_array("shape", given, (n, n) if given.ndim == 2 else (knots, n, n))
-    whole = np.broadcast_to(given, (knots, n, n))
-    if not np.allclose(whole, whole.transpose(0, 2, 1), rtol=1e-9, atol=0.0):
-        raise InputError("shape: got a matrix that is not symmetric, want covariances")
-    return 0.5 * (whole + whole.transpose(0, 2, 1))[:, chosen][:, :, chosen]
+        shape = shape.covariance
+    given = numbers_of("shape", shape, "a Tube, or a covariance (n, n) or (T+1, n, n)")
+    given = check_array("shape", given, (n, n) if given.ndim == 2 else (knots, n, n))
+    return np.broadcast_to(check_symmetric("shape", given), (knots, n, n))[:, chosen][:, :, chosen]
 
 
 def _inverse(curve: Array) -> Array:

@@ -62,7 +62,7 @@ MOST = 20  # rounds
 REMEDY = "more range of the controls, less lag, or other tolerances may help"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class HardeningRound:
     """A plan, and how its runs fail.
 
@@ -100,7 +100,7 @@ class HardeningRound:
         return f"cost {self.cost:.6g}, probability of failure {self.rare.probability:.2g}: {', '.join(parts)}"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class HardenedPlan:
     """A plan with its measured probability of failure, and the plans before it.
 

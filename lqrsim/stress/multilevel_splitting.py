@@ -53,7 +53,7 @@ class NoFailure(InputError):
         self.trials = trials
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SplittingResult:
     """An estimate of the probability of failure.
 

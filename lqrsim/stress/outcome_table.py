@@ -13,7 +13,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.solvers import compiled
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Outcomes:
     """The outcomes of K trials, an array (K,) for each measure. Measures cover the time until the trial ended.
 

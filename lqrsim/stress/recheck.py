@@ -11,7 +11,7 @@ from lqrsim.stress.multilevel_splitting import Progress
 from lqrsim.versions import changed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recheck:
     """The repeated measurement of a certificate.
 

@@ -21,7 +21,7 @@ from lqrsim.stress.statistics import rate as rate_of
 SAME = 0.02  # fraction of a state's range along the plan; plans that differ by no more count as the same
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ComparedPlan:
     """A plan that was compared.
 
@@ -41,7 +41,7 @@ class ComparedPlan:
         keep(self, successes=check_array("ComparedPlan: successes", self.successes, (None,)) != 0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SafestPlan:
     """The plan with which most of the common trials reached the goal.
 

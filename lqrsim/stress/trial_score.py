@@ -163,7 +163,7 @@ def _departure(clearance: Array) -> int:
     return first if first and clearance[:first].min() <= clearance[first:].min() else 0
 
 
-@dataclass
+@dataclass(eq=False)
 class TrialScore:
     """The score of trials as a function of their random numbers: call it with numbers (K, size) for scores (K,).
 

@@ -97,7 +97,7 @@ class Trials:
         return self._controllers[policy]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Job:
     """Everything that a worker needs for a campaign.
 

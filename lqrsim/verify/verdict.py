@@ -126,7 +126,7 @@ class Criterion:
         check_fields(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verification:
     """Positions of a run from pixels, in N frames with d coordinates, and the tests that they passed.
 
@@ -188,7 +188,7 @@ class Verification:
     __str__ = summary
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Positions:
     """Positions of the robot in N frames, d coordinates each, in metres.
 

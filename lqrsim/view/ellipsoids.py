@@ -17,7 +17,7 @@ WIDEST = 0.2  # largest half axis that is drawn, relative to the extent of the p
 APART = 0.8  # distance between neighbours, in half axes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ellipsoids:
     """Ellipsoids at the knots of a plan, or at some of them.
 

@@ -37,7 +37,7 @@ MOST_ELLIPSOIDS = 80  # largest number of ellipsoids; more take too long to draw
 LIFT = 0.006  # m, height of lines above the floor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DrawnTube:
     """Ellipsoids in the world.
 
@@ -54,7 +54,7 @@ class DrawnTube:
     opacity: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DrawnFunnel:
     """A funnel in the world.
 

@@ -178,7 +178,7 @@ QUALITIES: dict[Quality, QualitySettings] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PictureOptions:
     """The arguments of these names of `render` and `render_still`, which explain them.
 

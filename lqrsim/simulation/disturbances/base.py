@@ -40,7 +40,7 @@ Kick = Callable[[int, Array, Array], Array]
 Numbers = float | Sequence[float]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """The effect of a disturbance on a run of K trials. A field of None has no effect. Steps count control periods.
 
