@@ -16,7 +16,7 @@ from lqrsim.control.controllers import ControllerLike, ControllerRun
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
-from lqrsim.results.rollout import Rollout
+from lqrsim.results.rollout import MOVED, Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
@@ -279,7 +279,12 @@ class ClosedLoop:
         """A Rollout of all records."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
-        begun = () if settings.starts is None else ("given first states",)
+        goal, radius = self.controller_run.moved_goal(), settings.radius
+        remarks = () if settings.starts is None else ("given first states",)
+        if goal is None:
+            goal = settings.followed.goal
+        else:
+            remarks, radius = (*remarks, MOVED), settings.radius_about(goal)
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -292,8 +297,8 @@ class ClosedLoop:
             policy_digest=settings.law.digest,
             state_coordinates=settings.states,
             control_coordinates=settings.controls,
-            goal=settings.followed.goal,
-            goal_radius=settings.radius,
+            goal=goal,
+            goal_radius=radius,
             radius=plant.robot.radius,
             states=records.states,
             measured=records.measured,
@@ -311,7 +316,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in settings.acting), *begun),
+            disturbances=(*(one.describe(plant) for one in settings.acting), *remarks),
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
