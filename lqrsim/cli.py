@@ -1,5 +1,6 @@
 """The command line; `lqrsim COMMAND --help` documents each command."""
 
+import collections
 import contextlib
 import io
 import itertools
@@ -114,15 +115,20 @@ def _run(arguments: list[str]) -> int:
 
 
 def _parse(arguments: list[str]) -> Any:
-    """Parse the arguments into a command. With `--json` a usage error is returned as a line, not printed in a box."""
+    """Parse the arguments into a command. What is wrong with them is returned as a line, or printed in a box by tyro.
+
+    The line is that of an option that is given twice, and with `--json` of any usage error.
+    """
     import tyro
 
     from lqrsim.commands import Command
+    from lqrsim.commands.options import RULES
 
     printed = io.StringIO()
     try:
-        with _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
-            return tyro.cli(Command, prog="lqrsim", args=arguments)
+        with RULES, _unwrapped(printed) if "--json" in arguments else contextlib.nullcontext():
+            command = tyro.cli(Command, prog="lqrsim", args=arguments)
+        return _given_twice(command, arguments) or command
     except SystemExit as end:
         if "--json" not in arguments or end.code != 2:
             raise
@@ -134,6 +140,18 @@ def _parse(arguments: list[str]) -> Any:
     text = " ".join(itertools.takewhile(lambda line: line.strip("─-"), said))
     text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
     return text or "got arguments that cannot be parsed"
+
+
+def _given_twice(command: Any, arguments: list[str]) -> str:
+    """What is wrong with the first option that is given more than once, of which tyro takes the last; or nothing."""
+    words = itertools.takewhile(lambda word: word != "--", arguments)
+    # No value begins with "--": tyro takes it as a wrong option.
+    options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    for option, count in collections.Counter(f"--{one[2:].removeprefix('no-')}" for one in options).items():
+        if count > 1:
+            several = isinstance(getattr(command, option[2:].replace("-", "_"), None), tuple)
+            return f"{option}: got it {count} times, want it once" + (", with all its values" if several else "")
+    return ""
 
 
 @contextlib.contextmanager

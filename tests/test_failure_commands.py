@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from interrupting import interrupted
 from sampling import rarely
 from scipy import stats
 
@@ -190,16 +191,30 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
     assert (rare.probability.value, rare.probability.high) == (numbers["probability"], numbers["high"])
     assert rare.splitting.simulations == numbers["simulations"]
     same_files(command, python, "rare.json")
-    assert main(["break", reference, "--rounds", "1", "--seed", "3", *more]) == 0
+    assert main(["break", reference, "--rounds", "1", "--particles", "30", "--seed", "3", *more]) == 0
     break_says = capsys.readouterr().out
     told.clear()
-    smallest = problem.smallest_failure(rounds=1, seed=3, report=told.append)
+    smallest = problem.smallest_failure(rounds=1, particles=30, seed=3, report=told.append)
     assert smallest.save(python).outcome == ("collided",)
     assert break_says.startswith("\n".join([*told, str(smallest)]))
     numbers = found(command / "break.json")["found"]
     assert (smallest.point.distance, smallest.simulations) == (numbers["distance"], numbers["simulations"])
     assert list(smallest.shares) == numbers["shares"] == pytest.approx([1.0])
     same_files(command, python, "break.json")
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(1, 2)])
+def test_the_search_for_first_failures_has_the_given_number_of_particles(own: str, seed: int) -> None:
+    """More particles, more trials; 200 are the default. All find the same failure, to a tenth."""
+    problem = ls.stress.ReliabilityProblem(f"{own}:shifted", strength=2, policy="open_loop")
+    given: list[dict[str, Any]] = [{"particles": 20}, {"particles": 60}, {}]
+    found = [problem.smallest_failure(rounds=1, seed=seed, **more) for more in given]
+    few, some, many = (one.simulations for one in found)
+    assert some - few > 2 * 40 - 1  # two repetitions, of at least one level
+    assert many - some > 2 * 140 - 1
+    assert [one.options["particles"] for one in found] == [20, 60, 200]
+    for one in found:
+        assert one.point.distance == pytest.approx(found[-1].point.distance, rel=0.1)
 
 
 def test_a_given_solution_is_what_fails(own: str, tmp_path: Path) -> None:
@@ -305,6 +320,7 @@ def test_bad_input_is_one_line(
         ("rare quadrotor --policy track --design-disturbances gale", "got 'gale'"),
         ("rare quadrotor --repetitions 0", "repetitions: got 0"),
         ("break quadrotor --rounds 0", "rounds: got 0"),
+        ("break quadrotor --particles 19", "particles: got 19"),
     ],
 )
 def test_commands_check_their_options_before_they_solve(
@@ -313,18 +329,6 @@ def test_commands_check_their_options_before_they_solve(
     monkeypatch.setattr(solutions, "solve", lambda *_: pytest.fail("solved"))
     assert main([*command.split(), "--out", str(tmp_path / "out")]) == 2
     assert says in capsys.readouterr().err
-
-
-# The command as it is, which says at each step of its progress how far it is.
-TELLING = """
-import sys
-
-from lqrsim.cli import main
-from lqrsim.commands import console
-
-console.Progress.__call__ = lambda self, done, total, found="": print(f"{done} of {total}; {found}", flush=True)
-sys.exit(main())
-"""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
@@ -343,14 +347,8 @@ def test_ctrl_c_keeps_what_there_is_and_says_how_far_it_came(
     asked, *more = command.split()
     name, *settings = asked.split(",")
     scenario = ",".join([f"{own}:shifted", *settings])
-    words = [sys.executable, "-c", TELLING, name, scenario, *more, *OPEN, "--out", str(tmp_path)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        while not (line := process.stdout.readline()).startswith(at):
-            assert process.poll() is None, line
-        process.send_signal(signal.SIGINT)
-        printed, error = process.communicate(timeout=60)
-    assert (process.returncode, error.splitlines()[-1]) == (130, "lqrsim: stopped")
+    code, printed, error = interrupted([name, scenario, *more, *OPEN, "--out", str(tmp_path)], at)
+    assert (code, error.splitlines()[-1]) == (130, "lqrsim: stopped")
     assert re.search(says, printed)
     if name == "funnel":
         funnel = ls.load(tmp_path / "funnel.npz", ls.types.Funnel)

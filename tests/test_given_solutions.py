@@ -4,16 +4,21 @@ import dataclasses
 import json
 import logging
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sampling import examples
 
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
 from lqrsim.commands.reliability import Break, Rare
+from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.policies import solve
 from lqrsim.view import viewer
 
@@ -215,8 +220,10 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
     capsys.readouterr()
     assert main(["stress", DRIVE, *FEW, "--solution", path, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    says = f"is of another problem than that of {DRIVE} (solved as {DRIVE}); its plan is run as it is"
-    why = "replan, which re-plans the scenario's problem, while the solution is of another problem"
+    world = "World(16 obstacles: 'floor', 'wall_west', 'wall_east', ...)"
+    other = f": constraints Clearance(world={world}, margin=0.05, radius=0.17) instead of none"
+    says = f"is of another problem than that of {DRIVE} (solved as {DRIVE}){other}; its plan is run as it is"
+    why = f"replan, which re-plans the scenario's problem, while the solution is of another problem{other}"
     assert f"\nsmooth {says}\n" in printed
     assert f"\nleft out: {why}\n" in printed
     assert ls.stress.Results(out).campaign.policies == ("smooth", "ilqr", "open_loop")
@@ -224,6 +231,55 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
     assert main(["stress", DRIVE, *again]) == 2
     assert f"policies: got {why}, want some of smooth, ilqr, open_loop, track" in one_line(capsys)
     assert not (tmp_path / "new").exists()
+
+
+@settings(max_examples=examples(40), suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    weights=st.lists(st.sampled_from([1.0, 30.0, 60.0]), min_size=2, max_size=2), limit=st.sampled_from([0.4, 0.5]),
+    obstacles=st.sampled_from([0.0, 1.0, 2.5]), margin=st.sampled_from([None, 0.0, 0.05]),
+)  # fmt: skip
+def test_what_differs_in_another_problem_is_named_from_what_to_what(
+    differential_drive: ls.Scenario, weights: list[float], limit: float, obstacles: float, margin: float | None
+) -> None:
+    """Each part that was changed and no other, whatever was changed together; and after a file has been read."""
+    own, scene, robot = differential_drive.problem, differential_drive.scene, differential_drive.robot
+    cost = ls.ControlCost(weights, about=(0.25, 0.25))
+    if obstacles:
+        cost = cost + ls.ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0, weight=obstacles)
+    clear = [] if margin is None else [ls.Clearance(scene.world, radius=robot.radius, margin=margin)]
+    problem = dataclasses.replace(own, stage_cost=cost, control_limits=(-limit, limit), constraints=clear)
+    solution = ls.smooth(problem, max_iterations=1, starts=1)
+    said = remarks(differential_drive, solution)[not solution.success :]
+    if same := weights == [60.0, 60.0] and limit == 0.5 and obstacles == 1 and margin is None:
+        assert said == []
+    else:
+        (line,) = said
+        assert ("stage cost " in line) == (weights != [60.0, 60.0] or obstacles != 1)
+        assert ("limits left -0.4 to 0.4, right -0.4 to 0.4 instead of left -0.5" in line) == (limit == 0.4)
+        wanted = "" if margin is None else f", margin={margin:g}, radius=0.17) instead of none"
+        assert ("constraints Clearance(" in line, wanted in line) == (margin is not None, True)
+        assert not any(f"{part} " in line for part in ("start", "final cost", "dynamics", "states", "noise"))
+        if weights == [60.0, 60.0] and obstacles == 2.5:
+            assert "stage cost ... weight=2.5 ... instead of ... weight=1 ..." in line
+    with tempfile.TemporaryDirectory() as folder:
+        stored = ls.load(ls.save(solution, Path(folder) / "one.npz"), ls.Solution)
+    assert remarks(differential_drive, stored)[not solution.success :] == said
+    older = remarks(differential_drive, dataclasses.replace(stored, problem_parts={}))
+    assert same or older[-1] == f"is of another problem than that of {DRIVE}; its plan is run as it is"
+
+
+def test_numbers_that_no_description_has_are_said_to_differ(differential_drive: ls.Scenario) -> None:
+    """An obstacle that is elsewhere, of the same name."""
+    own, scene = differential_drive.problem, differential_drive.scene
+    *others, last = scene.world.obstacles
+    world = ls.World([*others, dataclasses.replace(last, position=last.position + 0.01)])
+    cost = ls.ControlCost((60.0, 60.0), about=(0.25, 0.25)) + ls.ObstacleCost(
+        world, radius=differential_drive.robot.radius, sharpness=10.0, weight=1.0
+    )
+    moved = ls.smooth(dataclasses.replace(own, stage_cost=cost), max_iterations=1, starts=1)
+    line = remarks(differential_drive, moved)[-1]
+    says = f"is of another problem than that of {DRIVE}, in numbers that a description of it leaves out; its plan is"
+    assert line == f"{says} run as it is"
 
 
 # What is refused.

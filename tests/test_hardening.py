@@ -5,6 +5,7 @@ twice as large as its plans and laws were told.
 """
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from interrupting import interrupted
+from past_a_crate import OWN
 from scipy.stats import binom, norm
 
 import lqrsim as ls
@@ -19,50 +22,6 @@ from lqrsim.cli import main
 from lqrsim.commands import console
 from lqrsim.stress.hardening import AIM, HardenedPlan, HardeningRound, _Search
 
-OWN = """
-from dataclasses import dataclass
-
-import numpy as np
-
-import lqrsim as ls
-from lqrsim.disturbances import ControlOffset
-from lqrsim.simulators import Simulator
-from lqrsim.templates.my_robot.my_robot import MJCF, MyRobot
-
-
-@dataclass(frozen=True)
-class Euler(Simulator):
-    name = "Euler"
-    timestep = 0.02
-    weight = 5.0
-
-    def start(self, states, factors, timestep):
-        return np.array(states)
-
-    def step(self, simulations, controls, wrench, wind, steps):
-        for _ in range(steps):
-            force = controls - 0.2 * simulations[:, 2:]
-            simulations[:, :2] += 0.02 * simulations[:, 2:]
-            simulations[:, 2:] += 0.02 * force / 0.5
-
-    def states(self, simulations):
-        return simulations
-
-
-def told(offset: float = 0.25, pillar: bool = True, near: bool = False) -> ls.Scenario:
-    robot, scene = MyRobot(), ls.load_scene(MJCF)
-    world = scene.world if pillar else ls.World([one for one in scene.world.obstacles if one.name != "pillar"])
-    problem = ls.Problem(
-        dynamics=robot.dynamics, dt=0.1, steps=24, initial=ls.FixedState((-1.0, 0.3, 0.0, 0.0)),
-        stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(world, radius=robot.radius, sharpness=100.0),
-        final_cost=ls.QuadraticCost((5000.0,) * 4, about=(1.0, 0.4, 0.0, 0.0)),
-        constraints=[ls.GoalState({"x": -0.42, "y": 0.1})] if near else [],  # 0.02 m from the crate
-    )
-    return ls.Scenario(
-        name="told", summary="past a crate", robot=robot, scene=scene, problem=problem, tracking_bound=0.1,
-        disturbances=(ControlOffset((offset, offset)),), simulator=Euler(),
-    )
-"""
 CHANCE, OFFSET = 0.05, 0.25
 FEW: dict[str, Any] = {"chance": CHANCE, "particles": 200, "repetitions": 2}
 TRIALS = 20_000
@@ -268,6 +227,27 @@ def test_the_command_keeps_what_there_is_and_says_if_it_is_not_enough(
     written = json.loads((tmp_path / "stopped" / "harden.json").read_text(encoding="utf-8"))
     assert written["stopped"] == "stopped after 1 of 3 plans"
     assert ls.load(tmp_path / "stopped" / "solution.npz", ls.Solution).success
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
+@pytest.mark.parametrize(("at", "kept"), [(1, 0), (3, 1)])
+def test_ctrl_c_in_a_process_of_its_own_keeps_the_plans_that_are_measured(
+    own: str, tmp_path: Path, at: int, kept: int
+) -> None:
+    """In the first plan nothing is kept, in the second the first; each takes two repetitions, and the end is 130."""
+    words = ["harden", own, *WORDS, "--chance", "0.001", "--rounds", "3", "--out", str(tmp_path / "out")]
+    code, printed, error = interrupted(words, f"{at} of 12")
+    assert (code, error.splitlines()[-1]) == (130, "lqrsim: stopped")
+    assert (tmp_path / "out").exists() == bool(kept)
+    if kept:
+        written = json.loads((tmp_path / "out" / "harden.json").read_text(encoding="utf-8"))
+        assert written["stopped"] == f"stopped after {kept} of 3 plans"
+        assert written["stopped"] in printed
+        assert len(written["found"]["rounds"]) == kept
+        assert ls.load(tmp_path / "out" / "solution.npz", ls.Solution).success
+        assert {path.name for path in (tmp_path / "out").iterdir()} == {
+            "solution.npz", "harden.json", "rollout.npz", "rare.json", "certificate.npz",
+        }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """`--json`: one object on stdout and nothing else there, with the numbers that Python has, to the last bit."""
 
+import contextlib
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import asdict, fields
@@ -10,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import past_a_crate
 import pytest
 
 import lqrsim as ls
-from lqrsim.cli import main
+from lqrsim.cli import _parse, main
 from lqrsim.codegen import disk_cache
 from lqrsim.commands import COMMANDS
 from lqrsim.stress.statistics import rate
@@ -131,6 +134,71 @@ def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytes
     assert captured.err == f"lqrsim: error: {found['error']}\n"
 
 
+REQUIRED = {"bridge": ["--commands", "1"], "export": ["--c", "1"], "replay": ["--cell", "1", "--trial", "1"]}
+CHOSEN = {"--overlays": "plan", "--policies": "smooth"}  # lists whose help does not show the choices
+
+
+def listed(command: str, capsys: pytest.CaptureFixture[str]) -> tuple[list[str], list[tuple[str, str, list[str], str]]]:
+    """The beginning of a valid command line, and the command's options in its help.
+
+    Each with its opposite if it is a flag, values, and how the help shows these.
+    """
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    printed = capsys.readouterr().out
+    arguments = re.findall(r"^[│ ] ([A-Z{]\S*)", printed, re.MULTILINE)
+    options = re.findall(r"^[│ ] (--[\w-]+)(?:, (--no-[\w-]+))?(?: (\S+(?: \S+)*))?", printed, re.MULTILINE)
+    assert options
+
+    def values(option: str, shown: str) -> list[str]:
+        words = [word for word in shown.split() if word not in ("...", "│")]
+        return [word[1:].split(",")[0].rstrip("}") if word[0] == "{" else CHOSEN.get(option, "1") for word in words]
+
+    begun = [command, *(word for shown in arguments for word in values("", shown)), *REQUIRED.get(command, [])]
+    return begun, [(option, opposite, values(option, shown), shown) for option, opposite, shown in options]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_option_that_is_repeated_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each option in the help of each command, with values; as --option=value and with underscores, too.
+
+    The last value was taken in silence. The error is an object, too, where the command has --json.
+    """
+    begun, options = listed(command, capsys)
+    for option, opposite, given, shown in options:
+        again = [f"{option.replace('-', '_').replace('__', '--')}={given[0]}"] if len(given) == 1 else [option, *given]
+        as_json = ["--json"] if option != "--json" and any(name == "--json" for name, *_ in options) else []
+        wrong = [*begun, option, *given, *([opposite] if opposite else again), *as_json]
+        times = 3 if option in begun else 2
+        assert main(wrong) == 2, wrong
+        out, err = capsys.readouterr()
+        several = ", with all its values" if shown.endswith("...") or len(given) > 1 else ""
+        assert err == f"lqrsim: error: {option}: got it {times} times, want it once{several}\n", wrong
+        if as_json:
+            assert json.loads(out)["error"] == err.removeprefix("lqrsim: error: ").rstrip(), wrong
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_errors_of_usage_have_no_markup_nor_types(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One value too few for each option of several values; and for three others, drawn, a word that is no number.
+
+    tyro prints `[bold]X Y Z AT[/bold]` as it stands, and types as Python names them, where a value may be None.
+    """
+    begun, options = listed(command, capsys)
+    rng = np.random.default_rng(list(COMMANDS).index(command))
+    wrong = [[option, *given[:-1]] for option, _, given, _ in options if len(given) > 1]
+    single = [option for option, _, given, shown in options if len(given) == 1 and shown[0] != "{"]
+    wrong += (
+        [[str(option), "many"] for option in rng.choice(single, min(3, len(single)), replace=False)] if single else []
+    )
+    for words in wrong:
+        with contextlib.suppress(SystemExit):  # a word may be what an option wants
+            _parse([*begun, *words])
+        said = capsys.readouterr().err
+        assert words[0] in said or words[-1] == "many", words
+        assert not re.search(r"\[/?bold|NoneType|\{None\}|<class", said), words
+
+
 LONG = "x" * 500  # longer than the lines of a box
 WRONG = {
     "an option that no command has": ["--no-such-option"],
@@ -246,6 +314,19 @@ def test_rare_and_break_print_their_files(printed: Any, tmp_path: Path) -> None:
     found = printed("rare", f"{reference},std=0.0001", "--policy", "open_loop", "--out", str(tmp_path / "none"), code=1)
     assert found["found"] is None
     assert "wrote" not in found
+
+
+def test_harden_prints_its_file(printed: Any, tmp_path: Path) -> None:
+    """A plan that is not as safe as requested: the exit code is 1, and the object has what the file has."""
+    (tmp_path / "crate.py").write_text(past_a_crate.OWN, encoding="utf-8")
+    asked = ["--strength", "2", "--particles", "40", "--repetitions", "2", "--rounds", "1", "--chance", "1e-6"]
+    law = ["--policy", "track", "--design-disturbances", "scenario"]
+    found = printed("harden", f"{tmp_path / 'crate.py'}:told", *asked, *law, "--out", str(tmp_path / "out"), code=1)
+    file = json.loads((tmp_path / "out" / "harden.json").read_text(encoding="utf-8"))
+    assert {key: found[key] for key in file} == file
+    assert set(found) - set(file) == {"exit_code", "wrote"}
+    assert (found["found"]["success"], len(found["found"]["rounds"])) == (False, 1)
+    assert all(Path(path).is_file() for path in found["wrote"])
 
 
 def test_demo(printed: Any, tmp_path: Path) -> None:

@@ -357,6 +357,46 @@ def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: in
     assert "body: part0, whose position is not among the states" in str(ls.MjcfRobot(robot.scene, body="part0"))
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_a_position_is_the_place_in_the_world_or_there_is_none(seed: int) -> None:
+    """Slides in any order and along some axes, each from a place of its own, with a `ref` that makes up for it or not.
+
+    Where it makes up for all, the states of the position are MuJoCo's `xpos`, and otherwise nothing is a position:
+    a robot that is judged by two of three coordinates would reach goals that it is far from.
+    """
+    rng = np.random.default_rng(seed)
+    axes = rng.permutation(3)[: rng.integers(2, 4)]
+    place = np.where(rng.random(3) < 0.6, 0.0, rng.uniform(-2, 2, 3).round(3))
+    made_up = [rng.random() < 0.5 for _ in axes]
+    joints = ""
+    for axis, up in zip(axes, made_up, strict=True):
+        along, ref = " ".join("1" if i == axis else "0" for i in range(3)), f"ref='{place[axis]}'" if up else ""
+        joints += f"<joint name='p{'xyz'[axis]}' type='slide' axis='{along}' {ref}/>"
+    robot = ls.MjcfRobot(
+        scene_from_xml(
+            f"<mujoco><worldbody><body name='base' pos='{' '.join(map(str, place))}'>{joints}"
+            "<geom type='sphere' size='0.1' mass='1'/></body></worldbody>"
+            f"<actuator><motor joint='p{'xyz'[axes[0]]}'/></actuator></mujoco>",
+            "gantry",
+        )
+    )
+    missing = [axis for axis, up in zip(axes, made_up, strict=True) if place[axis] != 0 and not up]
+    position = robot.dynamics.state_coordinates.position
+    if missing:
+        assert position == ()
+        for axis in missing:
+            hint = f"p{'xyz'[axis]} is the body's {'xyz'[axis]} minus {place[axis]:.6g} m"
+            assert hint in str(robot)
+            with pytest.raises(InputError, match=re.escape(hint)):
+                ls.MjcfRobot(robot.scene, position=[f"p{'xyz'[axis]}" for axis in axes])
+    else:
+        model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+        state = robot.at() + np.append(rng.normal(size=len(axes)), np.zeros(len(axes)))
+        data.qpos[:] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        assert state[list(position)] == pytest.approx(data.body("base").xpos[sorted(axes)], abs=1e-12)
+
+
 def test_weights_of_a_problem_by_name_and_by_unit() -> None:
     robot, _ = robot_of("cart", 0)
     start, goal = robot.at(pole=1.0), robot.at()

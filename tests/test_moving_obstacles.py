@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from point_mass import DT, MARGIN, RADIUS, Oracle, balls, check, problem
 from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
+from lqrsim.simulation.closed_loop import simulate_from
+from lqrsim.simulation.collisions import FINEST
 
 ACROSS = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0))  # in the middle of the way when the mass would be there
 
@@ -142,3 +144,73 @@ class TestReplanner:
         stated = problem(ACROSS, weight=1.0)
         with pytest.raises(ls.InputError, match="got obstacles that move, want none"):
             ls.smooth_chance_constrained(stated, ls.disturbances.Uncertainty(start=0.01), chance=0.01)
+
+
+@pytest.fixture(scope="module")
+def alone(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
+    """A run among the obstacles of the scene alone."""
+    return ls.simulate(differential_drive.plant(), drive_solution)
+
+
+class TestRuns:
+    """Obstacles that MuJoCo does not have, in a run: contact where they are at that time."""
+
+    @settings(max_examples=examples(16), suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(
+        steps=st.integers(0, 150), aside=st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=2),
+        velocity=st.lists(st.floats(-0.6, 0.6), min_size=2, max_size=2), size=st.floats(0.05, 0.3),
+        contacts=st.booleans(),
+    )  # fmt: skip
+    def test_it_collides_when_a_ball_meets_it(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution, alone: ls.Rollout, steps: int,
+        aside: list[float], velocity: list[float], size: float, contacts: bool,
+    ) -> None:  # fmt: skip
+        """At the first moment at which they touch, and at no earlier one, from 20,000 places of both.
+
+        To the finest step of the search, and 1 mm for paths between frames. The ball is near the plan at a drawn step.
+        Clearances are those to the ball or to what stands, to rounding; and nothing else differs from a run without.
+        """
+        plan, radius = drive_solution.trajectory, differential_drive.robot.radius
+        move = np.array([*velocity, 0.0])
+        there = np.array([*(plan.states[steps, :2] + aside), 0.0])
+        ball = ls.Obstacle("ball", "sphere", there, np.eye(3), np.array([size, 0, 0]), velocity=move)
+        world = ls.World([ball]).moved(-steps * plan.dt)
+        run = ls.simulate(differential_drive.plant(), drive_solution, moving=world, contacts=contacts)
+        start, times = np.array(world.obstacles[0].position[:2]), np.linspace(0, plan.horizon, 20_001)
+        path = np.stack([np.interp(times, run.frame_times, run.frames[0, :, i]) for i in range(2)], axis=1)
+        apart = np.hypot(*(path - start - times[:, None] * move[:2]).T) - radius - size
+        assert not np.isfinite(alone.collided_at).any()
+        at, finest = run.collided_at[0], FINEST * radius
+        assert apart[times < at].min(initial=np.inf) > -finest - 1e-3
+        if np.isfinite(at):
+            assert (apart[0] if at == 0 else abs(np.interp(at, times, apart))) < finest + 1e-3
+            assert (run.outcome, run.obstacles) == (("collided",), ("ball",))
+        else:
+            assert run.outcome == ("reached",)
+        knots = np.arange(plan.steps + 1) * plan.dt
+        to_ball = np.hypot(*(run.states[0, :, :2] - start - knots[:, None] * move[:2]).T) - radius - size
+        wanted = np.minimum(alone.clearance[0], to_ball)
+        until = np.flatnonzero(knots <= run.collided_at[0])
+        np.testing.assert_allclose(run.clearance[0, until], wanted[until], rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(run.states[0, until], alone.states[0, until])
+
+    def test_a_run_from_a_later_knot_has_them_where_they_are_then(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution
+    ) -> None:
+        """The clearance in closed form to the ball, which is nearer than what stands."""
+        plan = drive_solution.trajectory
+        place, velocity = np.array([plan.states[20, 0] + 0.28, plan.states[20, 1], 0.0]), np.array([0.5, 0.1, 0])
+        ball = ls.Obstacle("ball", "sphere", place, np.eye(3), np.array([0.1, 0, 0]), velocity=velocity)
+        world = ls.World([ball]).moved(-20 * plan.dt)
+        whole = ls.simulate(differential_drive.plant(), drive_solution, moving=world)
+        rest = simulate_from(differential_drive.plant(), drive_solution, whole.states[:, 20], knot=20, moving=world)
+        away = np.hypot(*(whole.states[0, 20, :2] - place[:2])) - 0.1 - differential_drive.robot.radius
+        assert whole.clearance[0, 20] == pytest.approx(away, abs=1e-9)
+        assert rest.clearance[0, 0] == pytest.approx(away, abs=1e-9)
+
+    def test_what_cannot_be_is_refused(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+        same = balls((5.0, 5.0, 0.1)).obstacles[0]
+        with pytest.raises(ls.InputError, match="moving: got pillar_1, which is an obstacle of the scene"):
+            ls.simulate(differential_drive.plant(), drive_solution, moving=ls.World([replace(same, name="pillar_1")]))
+        with pytest.raises(ls.InputError, match="moving: got 3, want a World"):
+            ls.simulate(differential_drive.plant(), drive_solution, moving=3)  # pyright: ignore[reportArgumentType]

@@ -125,6 +125,43 @@ def test_a_problem_that_does_not_fit_is_refused(options: dict[str, Any], message
         ls.check_plant(Arm(), arm(""), **options)
 
 
+@settings(max_examples=examples(12))
+@given(ends=st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=2).map(sorted), seed=st.integers(0, 10**6))
+def test_controls_are_numbers_vectors_or_pairs_by_name(ends: list[float], seed: int) -> None:
+    """The same bits in each form, and the worst control is within; a control that is not named keeps its limits."""
+    low, high = ends
+    plant, options = (ls.DifferentialDrive(), ls.load_scene("arena")), {"samples": 2, "settle": 0.0, "seed": seed}
+    first = ls.check_plant(*plant, controls=([low, low], [high, high]), **options)
+    assert ((low <= first.control) & (first.control <= high)).all()
+    forms: list[Any] = [
+        (low, high), [low, high], (low, [high, high]),
+        {"left": (low, high), "right": (low, high)}, {"m/s": (low, high)},
+    ]  # fmt: skip
+    for controls in forms:
+        found = ls.check_plant(*plant, controls=controls, **options)
+        np.testing.assert_array_equal(found.errors, first.errors)
+        np.testing.assert_array_equal(found.control, first.control)
+    named = ls.check_plant(*plant, controls={"right": (low, high)}, **options)
+    drawn = np.random.default_rng(seed)  # a state, then a control, for each sample
+    controls = [(drawn.normal(size=3), drawn.uniform((-0.5, low), (0.5, high)))[1] for _ in range(2)]
+    assert min(np.abs(named.control - one).max() for one in controls) == 0
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        (2.0, "controls: got 2.0, want \\(lowest, highest\\), each a number or \\(2,\\), or such pairs by name"),
+        (([0.0, 0.0, 0.0], 1.0), "controls: got .*, want \\(lowest, highest\\)"),
+        ({"lft": (0, 1)}, "controls: got 'lft'.* left"),
+        ({"left": 1.0}, "controls: 'left': got "),
+        ((0.4, -0.4), "want the lowest first"),
+    ],
+)
+def test_controls_that_are_no_ranges_are_refused(controls: Any, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        ls.check_plant(ls.DifferentialDrive(), ls.load_scene("arena"), controls=controls)
+
+
 def test_contacts_that_stay_are_named() -> None:
     """What can move is not taken away, here a heavy box on the way of the arm's fist."""
     box = '<body pos="0.3 0 0"><freejoint/><geom type="box" size="0.12 0.3 0.3" mass="50"/></body>'

@@ -1,5 +1,6 @@
 """Solving again in time: prepared solvers, re-planning in simulations, and the planner of a robot's own loop."""
 
+import itertools
 import threading
 import time
 from dataclasses import replace
@@ -8,15 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 from funnels_by_hand import funnel_by_hand
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from point_mass import RADIUS, Oracle, balls, problem
+from point_mass import MARGIN, RADIUS, Oracle, balls, problem
 from sampling import examples
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
 from lqrsim.control.replan_rule import ActivePlan, ReplanLog
 from lqrsim.errors import Array
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.engine import SolveRun
+from lqrsim.solvers.initial_guess import resolve
+from lqrsim.solvers.prepared import _Best, _unchanged
+from lqrsim.solvers.settings import SmootherSettings
 
 STEPS, DT = 20, 0.1
 
@@ -158,6 +164,69 @@ class TestPreparedSolver:
             assert found.success
             assert np.linalg.norm(found.trajectory.states[1:, :2] - (x, y), axis=1).min() >= size + 0.2
         assert len(compiled_module.compilations) == compiled
+
+    def test_of_plans_that_violate_as_much_the_cheaper_is_taken(
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.types.PreparedSolver, monkeypatch: Any
+    ) -> None:
+        """A ball appears over the robot; the corners of the controls' box bound the violation at the next step.
+
+        The solver finds several plans with that violation; costs and violations are the oracle's. A plan was kept that
+        cost 39,500 where another cost 123.
+        """
+        offered: list[tuple[Array, Array]] = []
+        consider = _Best.consider
+
+        def watched(best: _Best, found: Any) -> None:
+            offered.append((found.states.copy(), found.controls.copy()))
+            consider(best, found)
+
+        monkeypatch.setattr(_Best, "consider", watched)
+        choices = 0
+        for seed in range(16):
+            rng = np.random.default_rng(seed)
+            steps = rng.integers(3, 12)
+            state = solution.trajectory.states[steps] + rng.uniform(-0.05, 0.05, 4)
+            centre = state[:2] + rng.uniform(-0.45, 0.45, 2)
+            if np.hypot(*(centre - (-2, 0))) < 0.75:  # over the problem's own start
+                continue
+            changed, start = problem(balls((*centre, 0.5)), weight=1.0), solution.shifted(int(steps))
+            offered.clear()
+            found = solver.solve(state, start, problem=changed)
+            corners = state[:2] + DT * state[2:] + DT**2 / 2 * 20 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+            size = 0.5 + RADIUS + MARGIN
+            least = max(size - np.linalg.norm(corners - centre, axis=1).max(), 0.0)
+            cost, violation = price(changed, found.trajectory.states, found.trajectory.controls)
+            before = price(changed, *went(changed, start.policy, state))[1]
+            assert least - 1e-9 <= violation <= before + 1e-9
+            others = [price(changed, *one) for one in offered if np.isfinite(one[0]).all()]
+            alike = [price for price, missed in others if missed <= violation * (1 + 1e-3)]
+            choices += len(alike) > 1 and violation > 0
+            assert cost <= min(alike, default=np.inf) * (1 + 1e-8)
+        assert choices > 8
+
+    @settings(max_examples=examples(40), suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(
+        offers=st.lists(st.tuples(st.sampled_from([0.0, 3e-7, 0.1, 0.1004, 0.3, 0.5]), st.floats(1, 1e4)), max_size=6)
+    )
+    def test_violations_come_first_and_then_costs(
+        self, stated: ls.Problem, solution: ls.Solution, offers: list[tuple[float, float]]
+    ) -> None:
+        """Whatever plans are offered, in any order: 0 and 3e-7 m are as good, and so are 0.1 and 0.1004 m.
+
+        The first plan violates by 0.45 m; a plan that violates more is never taken.
+        """
+        state = solution.trajectory.states[9]
+        changed = problem(balls((state[0], state[1] + 0.2, 0.5)), weight=1.0).from_state(state)
+        run = SolveRun(changed, SmootherSettings(), resolve(solution.shifted(9), changed), state, Budget(1))
+        best = _Best(run)
+        first = best.violation, best.cost
+        assert 0.4 < first[0] < 0.5
+        for missed, cost in offers:
+            best.consider(replace(_unchanged(best), cost=cost, violation=missed))
+        ranks = {0.0: 0, 3e-7: 0, 0.1: 1, 0.1004: 1, 0.3: 2}
+        allowed = [(ranks[missed], cost) for missed, cost in offers if missed in ranks] or [(3, first[1])]
+        assert (ranks.get(best.violation, 3), best.cost) == min(allowed)
+        assert best.improved == (best.violation < 0.4)
 
     def test_another_structure_is_refused(
         self, stated: ls.Problem, solver: ls.types.PreparedSolver, solution: Any
@@ -553,12 +622,15 @@ class TestLive:
             planner.change(**parts)
 
     def test_changes_act_in_a_live_run_too(self, stated: ls.Problem, solution: ls.Solution) -> None:
-        """To the bit what `change` does, if it says so of each time."""
+        """To the bit what `change` does, if it says so of each time. A backward clock leaves each solve all its time,
+        however busy the machine is.
+        """
         goal = ls.QuadraticCost([100.0] * 4, about=(2, 1.5, 0, 0))
         known = [None, lambda t, problem: replace(problem, final_cost=goal)]
         plans = []
         for changes in known:
-            with live(stated, solution, every=DT, clock=lambda: 0.0, changes=changes) as planner:
+            backwards = itertools.count(0, -100).__next__
+            with live(stated, solution, every=DT, clock=backwards, changes=changes) as planner:
                 if changes is None:
                     planner.change(final_cost=goal)
                 for i in range(3):

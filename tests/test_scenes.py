@@ -285,13 +285,15 @@ def test_what_mujoco_would_not_survive_or_not_say(text, message):
 
 
 def test_replicas_are_obstacles_and_thousands_of_them_are_loaded_quickly():
-    """In processor time, as a ratio: at most three times what MuJoCo needs by itself."""
+    """In processor time, as a ratio: at most three times what MuJoCo needs by itself, in the best of five."""
     text = '<mujoco><worldbody><light/><camera pos="0 0 1"/><replicate count="100" offset="1 0 0"><replicate count="50"'
     text += ' offset="0 1 0"><geom type="box" size=".1 .1 .1"/></replicate></replicate></worldbody></mujoco>'
-    began = time.process_time()
-    mujoco.MjModel.from_xml_string(text)
-    alone = time.process_time() - began
-    began = time.process_time()
-    scene = scene_from_xml(text, "many")
-    assert time.process_time() - began < 3 * alone + 0.1
-    assert len(scene.world) == 5000
+
+    def seconds(load):
+        began = time.process_time()
+        load()
+        return time.process_time() - began
+
+    assert len(scene_from_xml(text, "many").world) == 5000
+    alone = min(seconds(lambda: mujoco.MjModel.from_xml_string(text)) for _ in range(5))
+    assert min(seconds(lambda: scene_from_xml(text, "many")) for _ in range(5)) < 3 * alone + 0.1

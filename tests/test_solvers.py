@@ -363,6 +363,39 @@ class TestProgress:
         first = next(line for line in told if not line.startswith("compiling "))  # if nothing is cached
         assert re.fullmatch(r"smooth: \d+ s, in the first iteration; at most 5000 s left", first)
 
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_it_says_how_long_it_compiled_if_that_does_not_count(
+        self, solver: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """Dynamics that no cache has: the time is within that of the call, beyond the limit, and said once."""
+        monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+
+        def solved(number: float, limit: float | None) -> tuple[list[float], float]:
+            """The times of compiling that are said in a solve, and how long it took, in s."""
+            dynamics = ls.Dynamics(
+                lambda x, u, p: [x[1], u[0] - number * x[0]], states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"}
+            )
+            problem = ls.Problem(
+                dynamics=dynamics, dt=0.1, steps=10, initial=ls.FixedState([1, 0]), stage_cost=ls.ControlCost([1.0]),
+                final_cost=ls.QuadraticCost([10.0, 10.0], about=[0, 0]),
+            )  # fmt: skip
+            caplog.clear()
+            clock = time.perf_counter()
+            solver(problem, time_limit=limit)
+            taken = time.perf_counter() - clock
+            line = rf"compiled in ([\d.]+) s, which the time_limit of {limit or 0:g} s does not count"
+            found = [re.fullmatch(line, record.getMessage()) for record in caplog.records]
+            return [float(one[1]) for one in found if one], taken
+
+        for seed in range(3):
+            number = float(np.random.default_rng(seed).uniform(0.5, 2.0)) + 2 * (solver is ls.ilqr)
+            told, taken = solved(number, 0.001)
+            (compiled,) = told
+            assert compiled <= taken + 0.05  # it is rounded
+            assert solved(number, 0.001)[0] == []  # nothing is compiled
+            assert solved(number + 0.125, None)[0] == []
+            assert solved(number + 0.25, 5000.0)[0] == []  # a tenth of that is more than compiling takes
+
     def test_whoever_hears_of_iterations_is_not_told(
         self, slow: ls.Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:

@@ -171,6 +171,9 @@ def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         for key, part in value.items():
             yield from _value(key, seen)
             yield from _value(part, seen)
+    elif isinstance(value, slice):  # a constant of code since Python 3.14
+        yield "slice"
+        yield from _value((value.start, value.stop, value.step), seen)
     elif _packaged(value):
         owner = getattr(value, "__module__", None)
         yield f"{owner}.{getattr(value, '__qualname__', getattr(value, '__name__', ''))}"

@@ -1,15 +1,37 @@
 """Options that several commands share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 
 def optional(metavar: str, text: str | None = None) -> object:
     """An option whose help text describes its default."""
     return arg(metavar=metavar, help_behavior_hint="", help=text)
+
+
+RULES = ConstructorRegistry()
+
+
+@RULES.primitive_rule
+def _value_or_default(info: PrimitiveTypeInfo) -> Any:
+    """What is given for a `T | None` is a T. tyro would try None as well, and name types and markup if both fail."""
+    kinds = set(get_args(info.type))
+    if len(kinds) != 2 or NoneType not in kinds:
+        return None
+    (kind,) = kinds - {NoneType}
+    found = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
+    if not isinstance(found, PrimitiveConstructorSpec):
+        return found
+    return replace(
+        found,
+        is_instance=lambda value: value is None or found.is_instance(value),
+        str_from_instance=lambda value: ["None"] if value is None else found.str_from_instance(value),
+    )
 
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]

@@ -109,6 +109,8 @@ class Break(FailureOptions):
 
     rounds: int = 40
     """Largest number of rounds; the search ends earlier if less than 1 % is left to gain."""
+    particles: int = 200
+    """Number of trials at each level of the splitting that finds first failures."""
 
     def run(self) -> int:
         from lqrsim.commands import console
@@ -123,7 +125,7 @@ class Break(FailureOptions):
         try:
             with console.keeping(write), console.progress("searching", "round") as progress:
                 smallest = problem.smallest_failure(
-                    rounds=self.rounds, seed=self.seed, report=console.say, progress=progress
+                    rounds=self.rounds, particles=self.particles, seed=self.seed, report=console.say, progress=progress
                 )
         except NoFailure as none:
             return _say_none(none)

@@ -71,7 +71,8 @@ class Solve:
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Stop after this many iterations. By default the solver's own limit."""
     time_limit: Annotated[float | None, optional("SECONDS")] = None
-    """Stop after this time, without compiling, with the best plan so far. By default there is no limit."""
+    """Stop after this time with the best plan so far. Compiling, which comes first for a new kind of problem, does not
+    count; a line says how long it took. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
     """Number of starting paths that smooth tries for a few iterations; the best continues. By default 7,
     if there is no start."""

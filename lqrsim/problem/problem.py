@@ -350,6 +350,12 @@ class Problem:
         return replace(self, **changed) if changed else self
 
     def __str__(self) -> str:
+        lines = self.parts | {"constraints": "\n               ".join(map(repr, self.constraints))}
+        return "\n".join(f"{name + ':':14s} {text}" for name, text in lines.items() if text)
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """What is asked for, by part, as `print(problem)` says it; empty for what is not."""
         space, controls = self.dynamics.state_coordinates, self.control_coordinates
         low, high = (self.steps * self.dt,) * 2 if self.duration is None else self.duration
         seconds = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
@@ -358,15 +364,14 @@ class Problem:
             for name, low, high in zip(controls.names, controls.low, controls.high, strict=True)
             if np.isfinite([low, high]).any()
         ]
-        lines = {
+        return {
             "dynamics": f"{self.dynamics.name}; {self.steps} steps of {self.dt:.6g} s, {seconds} in all",
             "states": ", ".join(space.labels), "controls": ", ".join(controls.labels), "limits": ", ".join(limited),
             "start": repr(self.initial), "stage cost": repr(self.stage_cost), "final cost": repr(self.final_cost),
-            "constraints": "\n               ".join(map(repr, self.constraints)),
+            "constraints": "; ".join(map(repr, self.constraints)),
             "noise": "" if self.noise is None else f"{self.noise!r}, risk {self.risk:g}",
             "cost of time": f"{self.time_weight:g} a second" if self.time_weight else "",
         }  # fmt: skip
-        return "\n".join(f"{name + ':':14s} {text}" for name, text in lines.items() if text)
 
     @property
     def digest(self) -> str:

@@ -276,6 +276,24 @@ class Coordinates:
             out[i] = number
         return out
 
+    def _ranges(self, field: str, limits: Limits) -> tuple[Array, Array]:
+        """The lowest and the highest value of each entry, (n,) each, as `limited` takes them; `field` of the message.
+
+        Raises:
+          InputError: a limit is not a number, or there is no such name.
+        """
+        if isinstance(limits, Mapping):
+            low, high = np.array(self.low), np.array(self.high)
+            for i, pair in self._by_name(field, limits, _pair).items():
+                low[i], high[i] = pair
+            return low, high
+        try:
+            low, high = (np.broadcast_to(numbers_of(field, side), len(self)) for side in limits)
+        except Exception:  # not a pair, not numbers, or the wrong number of them
+            wanted = f"(lowest, highest), each a number or ({len(self)},), or such pairs by name"
+            raise InputError(f"{field}: got {excerpt(limits)}, want {wanted}") from None
+        return low, high
+
     def limited(self, limits: Limits) -> "Coordinates":
         """The same coordinates with other limits.
 
@@ -286,16 +304,7 @@ class Coordinates:
         Raises:
           InputError: a limit is not a number, the lower is not below the upper, or there is no such name.
         """
-        if isinstance(limits, Mapping):
-            low, high = np.array(self.low), np.array(self.high)
-            for i, pair in self._by_name("control_limits", limits, _pair).items():
-                low[i], high[i] = pair
-        else:
-            try:
-                low, high = (np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in limits)
-            except Exception:  # not a pair, not numbers, or the wrong number of them
-                wanted = f"(lowest, highest), each a number or ({len(self)},), or such pairs by name"
-                raise InputError(f"control_limits: got {excerpt(limits)}, want {wanted}") from None
+        low, high = self._ranges("control_limits", limits)
         for name, lowest, highest in zip(self.names, low, high, strict=True):
             if not lowest < highest:
                 raise InputError(

@@ -109,8 +109,9 @@ class Plan:
 class Replan(Plan):
     """The result of a prepared solver: a plan from a given state, no worse than the rollout of the initial law.
 
-    No worse means that its violation is no larger, and if both keep the constraints, that its cost is no higher. The
-    plan can be used with any status, unless `cost` is not finite.
+    No worse means that its violation is no larger, and if both keep the constraints, that its cost is no higher. Of
+    plans that violate constraints equally, to two digits or within 1e-6, the one of least cost is chosen. The plan can
+    be used with any status, unless `cost` is not finite.
 
     Attributes:
       improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.

@@ -39,7 +39,8 @@ FORMATS: dict[type, tuple[str, int]] = {
     FailureCertificate: ("certificate", 1),
 }
 VERSIONS = dict(FORMATS.values())
-LATER = {(Certificate, "contacts"), (FailureCertificate, "keep")}  # fields that older files of the same version lack
+# Fields that older files of the same version lack.
+LATER = {(Certificate, "contacts"), (FailureCertificate, "keep"), (Solution, "problem_parts")}
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:

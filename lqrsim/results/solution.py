@@ -1,7 +1,7 @@
 """The result of a solve. NumPy only."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class Solution(Plan):
       solver: name of the function that was called.
       options: the settings of the solver; with noise, also a description of the noise, and the risk.
       problem_digest: hash of everything that defines the problem.
+      problem_parts: what the problem asks for, by part, as `print(problem)` says it; empty in older files.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
       remedy: a remedy to try in this case; empty for a success.
       scenario: the scenario that the command line solved; empty if a program called the solver.
@@ -55,6 +56,7 @@ class Solution(Plan):
     remedy: Annotated[str, 10 * LINE] = ""
     scenario: Annotated[str, 10 * LINE] = ""
     candidates: tuple[Candidate, ...] = ()
+    problem_parts: Mapping[str, Annotated[str, 10 * LINE]] = field(default_factory=dict)
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
@@ -76,7 +78,7 @@ class Solution(Plan):
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with all parts made."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -131,7 +131,8 @@ class MjcfRobot(Robot):
         self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
-        place, plane = self._position(position, names, mjcf_joints.position_of(model, number), who)
+        self._axes = mjcf_joints.position_of(model, number)
+        place, plane = self._position(position, names, who)
         states = Coordinates(
             names=names, units=units, position=place, plane=plane,
             rotation_vectors=tuple(one.dof + turned[one.kind] for one in self._joints if one.kind in turned),
@@ -167,25 +168,34 @@ class MjcfRobot(Robot):
                     yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
         yield from ((name, "") for name in mjcf_joints.activations_of(self.scene.model))
 
-    def _position(
-        self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
-    ) -> tuple[tuple[int, ...], str]:
+    def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
         """The states that are the position, and its plane."""
+        axes = self._axes
         if asked is None:
-            found = sorted(axes, key=lambda dof: axes[dof])
-            if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
+            found = sorted(axes.of, key=lambda dof: axes.of[dof])
+            reached = {axes.of[dof] for dof in found}
+            # A plane is a position only if nothing moves the body out of it.
+            if len(reached) < len(found) or len(found) < max(sum(axes.moving), 2):
                 return (), ""
         else:
             listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
             found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
-        plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
+        plane = "".join(_AXES[axes.of[dof]] for dof in found if dof in axes.of)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
-            got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
+            got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes.of) or "none"
             raise InputError(
                 f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r},"
-                f" among: {told}"
+                f" among: {told}" + "".join(f"; {line}" for line in self._shifted(names))
             )
         return tuple(found), plane if len(found) == 2 else ""
+
+    def _shifted(self, names: tuple[str, ...]) -> list[str]:
+        """Of each slide that moves the body along an axis, but from another zero: what makes it part of a position."""
+        return [
+            f"{names[dof]} is the body's {_AXES[axis]} minus {away:.6g} m, and would be its {_AXES[axis]}"
+            f' with ref="{away:.6g}" in the <joint>'
+            for dof, (axis, away) in self._axes.shifted.items()
+        ]
 
     def _balls_at(self, state: Array) -> Array:
         """Centres of the balls, (K, 3), by MuJoCo's bindings."""
@@ -392,6 +402,7 @@ class MjcfRobot(Robot):
             f"  body: {self.body}, with the position {', '.join(space.names[i] for i in space.position)}"
             if space.position
             else f"  body: {self.body}, whose position is not among the states",
+            *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
             f"  held at rest by: {_listed(told)}{short}",
             *([f"  dry friction, in plans and runs: {_listed(dry)}"] if (dry := self._dry()) else []),
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),

@@ -1,6 +1,7 @@
 """Solutions of scenarios: computed, computed from a stored start, or given instead of solving."""
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind
+from lqrsim.problem.problem import Problem
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -21,6 +23,8 @@ from lqrsim.solvers.initial_guess import InitialPrior, is_function, resolve
 from lqrsim.solvers.smoother import smooth
 
 SOLVERS: Mapping[str, Callable[..., Solution]] = {"smooth": smooth, "ilqr": ilqr}
+
+LONGEST = 600  # characters of a description of what differs
 
 
 def solve(scenario: Scenario, solver: str = "smooth", **options: Any) -> Solution:
@@ -114,10 +118,41 @@ def remarks(scenario: Scenario, solution: Solution) -> list[str]:
     lines: list[str] = []
     if not solution.success:
         lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
-    if solution.problem_digest != scenario.settled(solution).problem.digest:
+    problem = scenario.settled(solution).problem
+    if solution.problem_digest != problem.digest:
         solved = f" (solved as {solution.scenario})" if solution.scenario else ""
-        lines.append(f"is of another problem than that of {scenario.name}{solved}; its plan is run as it is")
+        other = difference(solution, problem)
+        lines.append(f"is of another problem than that of {scenario.name}{solved}{other}; its plan is run as it is")
     return lines
+
+
+def difference(solution: Solution, problem: Problem) -> str:
+    """Which parts of a solution's problem differ from another problem's, to be put after a name; or nothing.
+
+    Numbers that descriptions leave out, such as places of obstacles, differ without being named. Solutions of older
+    files have no description.
+    """
+    if not solution.problem_parts:
+        return ""
+    pairs = {name: (solution.problem_parts.get(name, "none"), text or "none") for name, text in problem.parts.items()}
+    named = [
+        f"{name} {' instead of '.join(_differing(one, other))}" for name, (one, other) in pairs.items() if one != other
+    ]
+    text = "; ".join(named)
+    text = text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return f": {text}" if named else ", in numbers that a description of it leaves out"
+
+
+def _differing(*texts: str) -> list[str]:
+    """Two descriptions without the items with which both begin or end."""
+    items = [re.split(r"(?<=[,;] )|(?<= \+ )", text) for text in texts]
+    least = min(map(len, items)) - 1
+    begin = next((i for i, (one, other) in enumerate(zip(*items, strict=False)) if one != other), least)
+    begin = min(begin, least)
+    back = zip(*(reversed(one[begin + 1 :]) for one in items), strict=False)
+    end = next((i for i, (one, other) in enumerate(back) if one != other), least - begin)
+    kept = ("".join(one[begin : len(one) - end]).strip(" ,;") for one in items)
+    return [f"{'... ' * (begin > 0)}{one}{' ...' * (end > 0)}" for one in kept]
 
 
 def _check_fits(field: str, what: object, scenario: Scenario, spaces: Spaces, steps: int) -> None:

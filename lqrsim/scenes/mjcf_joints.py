@@ -306,26 +306,43 @@ def keyframe(model: mujoco.MjModel, xml: str, name: str, what: str) -> tuple[Arr
     return model.key_qpos[number].copy(), model.key_qvel[number].copy(), act
 
 
-def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
-    """Map each degree of freedom that alone moves a body's origin along an axis of the world to that axis (0 to 2).
+@dataclass(frozen=True)
+class Axes:
+    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2).
 
-    The axes are found by moving the joints: the origin must be where the free joint or the slides put it, for any
-    positions of the other joints.
+    Attributes:
+      of: degree of freedom -> axis, where its position is the origin's coordinate.
+      shifted: degree of freedom -> its axis and the origin's coordinate at its zero, where that is another one.
+      moving: whether anything moves the origin along each axis, (3,).
     """
+
+    of: dict[int, int]
+    shifted: dict[int, tuple[int, float]]
+    moving: tuple[bool, ...]
+
+
+def position_of(model: mujoco.MjModel, body: int) -> Axes:
+    """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
     data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
     candidates = {
         one.dof + i: one.qpos.start + i for one in joints if one.kind in ("free", "slide")
         for i in range(3 if one.kind == "free" else 1)
     }  # fmt: skip
-    errors = {(dof, axis): 0.0 for dof in candidates for axis in range(3)}
-    for _ in range(5):
+    origins, positions = np.zeros((5, 3)), np.zeros((5, model.nq))
+    for trial in range(5):
         data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
         mujoco.mj_normalizeQuat(model, data.qpos)
         mujoco.mj_kinematics(model, data)
-        for dof, axis in errors:
-            off = abs(float(data.xpos[body][axis] - data.qpos[candidates[dof]]))
-            errors[dof, axis] = max(errors[dof, axis], off)
-    return {dof: axis for (dof, axis), error in errors.items() if error < 1e-9}
+        origins[trial], positions[trial] = data.xpos[body], data.qpos
+    exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
+    for dof, number in candidates.items():
+        for axis in range(3):
+            away = origins[:, axis] - positions[:, number]
+            if np.abs(away).max() < 1e-9:
+                exact[dof] = axis
+            elif np.ptp(away) < 1e-9:
+                shifted[dof] = (axis, float(away.mean()))
+    return Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
 
 
 def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:

@@ -18,6 +18,7 @@ from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import MOVED, Rollout
 from lqrsim.scenes.scene import unlogged
+from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import Effects
@@ -42,6 +43,7 @@ def simulate(
     goal_tolerance: float | None = None,
     frames: bool = True,
     contacts: bool = True,
+    moving: World | None = None,
     threads: int | None = None,
     generators: Callable[[int, int], np.random.Generator] | None = None,
     progress: Callable[[int, int], object] | None = None,
@@ -76,6 +78,8 @@ def simulate(
       contacts: whether obstacles stop the robot, from the control period of its first collision on. If False, the robot
         moves through them. This takes a quarter less time, is bit-identical until the collision, and has the same
         outcome. In simulators other than MuJoCo the robot always moves through obstacles.
+      moving: further obstacles, which move at their velocity, and are in their places at the time 0 of the plan. MuJoCo
+        does not have them: the robot passes through them, but touching one is a collision, and `clearance` counts them.
       threads: number of MuJoCo's threads; by default one per processor.
       generators: (trial, number of the disturbance) -> its random generator, instead of the generators of the seed.
       progress: called after each control period with the number of finished periods and the number of all periods.
@@ -145,7 +149,7 @@ class ClosedLoop:
         self.records = Recorder(plan, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
-        self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt)
+        self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt, settings.passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
         self.step, self.measured, self._knot = 0, self.states, settings.knot
@@ -280,11 +284,13 @@ class ClosedLoop:
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
         goal, radius = self.controller_run.moved_goal(), settings.radius
-        remarks = () if settings.starts is None else ("given first states",)
+        begun = () if settings.starts is None else ("given first states",)
+        passing = () if settings.moving is None else (f"moving obstacles {', '.join(settings.moving.names)}",)
+        moved = () if goal is None else (MOVED,)
         if goal is None:
             goal = settings.followed.goal
         else:
-            remarks, radius = (*remarks, MOVED), settings.radius_about(goal)
+            radius = settings.radius_about(goal)
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -316,7 +322,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in settings.acting), *remarks),
+            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing, *moved),
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},

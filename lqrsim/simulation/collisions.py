@@ -3,13 +3,15 @@
 The robot touches an obstacle if MuJoCo detects a contact, or if a signed distance minus the radius is negative. The
 distance is measured from the robot's position, or from one of its balls or geoms. Detection uses states without
 obstacle contacts, so its result is bit-identical whether or not an obstacle then stops the robot. It checks the knots,
-the parts of a control period that `Physics` has, and straight lines between them.
+the parts of a control period that `Physics` has, and straight lines between them. Obstacles that move, which MuJoCo
+does not have, are where they are at each moment.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
+from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
@@ -22,19 +24,26 @@ class Collisions:
 
     Args:
       displaced: (K, obstacles, 3), in metres. dt: control period in s.
+      passing: the robot's shape among further obstacles, which move; they are where they are at the time 0 of the run.
 
     Attributes:
       at: (K,) times in s; infinite without a collision. obstacles: names of the obstacles; empty without one.
       clearance: (K,) current signed distance to the nearest obstacle, minus the radius, in metres.
     """
 
-    def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float) -> None:
-        self.plant, self.shape, self.dt = plant, plant.shape, dt
+    def __init__(
+        self, plant: Plant, states: Array, displaced: Array, dt: float, passing: ShapeInWorld | None = None
+    ) -> None:
+        self.plant, self.shape, self.dt, self._passing = plant, plant.shape, dt, passing
+        moving = () if passing is None else passing.world.obstacles
+        self._velocities = np.array([one.velocity for one in moving]).reshape(-1, 3)
+        self._fastest = float(np.linalg.norm(self._velocities, axis=1).max(initial=0.0))
         self._displaced, self._moved = plant.shape.across(displaced), bool(displaced.any())
         self.at = np.full(len(states), np.inf)
         self.obstacles = [""] * len(states)
         self._last = self.shape.places(states)
-        self.clearance = self._clear(self._last)
+        self._time = 0.0  # of the last places, in s
+        self.clearance = self._clear(self._last, self._time)
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._last[row])
 
@@ -50,7 +59,7 @@ class Collisions:
             start = (step + part / parts) * self.dt
             for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
                 self.touch(int(row), start, touching[row])
-            if len(self.plant.world):
+            if len(self.plant.world) or len(self._velocities):
                 self._search_line(step, part, parts, self.shape.places(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # Rounding may put a time in the period past the period's end.
@@ -65,13 +74,14 @@ class Collisions:
     def relocate(self, states: Array) -> None:
         """Replace the current states: obstacles have stopped some of the trials."""
         self._last = self.shape.places(states)
-        self.clearance = self._clear(self._last)
+        self.clearance = self._clear(self._last, self._time)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
         """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
-        self._last, self.clearance = there, self._clear(there)
-        length = self.shape.travel(last, there)
+        self._time = (step + (part + 1) / parts) * self.dt
+        self._last, self.clearance = there, self._clear(there, self._time)
+        length = self.shape.travel(last, there) + self._fastest * self.dt / parts  # moves of robot and obstacles
         # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
@@ -85,17 +95,29 @@ class Collisions:
             share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None, None]
             at_end = gone >= length[rows]
             places = np.where(at_end[:, None, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
-            clear = self._clear(places, rows)
+            times = (step + (part + share[:, 0, 0]) / parts) * self.dt
+            clear = self._clear(places, times, rows)
             for k in np.flatnonzero(looking & (clear < 0)):
-                self._hit(int(rows[k]), (step + (part + float(share[k, 0, 0])) / parts) * self.dt, places[k])
+                self._hit(int(rows[k]), float(times[k]), places[k])
             looking &= (clear >= 0) & ~at_end
 
-    def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
-        """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3)."""
+    def _clear(self, places: Array, time: float | Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
+        """The clearance (k,) of these trials with their balls at places (k, B, 2 or 3), at times (k,) in s."""
         displaced = self._displaced if rows is None else self._displaced[rows]
-        return self.shape.clearance(places, displaced if self._moved else None)
+        clear = self.shape.clearance(places, displaced if self._moved else None)
+        if self._passing is None:
+            return clear
+        return np.minimum(clear, self._passing.clearance(places, self._gone(np.broadcast_to(time, len(places)))))
+
+    def _gone(self, times: Array) -> Array:
+        """How far the moving obstacles have come at times (k,) in s, (k, obstacles, 3) in m."""
+        return times[:, None, None] * self._velocities
 
     def _hit(self, row: int, time: float, places: Array) -> None:
         """Record a collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        self.obstacles[row] = self.plant.world.names[self.shape.nearest(places, self._displaced[row])]
+        gone = self._gone(np.array([time]))
+        if self._passing is None or not self._passing.clearance(places[None], gone)[0] < 0:
+            self.obstacles[row] = self.plant.world.names[self.shape.nearest(places, self._displaced[row])]
+        else:
+            self.obstacles[row] = self._passing.world.names[self._passing.nearest(places, gone[0])]

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.problem import Problem
-from lqrsim.results.coordinates import check_same_system, spaces_of
+from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, unlogged
@@ -111,7 +111,7 @@ def check_plant(
     period: float | None = None,
     around: npt.ArrayLike | None = None,
     spread: float = 0.3,
-    controls: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    controls: Limits | None = None,
     settle: float | None = None,
     samples: int = 50,
     tolerance: float = 0.02,
@@ -133,7 +133,8 @@ def check_plant(
       period: control period in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
       around: (n,) mean of the random states; by default the problem's start, or zero.
       spread: their standard deviation, in each state's unit.
-      controls: lowest and highest random control, (m,) each; by default the limits of the problem, or the dynamics'.
+      controls: (lowest, highest) random control, each a number or (m,), or a dictionary of name or unit of a control:
+        (lowest, highest); by default, and for controls that are not named, the limits of the problem, or the dynamics'.
       settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
         speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
@@ -222,17 +223,10 @@ def _drawn(rng: np.random.Generator, middle: Array, spread: float, low: Array, h
     return state
 
 
-def _control_range(
-    robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] | None, problem: Problem | None
-) -> tuple[Array, Array]:
+def _control_range(robot: Robot, controls: Limits | None, problem: Problem | None) -> tuple[Array, Array]:
     """The lowest and the highest control, (m,) each. Raises InputError unless they are finite and in order."""
     space = robot.dynamics.control_coordinates if problem is None else problem.applied_coordinates
-    m = len(space)
-    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
-        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
-    low, high = (space.low, space.high) if controls is None else controls
-    low = check_array("controls: lowest", low, (m,), infinite=True)
-    high = check_array("controls: highest", high, (m,), infinite=True)
+    low, high = space._ranges("controls", {} if controls is None else controls)
     if not (low <= high).all():
         raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
     if not np.isfinite([low, high]).all():

@@ -20,11 +20,13 @@ from lqrsim.errors import (
     check_seed,
     check_text,
 )
+from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
 from lqrsim.results.plan import Plan
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.scenes.world import World
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import MakeGenerator, seeded
 from lqrsim.simulation.physics import part_of
@@ -48,6 +50,7 @@ class RunSettings:
       followed: the plan of the run: the given one, or else the controller's own; from the knot on.
       states, controls: coordinates of the controller, with limits within the robot's limits.
       radius: distance from the goal within which it counts as reached, in `Target.unit`.
+      passing: the robot's shape among the moving obstacles, where they are at the knot; None without any.
       substeps: physics steps per control period.
 
     Raises:
@@ -71,6 +74,7 @@ class RunSettings:
     watch: Watch | None = None
     starts: Array | None = None
     knot: int = 0
+    moving: World | None = None
     acting: tuple[Disturbance, ...] = field(init=False)
     law: Controller = field(init=False)
     whole: Trajectory = field(init=False)
@@ -78,6 +82,7 @@ class RunSettings:
     states: Coordinates = field(init=False)
     controls: Coordinates = field(init=False)
     radius: float = field(init=False)
+    passing: ShapeInWorld | None = field(init=False)
     substeps: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -104,6 +109,7 @@ class RunSettings:
         target = Target(self.states, self.followed.goal, self.trajectory.states)
         self.radius = target.radius(self.plant.robot.radius, self.goal_radius, self.goal_tolerance)
         self.substeps = self.plant.substeps(self.trajectory.dt)
+        self.passing = _passing(self.plant, self.moving, self.knot * self.trajectory.dt)
         _check_size(self.plant, self.trajectory, self.substeps, self.trials, frames=self.frames)
 
     def radius_about(self, goal: Array) -> float:
@@ -127,6 +133,23 @@ class RunSettings:
     def random_streams(self) -> MakeGenerator:
         """(trial, number of the disturbance) -> its random generator."""
         return self.generators or seeded(self.seed)
+
+
+def _passing(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | None:
+    """The robot's shape among obstacles that MuJoCo does not have, at this time in s.
+
+    Raises:
+      InputError: there is no World, or the robot's distances are those of MuJoCo's geoms.
+    """
+    if moving is None:
+        return None
+    check_kind("moving", moving, World, "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])")
+    robot = plant.robot
+    if "geoms" in robot.shape:
+        raise InputError(f"moving: got obstacles for {robot.name}, whose geoms are its shape, want a radius or balls")
+    if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
+        raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
+    return shape_in(robot.dynamics, moving.moved(time), **robot.shape)
 
 
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:

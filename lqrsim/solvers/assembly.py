@@ -9,6 +9,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
+from lqrsim.results.fields import LINE
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
@@ -51,6 +52,7 @@ def assemble(
         "inverse_policy": lambda: policy(*inverse_law, states[1:]) if inverse_law is not None else None,
         "clearance": lambda: clearance_of(problem, states),
         "problem_digest": lambda: problem.digest,
+        "problem_parts": lambda: {name: _line(text) for name, text in problem.parts.items() if text},
     }
     return Solution._assembled(
         later,
@@ -72,6 +74,12 @@ def assemble(
         goal=problem.weighed_goal,
         goal_radius=goal_radius_of(problem, states),
     )
+
+
+def _line(text: str) -> str:
+    """A text, which may contain the repr of a user's object, as a printable line that a file can hold."""
+    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+    return line[: 10 * LINE]
 
 
 def _usable(found: RunResult, options: dict[str, object]) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import compilations
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
 
@@ -17,6 +18,7 @@ Callback = Callable[[Iteration], object]
 _log = logging.getLogger("lqrsim")
 SILENT = 2.0  # s without a message after which a solve reports its progress; later reports come at growing intervals
 SELDOM = 60.0  # s
+NOTED = 10.0  # compiling is mentioned if it takes longer than the time limit divided by this
 
 
 @dataclass
@@ -48,14 +50,16 @@ class Stop:
 
     @contextlib.contextmanager
     def not_counting(self) -> Iterator[None]:
-        """A block whose time does not count, such as compiling."""
-        began = time.perf_counter()
+        """A block that may compile, whose time does not count. If it compiles for long, a log line says so."""
+        began, limit, compiled = time.perf_counter(), self.deadline - self.begun, len(compilations)
         try:
             yield
         finally:
             taken = time.perf_counter() - began
             self.begun += taken
             self.deadline += taken
+            if len(compilations) > compiled and np.inf > limit < NOTED * taken:
+                _log.warning("compiled in %.1f s, which the time_limit of %g s does not count", taken, limit)
 
     @property
     def due(self) -> bool:

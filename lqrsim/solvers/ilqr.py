@@ -160,10 +160,11 @@ def _solve(
         steps=steps, max_iterations=most, tolerance=settings.tolerance, gap_tolerance=0.0,
         optimal=settings.stop == "optimal", fixed=True, guided=False, prior_iterations=0,
     )  # fmt: skip
-    model = compiled.arguments(problem)
-    loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, rows)
     budget = Budget(most, callback=callback, attentive=attentive)
     budget.stop.begin(settings.time_limit)
+    with budget.stop.not_counting():
+        model = compiled.arguments(problem)
+        loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, rows)
     with budget.stop.reporting("ilqr", attentive):
         ending = iterate(
             problem, lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, rows), rows,

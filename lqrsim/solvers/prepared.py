@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.constraints import allowed_violation, violation_of
+from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.plan import Plan, Replan
@@ -370,6 +370,8 @@ class _Best:
         # Equalities are kept only within a tolerance.
         allowed = run.settings.violation_tolerance(run.problem)
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
+        self._negligible = min(allowed, EQUALITY_TOLERANCE)
+        self._most = max(self.violation, self._none)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
@@ -393,7 +395,8 @@ class _Best:
 
     def consider(self, found: RunResult) -> None:
         """Adopt the final result if it converged and is as good as the best, or if it is better."""
-        as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
+        cheaper = self._better(self.cost, self.violation, found.cost, found.violation)
+        as_good = found.success and (self.violation > self._none or not cheaper)
         if as_good or self._beaten_by(found.cost, found.violation):
             there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())
             self._keep(found.cost, found.violation, there)
@@ -403,12 +406,21 @@ class _Best:
         return self._better(cost, violation, self.cost, self.violation)
 
     def _better(self, cost: float, violation: float, than_cost: float, than_violation: float) -> bool:
-        """Whether one plan is better than another: constraints first, then the cost, beyond rounding."""
-        if not np.isfinite(cost) or np.isnan(violation):
+        """Whether one plan is better than another: constraints first, then the cost, beyond rounding.
+
+        Often the first step decides the largest violation, whatever comes after it. So violations that agree to two
+        digits count as equal, as in `RunResult.rank`; but none may be larger than that of the first plan.
+        """
+        if not np.isfinite(cost) or not violation <= self._most:
             return False
-        if max(violation, than_violation) > self._none:
-            return violation < than_violation
+        missed, than_missed = self._missed(violation), self._missed(than_violation)
+        if missed != than_missed:
+            return missed < than_missed
         return not cost >= than_cost - ROUNDING * abs(than_cost)
+
+    def _missed(self, violation: float) -> float:
+        """A violation as it is compared."""
+        return 0.0 if violation <= self._negligible else float(f"{violation:.2g}")
 
     def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
         states, controls, gain, offset, *to_go = arrays

@@ -75,7 +75,8 @@ def smooth(
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
         may use that many, including the further starts that are tried while no plan satisfies the constraints.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
-        comes first, does not count. An iteration that would end later, if it took as long as the last, is not begun.
+        comes first, does not count, and if it takes long, a log line says so. An iteration that would end later, if it
+        took as long as the last, is not begun.
       start: the initial guess, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which attracts the first iterations; an AffinePolicy; a
         Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and

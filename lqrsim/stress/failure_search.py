@@ -197,6 +197,7 @@ class ReliabilityProblem:
         self,
         *,
         rounds: int = 40,
+        particles: int = 200,
         seed: int = 0,
         report: Report | None = None,
         progress: Progress | None = None,
@@ -205,6 +206,7 @@ class ReliabilityProblem:
 
         Args:
           rounds: largest number of rounds.
+          particles: number of trials at each level of the splitting that finds first failures.
           seed: seed of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the number of finished rounds, the number of all rounds, and the distance so far as
@@ -220,6 +222,7 @@ class ReliabilityProblem:
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_most=MOST)
+        particles = check_count("particles", particles, at_least=20)
         score = self._begin(report, progress)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
@@ -239,12 +242,12 @@ class ReliabilityProblem:
                 disturbances=tuple(rollout.disturbances),
                 shares=tuple(float(part @ part) / point.distance**2 for part in np.split(point.numbers, ends)),
                 largest=tuple(largest_effects(rollout)),
-                options={"seed": seed, "rounds": rounds},
+                options={"seed": seed, "rounds": rounds, "particles": particles},
             )
 
         with keeping(lambda done: found(done) if isinstance(done, DesignPoint) else None):
             first = failure_probability(
-                score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed
+                score, score.size, particles=particles, keep=0.2, repetitions=2, level=self._level(report), seed=seed
             )
             point = smallest_failure(
                 score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
@@ -469,7 +472,7 @@ class SmallestFailure:
     """The failure nearest to the undisturbed trial, and the contribution of each disturbance.
 
     Attributes:
-      problem: the ReliabilityProblem. options: `seed` and `rounds`.
+      problem: the ReliabilityProblem. options: `seed`, `rounds` and `particles`.
       point: the random numbers of the failure, their distance in standard deviations, and whether the search converged.
       simulations: number of trials, including the splitting before the search.
       disturbances: descriptions. shares: the fraction of each in the squared distance.

@@ -145,8 +145,9 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
     elif scenario.problem.duration is not None:
         found["ilqr"] = "which cannot find the scenario's free duration"
     replanned = given if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver else None
-    if replanned is not None and replanned.problem_digest != scenario.settled(replanned).problem.digest:
-        found["replan"] = "which re-plans the scenario's problem, while the solution is of another problem"
+    if replanned is not None and replanned.problem_digest != (own := scenario.settled(replanned).problem).digest:
+        other = solving.difference(replanned, own)
+        found["replan"] = f"which re-plans the scenario's problem, while the solution is of another problem{other}"
     return found
 
 
@@ -187,9 +188,10 @@ def make_controller(
             return OffsetFree(problem, solution, design_uncertainty(scenario, design))
         case "replan":
             if solution.problem_digest != problem.digest:
+                other = solving.difference(solution, problem)
                 raise InputError(
-                    f"controller: got replan for a solution of another problem than that of {scenario.name}, want a"
-                    f" solution of the scenario's own problem, or one of {', '.join(CONTROLLERS[:-1])}"
+                    f"controller: got replan for a solution of another problem than that of {scenario.name}{other};"
+                    f" want a solution of the scenario's own problem, or one of {', '.join(CONTROLLERS[:-1])}"
                 )
             every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
             return Replanner(problem, solution, every=every, deadline=0.0)

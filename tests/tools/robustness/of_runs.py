@@ -160,6 +160,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
             "seed": 0, "trials": 1, "first_trial": 0, "goal_radius": 0.1, "frames": True, "contacts": True,
             "threads": 1, "generators": lambda trial, stream: np.random.default_rng(trial), "progress": print_nothing,
             "watch": print_nothing,
+            "moving": ls.World([ls.Obstacle("ball", "sphere", np.full(3, 9.0), np.eye(3), np.array([0.1, 0, 0]))]),
         }, 2.0),
         "simulate an Effect": ({"call": simulate_effect, "plant": plant, "solution": solution, **effect},),
         "simulate a Controller": ({
@@ -250,7 +251,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "self": reliability, **more, "seed": 0, "report": print_nothing, "progress": print_nothing
             }, 0.1)
             for name, more in {
-                "rare_failures": {"particles": 20, "repetitions": 2, "keep": 0.1}, "smallest_failure": {"rounds": 1}
+                "rare_failures": {"particles": 20, "repetitions": 2, "keep": 0.1},
+                "smallest_failure": {"rounds": 1, "particles": 20}
             }.items()
         },
         "FailureCertificate": (vars(certificate),),
