@@ -4,6 +4,7 @@ import itertools
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -370,6 +371,24 @@ class TestReplanner:
         log = run.controller_run.log
         assert log.solved + log.kept.total() == len(log.records) == 4
         assert "ms in the median" in run.controller_run.summary()
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_the_summary_counts_plans_that_are_used_without_having_converged(self, seed: int) -> None:
+        """Those that are better than continuing; counted by hand."""
+        draws, log, used, not_used = np.random.default_rng(seed), ReplanLog(), 0, 0
+        for step in range(12):
+            status = [ls.Status.CONVERGED, ls.Status.INFEASIBLE, ls.Status.TIME_LIMIT][int(draws.integers(3))]
+            better = bool(draws.integers(2))
+            answer: Any = SimpleNamespace(
+                status=status, success=status.success, improved=better, cost=5.0, before=4.0, iterations=1, seconds=0.1
+            )
+            assert log.enter(step, 0, answer) == (status.success or better)
+            used += better and not status.success
+            not_used += not better and not status.success
+        said = log.summary()
+        assert said.startswith(f"solved again {12 - not_used} times")
+        assert (f"({used} of these plans did not converge, but are no worse than continuing: " in said) == (used > 0)
+        assert (f"kept the previous law {not_used} times: " in said) == (not_used > 0)
 
     @pytest.mark.parametrize(
         ("wrong", "line"),

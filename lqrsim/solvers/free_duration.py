@@ -48,11 +48,18 @@ def solve_for_duration(
     ended, as long as such plans become cheaper. `solve` is for problems with a fixed duration, within the time of this
     solve; for `attentive` see `Budget`.
     """
-    budget = Budget(settings.max_iterations, callback=callback)
+    budget, total = Budget(settings.max_iterations, callback=callback), 0
     stop, log = budget.stop, budget.log
+
+    def solved(fixed: Problem, options: SmootherSettings) -> Solution:
+        nonlocal total
+        solution = solve(fixed, options, stop)
+        total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
+        return solution
+
     stop.begin(settings.time_limit)
     assert problem.duration is not None
-    first = begin = solve(settled(problem, problem.steps * problem.dt), settings, stop)
+    first = begin = solved(settled(problem, problem.steps * problem.dt), settings)
     shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
     best, fixed = None, [first]
     while not budget.over:
@@ -68,13 +75,13 @@ def solve_for_duration(
             shorter -= 1
             less = max(SHORTER * ordinary.steps * ordinary.dt, problem.duration[0])
             tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-            begin = solve(settled(problem, less), tries, stop)
+            begin = solved(settled(problem, less), tries)
             if not begin.success:
                 break
         elif best is None and np.isfinite(found.plan.states).all() and not stop.due:
             # The search may only have ended far from the constraints: go on from a plan of that duration.
             start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
-            begin = solve(ordinary, replace(settings, start=start, starts=None), stop)
+            begin = solved(ordinary, replace(settings, start=start, starts=None))
             least = min(_rank_with_time(one, problem.time_weight) for one in fixed)
             fixed.append(begin)
             missed, cost = _rank_with_time(begin, problem.time_weight)
@@ -89,7 +96,8 @@ def solve_for_duration(
             np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
             f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
         )  # fmt: skip
-        return stop.finish(_described(solve(ordinary, replace(settings, start=guess, starts=None), stop), problem))
+        chosen = solved(ordinary, replace(settings, start=guess, starts=None))  # its log begins with the search's
+        return stop.finish(_described(chosen, problem, total))
     chosen = min(fixed, key=lambda one: _rank_with_time(one, problem.time_weight))
     status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
     if stop.due:
@@ -102,15 +110,16 @@ def solve_for_duration(
         chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations,
         remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
     )  # fmt: skip
-    return stop.finish(_described(chosen, problem))
+    return stop.finish(_described(chosen, problem, total + len(log)))
 
 
-def _described(solution: Solution, problem: Problem) -> Solution:
-    """The solution with the free duration among its options, in words."""
+def _described(solution: Solution, problem: Problem, total: int) -> Solution:
+    """The solution with the free duration among its options, in words, and the iterations that all of it took."""
     assert problem.duration is not None
     low, high = problem.duration
     price = f", at a price of {problem.time_weight:g} a second" if problem.time_weight else ""
-    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"})
+    effort = f"; all solves took {total} iterations" if total > len(solution.iterations) else ""
+    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}{effort}"})
 
 
 def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
