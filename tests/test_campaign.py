@@ -650,6 +650,6 @@ def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys
     run_campaign(replace(campaign, trials=2), tmp_path, workers=0)
     results = Results(tmp_path)
     assert results.tally(results.cells[0]).total() == 2
-    with pytest.raises(InputError, match="to run that code"):
+    with pytest.raises(InputError, match="which runs only with --scenario"):
         replay(results, results.cells[0], 0)
     assert replay(Results(tmp_path, scenario=campaign.scenario), results.cells[0], 0).trials == 1

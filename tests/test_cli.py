@@ -199,7 +199,7 @@ def test_runs_are_named_after_the_scenario(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert main(["simulate", str(solution)]) == 2
-    option = one_line(capsys).split(" want ")[1].removesuffix(" to run that code\n")
+    option = one_line(capsys).split("which runs only with ")[1].removesuffix("\n")
     assert main(["simulate", str(solution), *shlex.split(option)]) == 0
 
 

@@ -135,8 +135,44 @@ def test_a_duration_that_is_not_the_best_is_not_dropped_for_the_stated_one() -> 
     solution = ls.smooth(problem(time_weight=5.0), max_iterations=6)
     assert solution.status is Status.MAX_ITERATIONS
     assert "the best duration was not found" in solution.detail
+    assert solution.remedy.startswith("raise max_iterations")
     assert solution.violation <= 1e-6
     assert 2.0 <= solution.trajectory.horizon < 4.0 - 1e-3
+
+
+def test_a_search_that_ends_early_goes_on_from_its_own_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each search has fewer iterations than it mostly needs, six to nine; the limit of the solve allows many.
+
+    Far from the limits, the effort for a duration T is that of the least pushes from rest to rest, effort / T^4, so the
+    best duration is (4 effort / price)^(1/5). A search may end so far away that there is nothing to go on from.
+    """
+    monkeypatch.setattr(free_duration, "SHORTENED", 0)
+    draws, ended = np.random.default_rng(0), []
+    for _ in range(24):
+        way, push, weight = np.exp(draws.uniform(np.log([0.3, 0.5, 0.1]), np.log([3.0, 3.0, 1.0]))).tolist()
+        monkeypatch.setattr(free_duration, "MOST", int(draws.integers(4, 7)))
+        free = dataclasses.replace(problem(way=way, push=push, weight=weight), control_limits=(-100, 100))
+        steps = np.arange(free.steps)
+        reached = push * np.stack([(free.steps - steps - 0.5) / free.steps**2, np.full(free.steps, 1 / free.steps)])
+        effort = 0.5 * weight * np.sum(np.linalg.lstsq(reached, np.array([way, 0.0]), rcond=None)[0] ** 2)
+        solution = ls.smooth(free)
+        ended.append(solution.status)
+        if solution.success:
+            assert solution.trajectory.horizon == pytest.approx((4 * effort) ** 0.2, rel=1e-6)
+    assert set(ended) <= {Status.CONVERGED, Status.STALLED}
+    assert ended.count(Status.CONVERGED) >= 20  # without going on, fewer than half
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_status_of_a_search_without_success_is_true(seed: int) -> None:
+    """In the longest duration the mass gets as far as a quarter of its square, and the goal is farther."""
+    draws = np.random.default_rng(seed)
+    longest = float(draws.uniform(4.0, 6.0))
+    far = float(draws.uniform(1.1, 2.0)) * longest**2 / 4
+    solution = ls.smooth(problem(way=far, duration=(1.0, longest)), max_iterations=5000)
+    assert solution.status is Status.STALLED
+    assert solution.remedy.startswith("state a dt that allows enough time")
+    assert "\n  remedy:" in str(solution)
 
 
 def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,7 +219,7 @@ def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPat
 def test_a_duration_ends_at_its_bound() -> None:
     solution = ls.smooth(problem(duration=(3.0, 5.0)))
     assert solution.trajectory.horizon == pytest.approx(3.0, abs=1e-7)
-    assert "\n  duration:  3 s, free from 3 to 5 s, at a price of 1 a second\n" in str(solution)
+    assert "\n  duration:  3 s, free from 3 to 5 s, at a price of 1 a second; all solves took " in str(solution)
     solution = ls.smooth(problem(weight=1.0, duration=(1.0, 5.0), time_weight=0.0))
     assert solution.trajectory.horizon == pytest.approx(5.0, abs=1e-6)
 

@@ -386,6 +386,23 @@ def test_what_cannot_be_is_infeasible(
         assert solution.violation == pytest.approx(float(np.abs(shooting.rows(best, True)).max()), rel=1e-3)
 
 
+@pytest.mark.parametrize("way", np.exp(np.random.default_rng(0).uniform(np.log(3.0), np.log(150.0), 8)).tolist())
+def test_limits_that_stand_against_a_goal_are_named_however_far_it_is(way: float) -> None:
+    """With a force of at most 1 N, a mass of 1 kg gets 1 m far in 2 s and stops, and 2 m without stopping."""
+    dynamics = ls.Dynamics(lambda x, u, p: [x[1], u[0]], states={"x": "m", "v": "m/s"}, controls={"force": "N"})
+    solution = ls.smooth(
+        ls.Problem(
+            dynamics=dynamics, dt=0.1, steps=20, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.1]),
+            final_cost=ls.QuadraticCost([10.0, 10.0], about=[1.0, 0.0]), constraints=[ls.GoalState(x=way, v=0.0)],
+            control_limits=(-1, 1),
+        )
+    )  # fmt: skip
+    assert solution.status is Status.INFEASIBLE
+    assert way - 2 - 1e-6 <= solution.violation <= way - 1 + 1e-3
+    assert "the limits of force" in solution.detail.split("against it stand")[1]
+    assert "relax the limits of force" in solution.remedy
+
+
 def blocked(place: float) -> ls.Problem:
     """A mass in the plane, whose goal may be in a ball about (1, 0)."""
     world = ls.World([ls.Obstacle("ball", "sphere", np.array([1.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]))])

@@ -4,6 +4,7 @@ import itertools
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -333,6 +334,34 @@ class TestReplanner:
         assert np.linalg.norm(end - goal[:3]) < 0.1
         assert np.linalg.norm(end - quadrotor_solution.trajectory.states[-1, :3]) > 0.3
 
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_run_ends_at_the_goal_that_it_had_last(
+        self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution, seed: int
+    ) -> None:
+        """Goals that move by more than the radius; distances by hand. What does not move is judged as before."""
+        draws = np.random.default_rng(seed)
+        first = quadrotor.problem.goal
+        assert first is not None
+        goal, begin = first.copy(), float(draws.uniform(0.5, 2.5))
+        goal[2] -= np.sign(goal[2]) * draws.uniform(1.5, 2.5) * quadrotor.robot.radius
+        later = ls.QuadraticCost(np.full(12, 5000.0), about=goal)
+
+        def known(t: float, problem: ls.Problem) -> ls.Problem:
+            return replace(problem, final_cost=later) if t >= begin else problem
+
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.5, changes=known)
+        run = simulated(plant, quadrotor_solution, law)
+        away = np.linalg.norm(run.states[0, -1, :3] - goal[:3])
+        assert run.goal_distance[0] == pytest.approx(away, abs=1e-12)
+        assert away <= quadrotor.robot.radius
+        assert run.outcome == ("reached",)
+        assert np.linalg.norm(run.states[0, -1, :3] - first[:3]) > quadrotor.robot.radius
+        assert "goal moved during the run" in str(run)
+        assert "MISSES" not in str(run)
+        still = simulated(plant, quadrotor_solution, ls.Replanner(quadrotor.problem, quadrotor_solution, every=2.0))
+        np.testing.assert_array_equal(still.goal, quadrotor_solution.goal)
+        assert "moved" not in str(still)
+
     def test_measured_it_says_how_long_it_took(self, plant: ls.Plant, quadrotor: Any, quadrotor_solution) -> None:
         law = ls.Replanner(
             quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.5, computing="measured", horizon="moving"
@@ -342,6 +371,24 @@ class TestReplanner:
         log = run.controller_run.log
         assert log.solved + log.kept.total() == len(log.records) == 4
         assert "ms in the median" in run.controller_run.summary()
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_the_summary_counts_plans_that_are_used_without_having_converged(self, seed: int) -> None:
+        """Those that are better than continuing; counted by hand."""
+        draws, log, used, not_used = np.random.default_rng(seed), ReplanLog(), 0, 0
+        for step in range(12):
+            status = [ls.Status.CONVERGED, ls.Status.INFEASIBLE, ls.Status.TIME_LIMIT][int(draws.integers(3))]
+            better = bool(draws.integers(2))
+            answer: Any = SimpleNamespace(
+                status=status, success=status.success, improved=better, cost=5.0, before=4.0, iterations=1, seconds=0.1
+            )
+            assert log.enter(step, 0, answer) == (status.success or better)
+            used += better and not status.success
+            not_used += not better and not status.success
+        said = log.summary()
+        assert said.startswith(f"solved again {12 - not_used} times")
+        assert (f"({used} of these plans did not converge, but are no worse than continuing: " in said) == (used > 0)
+        assert (f"kept the previous law {not_used} times: " in said) == (not_used > 0)
 
     @pytest.mark.parametrize(
         ("wrong", "line"),

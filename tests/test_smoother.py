@@ -1,6 +1,7 @@
 """What smooth() can begin with, and in which form and order; what its safeguard changes, and what it does not."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.kernels import declarations
 from lqrsim.results.solution_parts import Status
+from lqrsim.solvers.engine import Ending, SolveRun
 from lqrsim.solvers.initial_guess import StartLike
 
 FORMS = ("dual", "primal")
@@ -235,6 +238,29 @@ class TestSafeguard:
         # iLQR from there finds next to nothing.
         further = ls.ilqr(stiff, start=guarded.trajectory, tolerance=1e-9, max_iterations=2000)
         assert guarded.cost - further.cost < 1e-3 * guarded.cost
+
+    @pytest.mark.parametrize(
+        "outcome", [declarations.NOT_FINITE, declarations.NO_START, declarations.DIVERGED, declarations.NO_PROGRESS]
+    )
+    def test_a_finite_plan_that_no_step_betters_has_stalled(
+        self, stiff: ls.Problem, monkeypatch: pytest.MonkeyPatch, outcome: int
+    ) -> None:
+        """However the undamped method ended: the status is of the plan, which can be run. The detail has the rest."""
+
+        real = SolveRun.damped
+
+        def damped(run: SolveRun, **options: Any) -> Ending:
+            run.ending = Ending(outcome, failed=3)
+            return dataclasses.replace(real(run, **options), outcome=declarations.STALLED)
+
+        monkeypatch.setattr(SolveRun, "damped", damped)
+        solution = ls.smooth(stiff, finish=None, start=np.tile(stiff.nominal_control, (stiff.steps, 1)))
+        assert np.isfinite(solution.trajectory.states).all()
+        assert np.isfinite(solution.cost)
+        assert solution.status is Status.STALLED
+        assert "the undamped method failed" in solution.detail
+        assert "no step lowers the cost" in solution.detail
+        assert "NaN" not in str(solution)
 
     def test_its_answer_is_whole(self, stiff: ls.Problem) -> None:
         """The policy is undamped and makes the plan; the value functions are of the plan."""

@@ -1,7 +1,9 @@
 """Plans through contacts: models with softer contacts and limits, and what `smooth` does with them."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -13,6 +15,8 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.solvers import budget, strategy
+from lqrsim.solvers.settings import SmootherSettings
 
 OPTION = '<option timestep="0.005" tolerance="1e-14"/><compiler autolimits="true"/>'
 # A ball over the floor, a leg of two joints that hops, a pendulum that hangs between stops.
@@ -216,3 +220,29 @@ def test_the_time_limit_ends_the_solves_for_softer_contacts_too() -> None:
     solution = ls.smooth(hop(robot), time_limit=1e-6)
     assert solution.status is ls.Status.TIME_LIMIT
     assert all("softness" not in one.start for one in solution.candidates)
+
+
+@pytest.mark.parametrize("limit", [100.0, 200.0])
+def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+    """On a clock that advances whenever it is read; without a limit, the solve takes some 400 readings."""
+    now = [0.0]
+
+    def read() -> float:
+        now[0] += 1.0
+        return now[0]
+
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
+    problem, options = hop(robot_of("leg", 1.0)), SmootherSettings(max_iterations=12)
+    real = strategy.Search.run
+
+    def run(search: strategy.Search) -> None:
+        """As if no step had lowered the cost of the first plan any more."""
+        real(search)
+        first, found = search._finished[0]
+        search._finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
+
+    monkeypatch.setattr(strategy.Search, "run", run)
+    solution = strategy.solve(problem, replace(options, time_limit=limit))
+    assert solution.status is ls.Status.TIME_LIMIT
+    assert np.isfinite(solution.cost)
+    assert solution.remedy.startswith("raise time_limit")

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -500,3 +501,37 @@ def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     assert "CONVERGED after 6 iterations of smooth" in text
     assert "the plan is from the start 'straight', one of 7; 6 were dropped" in text
     assert "clearance: 0.141 m" in text
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_time_that_is_left_only_falls(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Also while the clock is stopped, and when it goes on."""
+    draws, now = np.random.default_rng(seed), [0.0]
+    monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    stop, said, counted = budget.Stop(), list[int](), 0.0
+    stop.begin(100.0)
+
+    def wait(*, counts: bool) -> None:
+        nonlocal counted
+        seconds = float(draws.uniform(0.0, 5.0))
+        now[0], counted = now[0] + seconds, counted + seconds * counts
+        said.append(int(stop.found.split("at most ")[1].split(" s ")[0]))
+        assert said[-1] == round(100 - counted)
+
+    for _ in range(6):
+        wait(counts=True)
+        with stop.not_counting():
+            wait(counts=False)
+            wait(counts=False)
+    wait(counts=True)
+    assert said == sorted(said, reverse=True)
+
+
+def test_the_summary_says_how_many_iterations_all_starts_took() -> None:
+    for query in range(3):
+        solution = ls.smooth(ls.scenarios.quadrotor(query=query).problem, starts=3)
+        total = sum(one.iterations for one in solution.candidates)
+        assert total > len(solution.iterations)
+        assert f"; all took {total} iterations" in str(solution)
+    alone = ls.smooth(ls.scenarios.quadrotor().problem, starts=1)
+    assert "all took" not in str(alone)

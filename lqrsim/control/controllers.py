@@ -89,6 +89,14 @@ class ControllerRun(abc.ABC):
         """
         return {}
 
+    def moved_goal(self) -> Array | None:
+        """The goal of the trials, if it moved during the run.
+
+        Returns:
+          (n,), NaN in states that do not count; None if the goal is still that of the plan.
+        """
+        return None
+
     def summary(self) -> str:
         """A remark on the run, in one line, or empty."""
         return ""

@@ -81,7 +81,8 @@ class ReplanRecord:
       cost: cost of the new plan.
       before: cost of continuing with the law in force.
       used: whether the new plan came into force.
-      reason: why the plan was not used, or why it is no better; empty if all went well.
+      reason: why the plan was not used, or the status with which it was used without having converged; empty if all
+        went well. Such a plan may cost more than `before` if it violates the constraints less.
     """
 
     step: int
@@ -165,7 +166,8 @@ class ReplanLog:
         line = f"solved again {self.solved} times"
         early = Counter(one.reason for one in self.records if one.used and one.reason)
         if early:
-            line += f" ({', '.join(f'{count} {reason}' for reason, count in early.most_common())})"
+            counts = ", ".join(f"{count} {reason}" for reason, count in early.most_common())
+            line += f" ({early.total()} of these plans did not converge, but are no worse than continuing: {counts})"
         if self.kept:
             reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
             line += f", kept the previous law {self.kept.total()} times: {reasons}"

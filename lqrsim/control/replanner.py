@@ -217,7 +217,7 @@ class Replanner(Controller):
         False, a plan begins where the robot was when the solve began.
       changes: a function of the time in seconds and the problem that returns the problem as known at that time, with
         other goals, obstacles or parameters. dt, steps, states and controls cannot change, nor can anything that would
-        have to be compiled.
+        have to be compiled. If the goal moves, a run ends at the goal of the last problem.
       when: a funnel of the solution, for the horizon "shrinking": solve only for states outside the funnel about the
         plan in force. The certificate is for the first plan. About a later plan, or after a change, the same ellipsoids
         are a rule of thumb.
@@ -311,6 +311,7 @@ class ReplannerRun(ControllerRun):
     def __init__(self, of: Replanner, trials: int) -> None:
         self._of, self._rule, self._evaluate = of, of.rule, evaluator(*of.coordinates)
         self.log = ReplanLog()
+        self._problem = of.problem  # as last known
         self.active = [ActivePlan(of.solution, 0)] * trials
         self._next: list[ActivePlan | None] = [None] * trials  # put into force at the step at which they begin
 
@@ -325,6 +326,11 @@ class ReplannerRun(ControllerRun):
             commands[trial] = self._evaluate(one, policy.gain[row], policy.offset[row], policy.nominal[row])[0]
         return commands
 
+    def moved_goal(self) -> Array | None:
+        goal, first = self._problem.weighed_goal, self._of.problem.weighed_goal
+        still = first is None if goal is None else first is not None and np.array_equal(goal, first, equal_nan=True)
+        return None if still else goal
+
     def summary(self) -> str:
         return self.log.summary(times=self._of.computing == MEASURED)
 
@@ -337,7 +343,7 @@ class ReplannerRun(ControllerRun):
     def _replan(self, step: int, measured: Array) -> None:
         """Solve for all trials for which a solve is due."""
         rule = self._rule
-        problem = rule.problem_at(step, rule.problem)
+        self._problem = problem = rule.problem_at(step, rule.problem)
         trials = [k for k, active in enumerate(self.active) if rule.outside(active, step, measured[k])]
         requests = [rule.request(self.active[k], step, measured[k], problem) for k in trials]
         for trial, request, replan in zip(trials, requests, self._solve(requests), strict=True):

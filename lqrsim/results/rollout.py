@@ -15,6 +15,8 @@ from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
 from lqrsim.results.goal import Target, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
+MOVED = "goal moved during the run"  # among the disturbances of a run
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BallRecord:
@@ -70,7 +72,8 @@ class Rollout:
       policy_digest: hash of the controller.
       state_coordinates: names and units of the states, and which of them wrap.
       control_coordinates: names and units of the controls, and their limits.
-      goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
+      goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan. If a
+        `Replanner` had a goal that moved, the last one.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: in metres, or a scaled
         error if the goal has no position.
       radius: radius of the robot's collision circle or sphere, in metres.
@@ -94,7 +97,7 @@ class Rollout:
       reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frame_times: (F,) seconds.
       frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
-      disturbances: a description of each disturbance.
+      disturbances: a description of each disturbance, and whether the goal moved.
       seed: seed of the random numbers.
       first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
@@ -343,7 +346,10 @@ class Rollout:
         """Disturbances, the end of the plan, and for each trial outcome, tracking error, clearance and saturation."""
         what = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
-        lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
+        if MOVED in self.disturbances:
+            lines.append("  trials are to reach the goal where it was last; the plan was made for another")
+        else:
+            lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
         return "\n".join([*lines, *(f"  {self._line(k)}" for k in range(self.trials))])
 
     def _line(self, k: int) -> str:

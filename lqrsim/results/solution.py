@@ -196,6 +196,8 @@ class Solution(Plan):
         lines = [f"the plan is from the start {best!r}, one of {len(self.candidates)}"]
         if dropped:
             lines[0] += f"; {len(dropped)} were dropped at costs of {min(dropped):.6g} or more"
+        if (total := sum(candidate.iterations for candidate in self.candidates)) > len(self.iterations):
+            lines[0] += f"; all took {total} iterations"
         others = [one for one in ended if one.start != best]
         return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
 

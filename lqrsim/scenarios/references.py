@@ -53,7 +53,7 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     if names_code(reference):
         if registered_only:
             option = shlex.join(["--scenario", reference])
-            raise InputError(f"scenario: got a file made with {target!r}, want {option} to run that code")
+            raise InputError(f"scenario: got a file that needs your code in {target!r}, which runs only with {option}")
         make = _own_function(target)
     else:
         make = _registered_function(target)

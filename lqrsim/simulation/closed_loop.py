@@ -16,7 +16,7 @@ from lqrsim.control.controllers import ControllerLike, ControllerRun
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
-from lqrsim.results.rollout import Rollout
+from lqrsim.results.rollout import MOVED, Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
@@ -283,8 +283,14 @@ class ClosedLoop:
         """A Rollout of all records."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
+        goal, radius = self.controller_run.moved_goal(), settings.radius
         begun = () if settings.starts is None else ("given first states",)
         passing = () if settings.moving is None else (f"moving obstacles {', '.join(settings.moving.names)}",)
+        moved = () if goal is None else (MOVED,)
+        if goal is None:
+            goal = settings.followed.goal
+        else:
+            radius = settings.radius_about(goal)
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -297,8 +303,8 @@ class ClosedLoop:
             policy_digest=settings.law.digest,
             state_coordinates=settings.states,
             control_coordinates=settings.controls,
-            goal=settings.followed.goal,
-            goal_radius=settings.radius,
+            goal=goal,
+            goal_radius=radius,
             radius=plant.robot.radius,
             states=records.states,
             measured=records.measured,
@@ -316,7 +322,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing),
+            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing, *moved),
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},

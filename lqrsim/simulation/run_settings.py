@@ -112,6 +112,13 @@ class RunSettings:
         self.passing = _passing(self.plant, self.moving, self.knot * self.trajectory.dt)
         _check_size(self.plant, self.trajectory, self.substeps, self.trials, frames=self.frames)
 
+    def radius_about(self, goal: Array) -> float:
+        """The distance from another goal (n,) within which it counts as reached; by default in another unit."""
+        plan = self.trajectory.states
+        target, given = Target(self.states, goal, plan), (self.goal_radius, self.goal_tolerance)
+        same_unit = target.unit == Target(self.states, self.followed.goal, plan).unit
+        return target.radius(self.plant.robot.radius, *(given if same_unit else (None, None)))
+
     @property
     def trajectory(self) -> Trajectory:
         """The trajectory of the plan, from the knot on."""

@@ -42,6 +42,7 @@ class Stop:
     iterations: int = 0
     last: Iteration | None = None
     told: float = -np.inf
+    _stopped: float | None = None  # when the clock was stopped, if it does not count now
 
     def begin(self, seconds: float | None) -> None:
         """Start the clock, with a deadline this many seconds from now; None for no deadline."""
@@ -52,9 +53,12 @@ class Stop:
     def not_counting(self) -> Iterator[None]:
         """A block that may compile, whose time does not count. If it compiles for long, a log line says so."""
         began, limit, compiled = time.perf_counter(), self.deadline - self.begun, len(compilations)
+        before = self._stopped
+        self._stopped = began if before is None else before
         try:
             yield
         finally:
+            self._stopped = before
             taken = time.perf_counter() - began
             self.begun += taken
             self.deadline += taken
@@ -68,10 +72,8 @@ class Stop:
     @property
     def found(self) -> str:
         """The progress of the solve as text: the results so far, and the time that is left."""
-        left = (
-            "" if self.deadline == np.inf else f"; at most {max(self.deadline - time.perf_counter(), 0.0):.0f} s left"
-        )
-        last = self.last
+        now, last = time.perf_counter() if self._stopped is None else self._stopped, self.last
+        left = "" if self.deadline == np.inf else f"; at most {max(self.deadline - now, 0.0):.0f} s left"
         if last is None:
             return f"in the first iteration{left}"
         parts = [f"iteration {self.iterations}: {last.method}"]

@@ -407,7 +407,10 @@ class SolveRun:
             return found
         status = damped.status
         if damped.outcome == declarations.STALLED:
-            status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
+            # The plan is finite, whatever the undamped method met on its way; the detail names it.
+            lost = self.ending.status in (Status.NOT_FINITE, Status.DIVERGED)
+            status = Status.STALLED if lost else self.ending.status
+            detail = f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)
 
     def damped(self, *, added: float = 0.0, least: tuple[float, float] = (0.0, 0.0)) -> Ending:

@@ -32,6 +32,7 @@ STATE, STATED = "duration", "stated_duration"  # the added state, and the parame
 MOST = 300  # largest number of iterations
 # Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
+FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
 
 Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
 
@@ -43,33 +44,51 @@ def solve_for_duration(
     """Solve for the stated duration, then find the best duration near it, and finish the plan with that duration.
 
     With a weight on time, and no start from the caller, shorter durations are also tried, because they may lead to
-    another route. `solve` is for problems with a fixed duration, within the time of this solve; for `attentive` see
-    `Budget`.
+    another route. A search for the best duration that ends elsewhere goes on from a plan of the duration at which it
+    ended, as long as such plans become cheaper. `solve` is for problems with a fixed duration, within the time of this
+    solve; for `attentive` see `Budget`.
     """
-    budget = Budget(settings.max_iterations, callback=callback)
+    budget, total = Budget(settings.max_iterations, callback=callback), 0
     stop, log = budget.stop, budget.log
+
+    def solved(fixed: Problem, options: SmootherSettings) -> Solution:
+        nonlocal total
+        solution = solve(fixed, options, stop)
+        total += max(len(solution.iterations), sum(one.iterations for one in solution.candidates))
+        return solution
+
     stop.begin(settings.time_limit)
     assert problem.duration is not None
-    stated, first, best, near = problem.steps * problem.dt, None, None, None
-    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 and settings.start is None else 1):
-        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-        begin = solve(settled(problem, stated), tries, stop)
-        first = begin if first is None else first
-        if stop.due or (attempt and not begin.success):
-            break
+    first = begin = solved(settled(problem, problem.steps * problem.dt), settings)
+    shorter = SHORTENED if problem.time_weight > 0 and settings.start is None else 0
+    best, fixed = None, [first]
+    while not budget.over:
         with stop.reporting("smooth", attentive):
-            near = find_duration(
+            ordinary, found = find_duration(
                 problem, begin.trajectory, tolerance=settings.final(problem),
-                violation=settings.violation_tolerance(problem), most=settings.max_iterations, budget=budget,
+                violation=settings.violation_tolerance(problem), most=budget.left, budget=budget,
             )  # fmt: skip
-        cheaper = best is None or near[1].measures.cost < best[1].measures.cost
-        if not near[1].solved or not cheaper:
+        if found.solved and (best is None or found.measures.cost < best[1].measures.cost):
+            best = ordinary, found
+            if not shorter or stop.due:
+                break
+            shorter -= 1
+            less = max(SHORTER * ordinary.steps * ordinary.dt, problem.duration[0])
+            tries = replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+            begin = solved(settled(problem, less), tries)
+            if not begin.success:
+                break
+        elif best is None and np.isfinite(found.plan.states).all() and not stop.due:
+            # The search may only have ended far from the constraints: go on from a plan of that duration.
+            start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
+            begin = solved(ordinary, replace(settings, start=start, starts=None))
+            least = min(_rank_with_time(one, problem.time_weight) for one in fixed)
+            fixed.append(begin)
+            missed, cost = _rank_with_time(begin, problem.time_weight)
+            if not begin.success or not (missed, cost + FELL * abs(cost)) < least:
+                break
+        else:
             break
-        best = near
-        if stop.due:
-            break
-        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
-    assert first is not None
     if best is not None:
         ordinary, found = best
         m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
@@ -77,26 +96,30 @@ def solve_for_duration(
             np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
             f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
         )  # fmt: skip
-        return stop.finish(_described(solve(ordinary, replace(settings, start=guess, starts=None), stop), problem))
-    candidates = [first]
-    if near is not None and np.isfinite(near[1].plan.states).all() and not stop.due:
-        ordinary, found = near
-        start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
-        candidates.append(solve(ordinary, replace(settings, start=start, starts=None), stop))
-    chosen = min(candidates, key=lambda one: _rank_with_time(one, problem.time_weight))
-    status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
+        chosen = solved(ordinary, replace(settings, start=guess, starts=None))  # its log begins with the search's
+        return stop.finish(_described(chosen, problem, total))
+    chosen = min(fixed, key=lambda one: _rank_with_time(one, problem.time_weight))
+    status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
+    if stop.due:
+        status, remedy = Status.TIME_LIMIT, "raise time_limit"
+    elif not budget.left or chosen.status is Status.MAX_ITERATIONS:
+        status, remedy = Status.MAX_ITERATIONS, "raise max_iterations"
     detail = f"the best duration was not found, this is {chosen.trajectory.horizon:g} s; {chosen.detail}"
     iterations = (*first.iterations, *log, *(chosen.iterations if chosen is not first else ()))
-    chosen = replace(chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations)
-    return stop.finish(_described(chosen, problem))
+    chosen = replace(
+        chosen, status=status, detail=detail.removesuffix("; "), iterations=iterations,
+        remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
+    )  # fmt: skip
+    return stop.finish(_described(chosen, problem, total + len(log)))
 
 
-def _described(solution: Solution, problem: Problem) -> Solution:
-    """The solution with the free duration among its options, in words."""
+def _described(solution: Solution, problem: Problem, total: int) -> Solution:
+    """The solution with the free duration among its options, in words, and the iterations that all of it took."""
     assert problem.duration is not None
     low, high = problem.duration
     price = f", at a price of {problem.time_weight:g} a second" if problem.time_weight else ""
-    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"})
+    effort = f"; all solves took {total} iterations" if total > len(solution.iterations) else ""
+    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}{effort}"})
 
 
 def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
@@ -125,7 +148,7 @@ def find_duration(
         measures.record(laps)
         return budget.stop.due
 
-    states = np.column_stack([begin.states, np.full(len(begin.states), problem.steps * problem.dt)])
+    states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
         point = InteriorPoint(freed, plan, stages=stages)

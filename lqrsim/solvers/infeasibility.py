@@ -63,12 +63,12 @@ def evidence(
     missed, slopes, alone, holding = _pulls(problem, work, plan, shares, sizes, allowed)
     if not missed > 0:
         return None
-    left, size, pressed = _balance(problem, plan, slopes, alone, control_size, state_size)
+    left, size, pull, pressed = _balance(problem, plan, slopes, alone, control_size, state_size)
     if not left <= STATIONARY * size:
         return None
     if size > 0:
         each = zip(problem.dynamics.control_coordinates.names, pressed.tolist(), strict=True)
-        holding += [(force / size, f"the limits of {name}") for name, force in each if force > 1e-2 * size]
+        holding += [(force / size, f"the limits of {name}") for name, force in each if force > 1e-2 * min(pull, size)]
     return Evidence(plan, missed, tuple(name for _, name in sorted(holding, reverse=True)))
 
 
@@ -110,14 +110,18 @@ def _pulls(
 
 def _balance(
     problem: Problem, plan: RunResult, slopes: Array, alone: Array, control_size: Array, state_size: Array
-) -> tuple[float, float, Array]:
-    """The largest remaining gradient in a control, the size of the cancelling ones, and (m,) the limits' part."""
+) -> tuple[float, float, float, Array]:
+    """The largest remaining gradient in a control, the size of the cancelling ones, and (m,) the limits' part.
+
+    The third number is the largest gradient of the violated rows alone. The size is above it by orders of magnitude if
+    they depend on controls through states of other magnitudes only.
+    """
     states, controls = plan.states, plan.controls
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     space = problem.control_coordinates
     low = controls <= space.low + NEAR_LIMIT * control_size
     high = controls >= space.high - NEAR_LIMIT * control_size
-    total, size, pressed = 0.0, 0.0, np.zeros(m)
+    total, size, pull, pressed = 0.0, 0.0, 0.0, np.zeros(m)
     ahead, own = slopes[steps, :n], alone[steps, :n]
     for t in range(steps - 1, -1, -1):
         A, B, _ = problem.dynamics.linearize(states[t], controls[t], problem.dt)
@@ -127,6 +131,7 @@ def _balance(
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
         of_all, of_own = np.linalg.norm(ahead * state_size) * reach, np.linalg.norm(own * state_size) * reach
-        size = max(size, *(float(one.max()) for one in (of_all, of_own, np.abs(of_missed) * control_size)))
+        pull = max(pull, float((np.abs(of_missed) * control_size).max()))
+        size = max(size, pull, float(of_all.max()), float(of_own.max()))
         ahead, own = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ own
-    return total, size, pressed
+    return total, size, pull, pressed

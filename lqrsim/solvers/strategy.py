@@ -460,6 +460,9 @@ class Search:
         if found.status is Status.INFEASIBLE and not self._tried and stop.error is None:
             untried = "no time was left for other starts, which may keep the constraints"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
+        elif self._cut_short and np.isfinite(found.cost):
+            untried = "no time was left for all that may make it better"
+            found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         return assemble(
@@ -505,6 +508,15 @@ class Search:
     @property
     def _may_soften(self) -> bool:
         return self._default and self._may_go_on and not self.best[1].success
+
+    @property
+    def _cut_short(self) -> bool:
+        """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
+        if self.best[1].success or not (self._default and self._settings.safeguard and self._budget.stop.due):
+            return False
+        if not self._tried and self._is_unacceptable:
+            return True
+        return bool(self._soft) or any(True for _ in self._problem.dynamics.softened(self.best[1].states))
 
     @property
     def _is_unacceptable(self) -> bool:

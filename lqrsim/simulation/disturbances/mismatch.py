@@ -179,7 +179,7 @@ class InertiaMismatch(Mismatch):
     what = parameter = "inertia"
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        why = "it changes the effect of controls, but not an undisturbed run"
+        why = "it scales how fast torques turn the robot, for which predictions have no unknown"
         return left_out(self, plant, why, acts=bool(self.spread(plant).any()))
 
 
