@@ -586,6 +586,13 @@ def test_where_nothing_reaches_the_kinds_to_try_alone_are_named(tmp_path: Path) 
     assert "--sweep" not in run_campaign(easy, tmp_path / "all", workers=0).summary()
 
 
+def test_a_scenario_without_disturbances_is_told_of_presets() -> None:
+    bare = replace(ls.scenarios.quadrotor(), disturbances=())
+    with pytest.raises(ls.InputError, match=r"scenario quadrotor.* states none, want .* such as --sweep light"):
+        disturbance_set("scenario", bare)
+    assert disturbance_set("light", bare)
+
+
 # Filters that diverge.
 
 
