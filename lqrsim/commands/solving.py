@@ -245,7 +245,7 @@ class Simulate:
             worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
             by, when = found[worst].tolist()
             console.say(
-                f"{count} of {rollout.trials} trials violate {name}, by up to {by:.3g} (trial"
+                f"{count} of {rollout.trials} trials violate a constraint, {name}, by up to {by:.3g} (trial"
                 f" {rollout.first_trial + worst} at {when:.2f} s); outcomes do not count this"
             )
         tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
