@@ -586,6 +586,47 @@ def test_where_nothing_reaches_the_kinds_to_try_alone_are_named(tmp_path: Path) 
     assert "--sweep" not in run_campaign(easy, tmp_path / "all", workers=0).summary()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_runs_violate_is_named_though_they_reach_the_goal(
+    seed: int, differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    """By states and controls themselves: bounds, a formula of the controls, and an equality at the end."""
+    plant, rng = differential_drive.plant(), np.random.default_rng(seed)
+    run = ls.simulate(plant, drive_solution, disturbances=ls.disturbances.preset("light", plant), trials=3, seed=seed)
+    x, u, t = run.states, run.applied, run.times
+    low, high = np.quantile(x[..., 0], [0.1, 0.9])
+    most, end = float(np.quantile(u[..., 1], 0.9)), rng.normal()
+    clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius, margin=9.0)
+    problem = replace(
+        differential_drive.problem,
+        constraints=[
+            ls.StateBounds({differential_drive.robot.dynamics.state_coordinates.names[0]: (low, high)}),
+            ls.SymbolicConstraint(lambda x, u, p: p.most - u[1], parameters={"most": most}),
+            ls.SymbolicConstraint(lambda x, u, p: x[1] - p.end, parameters={"end": end}, equality=True, at="final"),
+            clear,
+        ],
+    )
+    missed = [low - x[:, 1:, 0], x[:, 1:, 0] - high, u[:, :, 1] - most, np.abs(x[:, -1:, 1] - end)]
+    knots = [slice(1, None), slice(1, None), slice(0, -1), slice(-1, None)]
+    found = list(problem.violations(run).values())
+    assert len(found) == 4
+    for own, by, acts in zip(found, missed, knots, strict=True):
+        values = np.where((by > 1e-6) & run.counts[:, acts], by, 0.0)
+        worst, when = values.max(axis=1), t[acts][values.argmax(axis=1)]
+        np.testing.assert_allclose(own[:, 0], worst, rtol=1e-12, atol=1e-12)  # rounding of the formulas
+        np.testing.assert_array_equal(own[:, 1], np.where(worst > 0, when, 0.0))
+    assert not replace(problem, constraints=[clear]).violations(run)
+    with pytest.raises(InputError, match=r"rollout: got .* steps, want the problem's: "):
+        replace(problem, steps=problem.steps + 1).violations(run)
+
+
+def test_a_scenario_without_disturbances_is_told_of_presets() -> None:
+    bare = replace(ls.scenarios.quadrotor(), disturbances=())
+    with pytest.raises(ls.InputError, match=r"scenario quadrotor.* states none, want .* such as --sweep light"):
+        disturbance_set("scenario", bare)
+    assert disturbance_set("light", bare)
+
+
 # Filters that diverge.
 
 

@@ -61,7 +61,7 @@ FLOORS_WITHIN = {
         ("collision_shape",),
         ("costs",),
         ("constraints",),
-        ("clearance",),
+        ("clearance", "plain_term"),
         ("problem",),
     ),
     "solvers": (

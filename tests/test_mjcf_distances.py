@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sampling import examples, rarely
 
@@ -455,3 +455,23 @@ def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> No
     blocked = ls.QuadraticCost(np.ones(6), about=robot.at(a=0.72))
     there = ls.Problem(**bad | {"initial": ls.FixedState(robot.at()), "final_cost": blocked})
     assert there.goal_inside.endswith("m inside obstacle 'post'")
+
+
+@pytest.mark.parametrize("unweighed", ["none", "velocities", "activations", "a position"])
+@settings(max_examples=examples(12), deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1))
+@example(seed=0)  # inside
+def test_a_goal_inside_an_obstacle_is_found_where_positions_have_weights(seed: int, unweighed: str) -> None:
+    rng = np.random.default_rng(seed)
+    xml = CARRIED.format(ground="", height=0.5, joint='<joint name="x" type="slide" axis="1 0 0"/>', more="").replace(
+        "</actuator>", '<general name="slow" joint="x" dyntype="filter" dynprm="0.1"/></actuator>'
+    )
+    robot = ls.MjcfRobot(scene_from_xml(xml, "cart"))
+    nv, n = robot.scene.model.nv, len(robot.dynamics.state_coordinates)
+    assert n == 2 * nv + 1
+    weights, goal = rng.uniform(1, 100, n), robot.at(x=rng.uniform(1.5, 2.5), pole=rng.uniform(-3, 3))
+    free = {"none": [], "velocities": range(nv, 2 * nv), "activations": [n - 1], "a position": [rng.integers(nv)]}
+    weights[free[unweighed]] = 0.0
+    problem = robot.problem(robot.at(x=-3.0), goal, steps=5, weights=weights)
+    inside = by_bindings(robot, goal).min() < 0 and unweighed != "a position"
+    assert bool(problem.goal_inside) == inside, problem.goal_inside

@@ -634,6 +634,82 @@ def test_loops_that_can_not_close_and_couplings_that_bend() -> None:
     np.testing.assert_allclose(bent.at(b=0.3)[:2], [0.1 + 0.3 + 2 * 0.3**2, 0.3], rtol=0, atol=1e-9)
 
 
+def tied(kind: str, rng: np.random.Generator) -> str:
+    """An MJCF with equality constraints: a five-bar, a swinging plate, or arms that another one follows."""
+    if kind == "connect":
+        return five_bar(rng)
+    if kind == "plate":  # on two rods by ball joints, which a lever in the middle moves
+        ends = rng.uniform(0.1, 0.3, 2).tolist()
+        rods = "".join(
+            f'<body name="rod{i}" pos="{x} 0 0"><joint type="ball"/>'
+            f'<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.01" {NO_CONTACT}/></body>'
+            for i, x in enumerate((-ends[0], ends[1]))
+        )
+        ties = "".join(f'<connect body1="rod{i}" body2="plate" anchor="0 0 -0.3"/>' for i in range(2))
+        moved = '<body><joint name="lever" axis="1 0 0"/><geom size="0.05"/></body>'
+        return f"""<mujoco><worldbody>{rods}{moved}<body name="plate" pos="0 0 -0.3"><freejoint/>
+          <geom type="box" size="0.3 0.05 0.01" {NO_CONTACT}/></body></worldbody><equality>{ties}</equality>
+          <actuator><motor joint="lever"/></actuator></mujoco>"""
+    bodies = "".join(
+        f'<body name="{name}" pos="0 0 {0.3 * k}"><joint name="{name}" axis="0 1 0"/><geom size="0.02" {NO_CONTACT}/>'
+        for k, name in enumerate("abc")
+    )
+    ratio = rng.uniform(0.5, 2.0)
+    held = {
+        "joint": f'<joint joint1="a" joint2="b" polycoef="0 {ratio} {rng.uniform(-1, 1)}"/><joint joint1="c"/>',
+        "linear": f'<joint joint1="a" joint2="b" polycoef="0.1 {ratio}"/>',
+        "weld": '<weld body1="c"/>',
+        "tendon": '<tendon tendon1="t"/>',
+    }[kind]
+    tendon = f'<fixed name="t"><joint joint="a" coef="1"/><joint joint="c" coef="{ratio}"/></fixed>'
+    return f"""<mujoco><worldbody>{bodies}</body></body></body></worldbody><tendon>{tendon}</tendon>
+      <equality>{held}</equality><actuator><motor joint="b"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("kind", ["connect", "plate", "joint", "linear", "weld", "tendon"])
+@settings(max_examples=2, deadline=None)
+@given(seed=SEEDS)
+def test_an_error_of_the_start_leaves_loops_closed(kind: str, seed: int) -> None:
+    """By MuJoCo's constraints; what is drawn is what the robot without the constraints begins with."""
+    rng, trials = np.random.default_rng(seed), 3
+    xml = tied(kind, rng)
+    loose = re.sub("<equality>.*</equality>", "", xml, flags=re.DOTALL)
+    robots = [ls.MjcfRobot(scene_from_xml(text, kind)) for text in (xml, loose)]
+    n, model = len(robots[0].dynamics.state_coordinates), robots[0].scene.model
+    error = ls.disturbances.InitialStateError(rng.uniform(0.005, 0.02, n))
+    plan = ls.Trajectory(np.tile(robots[0].at(), (2, 1)), np.zeros((1, len(robots[0].actuators))), dt=0.02)
+    effects = [
+        error.start(ls.Plant(robot, robot.scene), plan, [np.random.default_rng((seed, i)) for i in range(trials)])
+        for robot in robots
+    ]
+    begun, drawn = (one.initial_states(np.tile(plan.states[0], (trials, 1))) for one in effects if one.initial_states)
+    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    data = mujoco.MjData(model)
+    for state, first in zip(begun, drawn, strict=True):
+        wanted, _ = robots[0].configuration(first)
+        data.qpos[:], data.qvel[:] = robots[0].configuration(state)
+        mujoco.mj_forward(model, data)
+        rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        assert np.abs(data.efc_pos[rows]).max() < 1e-9
+        assert np.abs(data.efc_vel[rows]).max() < 1e-12
+        # What is added is across the motions that the constraints leave, to first order: nothing else moves.
+        change, slopes = np.zeros(model.nv), data.efc_J.reshape(-1, model.nv)[rows]
+        mujoco.mj_differentiatePos(model, change, 1.0, wanted, data.qpos)
+        free = np.eye(model.nv) - np.linalg.pinv(slopes, rcond=1e-9) @ slopes
+        assert np.linalg.norm(change) > 1e-4
+        assert np.linalg.norm(free @ change) < 10 * np.linalg.norm(change) ** 2 + 1e-12
+        np.testing.assert_allclose(free @ (state - first)[model.nv : 2 * model.nv], 0, atol=1e-12)
+
+
+def test_a_start_far_from_a_closed_loop_is_refused() -> None:
+    robot = ls.MjcfRobot(scene_from_xml(five_bar(np.random.default_rng(0)), "five-bar"))
+    state = robot.at()
+    np.testing.assert_array_equal(robot.with_closed_loops(np.stack([state, state]))[1], state)
+    robot.scene.model.eq_data[:, 0] += 9.0  # an anchor out of reach
+    with pytest.raises(InputError, match=r"states: got left 0.*, want positions near which all loops close"):
+        robot.with_closed_loops(state)
+
+
 def test_a_light_where_there_is_none() -> None:
     bare = mjcf_files.draw("cart", 0).xml
     assert "<camera" not in bare

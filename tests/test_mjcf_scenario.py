@@ -164,6 +164,8 @@ def test_solve_and_simulate_on_the_command_line(
         ("start=3", "start: got 3, want a keyframe's name, or states by name"),
         ("start={1: 2}", "start: got {1: 2}, want states by name"),
         ("start={'keyframe': 3}", "start: keyframe: got 3, want its name"),
+        ("start={'slider': -0.08 mm}", "start: got \"{'slider': -0.08 mm}\", want {'x': 1.0}, numbers without units"),
+        ("goal={'slider': 1cm,'pole': 3}", "numbers without units: slider in m, pole in rad"),
         ("weights={'kg': 1}", "weights: got 'kg', want one of"),
         ("effort=0", "effort: got 0"),
         ("dt=0.003", "dt: got 0.003 s, want a multiple of the physics step"),

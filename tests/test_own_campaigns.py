@@ -59,6 +59,10 @@ def test_printed_commands_run_as_printed(
     page = html.unescape((folder / "report.html").read_text(encoding="utf-8"))
     printed = sorted(set(re.findall(r"<code>(lqrsim .*?)</code>", page)))
     results = Results(folder, scenario=reference)
+    roundabout = Path("runs") / ".." / ".." / elsewhere.name / "own file.py:shorter,steps=8"
+    assert Results(folder, scenario=str(roundabout)).resolved.problem.steps == 8
+    with pytest.raises(ls.InputError, match=r"which .* was run on"):
+        Results(folder, scenario="../own file.py:shorter,steps=8")
     assert results.command in printed
     assert {shlex.split(line)[1] for line in printed} == {"stress", "report", "replay"}
 

@@ -148,6 +148,8 @@ def test_a_plane_one_in_a_million(size: int) -> None:
     plain = (1 - exact) * exact / found.standard_error**2
     assert found.simulations < plain / 50
     assert found.probability.low < exact < found.probability.high
+    assert len(str(found).splitlines()) == 2  # no arrays
+    assert f"{found.probability:.2g} (95 % interval, 20 repetitions)" in str(found)
 
 
 def test_outside_of_a_ball_one_in_a_million() -> None:

@@ -22,7 +22,8 @@ class FailureOptions(PolicyOptions):
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
     """Disturbances, as in `lqrsim stress`. By default the disturbances of the scenario's demo."""
     failure: Literal["collision", "miss"] = "collision"
-    """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal."""
+    """collision: the robot hits an obstacle, or its simulation diverges. miss: it does not reach its goal, which is
+    what `lqrsim stress` calls a failure."""
 
     out: Folder = None
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""

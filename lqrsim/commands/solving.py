@@ -242,6 +242,13 @@ class Simulate:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
+        for name, found in scenario.problem.violations(rollout).items():
+            worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
+            by, when = found[worst].tolist()
+            console.say(
+                f"{count} of {rollout.trials} trials violate a constraint, {name}, by up to {by:.3g} (trial"
+                f" {rollout.first_trial + worst} at {when:.2f} s); outcomes do not count this"
+            )
         tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
         if remark:
             console.say(remark)

@@ -237,8 +237,9 @@ class GeomsInWorld(ShapeInWorld):
         return self.geoms.travel(before[..., 0, :], after[..., 0, :])
 
     def inside(self, state: Array) -> tuple[str, str] | None:
-        if not len(self.world) or np.isnan(state).any():
+        if not len(self.world) or np.isnan(state[list(self.moved_by)]).any():
             return None
+        state = np.where(np.isnan(state), 0.0, state)  # velocities and activations, which move no geom
         distances = self.geoms.clearances(self.dynamics, self.world, state)
         if distances.min() >= -TOUCHING:
             return None

@@ -9,12 +9,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.user_functions import Term, UserFunction, address_of, first_numbers, plain_calls
+from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, excerpt
-from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.plain_term import PlainTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.fields import Line, check_fields
 
@@ -87,46 +86,6 @@ def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
 def evaluate(term: CostTerm, x: Array, u: Array) -> tuple[float, Array, Array]:
     """A cost term at a state (n,) and control (m,) in plain Python; see `PlainTerm.cost`."""
     return PlainTerm(term, len(x), len(u)).cost(np.concatenate([x, u]))
-
-
-class PlainTerm:
-    """A cost or constraint term in plain Python, at points z = (x, u)."""
-
-    def __init__(self, term: CostTerm | ConstraintTerm, states: int, controls: int) -> None:
-        self.shared = term.shared if isinstance(term, ConstraintTerm) else 0
-        self.states, self.size = states, states + controls
-        first = term.functions[:1]
-        parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
-        wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
-        sizes, calls = {"N": states, "M": controls}, plain_calls(term.functions, parameters)
-        self._functions = plain_functions(term.code, sizes, wanted, calls)
-        places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
-        self._data = np.concatenate([places, term.data])
-
-    def cost(self, z: Array) -> tuple[float, Array, Array]:
-        """The cost, its gradient (n+m,) and its Hessian (n+m, n+m), before any projection."""
-        x, u = z[: self.states], z[self.states :]
-        gradient, hessian = np.zeros(self.size), np.zeros((self.size, self.size))
-        return float(self._functions["derivatives"](x, u, 1, self._data, hessian, gradient)), gradient, hessian
-
-    def value(self, z: Array, row: int) -> float:
-        """One row of the constraint."""
-        return float(self._functions["value"](*self._given(z), 1, row, self._data))
-
-    def slope(self, z: Array, row: int) -> Array:
-        """The gradient (n+m,) of one row of the constraint."""
-        gradient = np.zeros(self.size)
-        self._functions["slope"](*self._given(z), 1, row, self._data, gradient)
-        return gradient
-
-    def _given(self, z: Array) -> tuple[Array, Array]:
-        """State and control; or, in their place, the values that all rows share and their derivatives."""
-        x, u = z[: self.states], z[self.states :]
-        if not self.shared:
-            return x, u
-        at, moves = np.zeros(self.shared), np.zeros((self.shared, self.states))
-        self._functions["places_jacobian"](x, self._data, at, moves)
-        return at, moves
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,12 +24,14 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear
-from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, by_name, goals_of
+from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
+from lqrsim.problem.plain_term import violated
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
+from lqrsim.results.rollout import Rollout
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -458,6 +460,35 @@ class Problem:
         if found is not None:
             where, advice = found
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
+
+    def violations(self, rollout: Rollout) -> dict[str, Array]:
+        """The constraints that runs violate by more than 1e-6, other than clearances, which a `Rollout` has itself.
+
+        A run's outcome does not count them: a run that reached its goal may have violated any of them.
+
+        Args:
+          rollout: runs of a plan for this problem, K trials.
+
+        Returns:
+          Name of a constraint -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in
+          seconds; zeros for a trial without one. Only constraints that some trial violates.
+
+        Raises:
+          InputError: the runs have other states, controls or steps.
+        """
+        check_kind("rollout", rollout, Rollout, "a Rollout, as from simulate")
+        sizes = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates), self.steps
+        own = rollout.states.shape[2], rollout.applied.shape[2], rollout.plan.steps
+        if own != sizes:
+            got, want = ("{} states, {} controls, {} steps".format(*one) for one in (own, sizes))
+            raise InputError(f"rollout: got {got}, want the problem's: {want}")
+        found: dict[str, Array] = {}
+        for constraint, term in zip(self.constraints, self.constraint_terms, strict=True):
+            if not isinstance(constraint, KeepsClear):
+                runs = rollout.states, rollout.applied, rollout.counts
+                for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
+                    found[name] = np.stack([by, rollout.times[knots]], axis=1)
+        return found
 
     @property
     def goal_inside(self) -> str:

@@ -374,7 +374,7 @@ class Rollout:
         near = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
         return (
             f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{self._worst(k)}{final} {unit}{near};"
-            f" {self.contacts[k]} periods in contact; {saturated:.0f} % saturated"
+            f" {self.contacts[k]} periods in contact with obstacles; {saturated:.0f} % saturated"
         )
 
     def _worst(self, k: int) -> str:

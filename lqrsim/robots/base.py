@@ -84,6 +84,22 @@ class Robot(abc.ABC):
           qpos (..., nq) and qvel (..., nv).
         """
 
+    def with_closed_loops(self, states: npt.ArrayLike) -> Array:
+        """The states near those given that the robot can be in: the same by default, without kinematic loops.
+
+        Args:
+          states: (..., n).
+
+        Returns:
+          (..., n).
+
+        Raises:
+          InputError: there is none near a state.
+        """
+        import numpy as np
+
+        return np.asarray(states, dtype=np.float64)
+
     def actuation(self, control: npt.ArrayLike) -> Array:
         """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default.
 

@@ -509,6 +509,32 @@ class MjcfRobot(Robot):
         found[fixed] = state[: model.nv][fixed]  # to the last bit
         return found
 
+    def with_closed_loops(self, states: npt.ArrayLike) -> Array:
+        """The nearest states at which all equality constraints are met, in positions and in velocities.
+
+        Args:
+          states: (..., n).
+
+        Returns:
+          (..., n); without equality constraints the same.
+
+        Raises:
+          InputError: loops do not close near a state.
+        """
+        model = self.scene.model
+        states = vectors_of("states", states, len(self.dynamics.state_coordinates))
+        if not model.eq_active0.any():
+            return states
+        equalities, found = mjcf_joints.Equalities(model), states.copy()
+        for state in found.reshape(-1, states.shape[-1]):
+            closed = equalities.closed(*self.configuration(state))
+            if closed is None:
+                names, told = self.dynamics.state_coordinates.names, state[: model.nv].tolist()
+                got = _listed([f"{name} {value:.4g}" for name, value in zip(names, told, strict=False)])
+                raise InputError(f"MjcfRobot {self.name}: states: got {got}, want positions near which all loops close")
+            state[: 2 * model.nv] = self.state(*closed, near=state)
+        return found
+
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
         qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)

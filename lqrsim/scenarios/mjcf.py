@@ -1,6 +1,7 @@
 """A scenario from any MJCF: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -84,6 +85,12 @@ def _state(robot: MjcfRobot, field: str, place: Place) -> Array:
     check_kind(field, place, (str, Mapping, type(None)), "a keyframe's name, or states by name: {'x': 1.0}")
     named = {"keyframe": place} if isinstance(place, str) else dict(place or {})
     keyframe = named.pop("keyframe", None)
+    if isinstance(keyframe, str) and keyframe.lstrip().startswith("{"):  # not a dictionary that Python can read
+        space = robot.dynamics.state_coordinates
+        units = dict(zip(space.names, space.units, strict=True))
+        meant = [f"{name} in {units[name]}" for name in re.findall(r"\w+", keyframe) if units.get(name)]
+        told = f": {', '.join(meant)}" if meant else ""
+        raise InputError(f"{field}: got {excerpt(keyframe)}, want {{'x': 1.0}}, numbers without units{told}")
     if not isinstance(keyframe, str | None):
         raise InputError(f"{field}: keyframe: got {excerpt(keyframe)}, want its name")
     try:

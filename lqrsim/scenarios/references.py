@@ -75,7 +75,11 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
     check_name("disturbances", whole, ["scenario", *PRESETS])
     found = scenario.disturbances if whole == "scenario" else tuple(preset(whole, scenario.plant()))
     if not found:
-        raise InputError(f"disturbances: got {name!r}, which is empty, want a set with disturbances")
+        why = f"for scenario {scenario.name} states none" if whole == "scenario" else "for the robot has none of them"
+        raise InputError(
+            f"disturbances: got {name!r}, which is empty, {why}, want a set with disturbances: a preset, such as"
+            " --sweep light (of lqrsim simulate: --disturbances light)"
+        )
     if not colon:
         return found
     check_name(f"kind of disturbance in {whole}", kind, dict.fromkeys(type(one).__name__ for one in found))

@@ -84,6 +84,7 @@ class Coupling:
 
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
+_RANK = 1e-9  # relative size of singular values that count as zero
 _STRIDE = 0.05  # m or rad, of joints that others follow
 UNNAMED = "unnamed_"  # prefix of the names of bodies, joints, geoms and actuators without a name in the MJCF
 
@@ -272,11 +273,19 @@ class Equalities:
                 if np.abs(off).max(initial=0.0) < _MET:
                     break
                 step = np.zeros(model.nv)
-                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=1e-9)[0]
+                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=_RANK)[0]
                 mujoco.mj_integratePos(model, place, step, 1.0)
             else:
                 return None
         return place
+
+    def closed(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
+        """Positions (nq,) and velocities (nv,) near those given at which they are met; None if none were found."""
+        place = self.met(qpos, qpos, np.zeros(self.model.nv, dtype=bool))
+        if place is None:
+            return None
+        _, slopes = self.at(place)
+        return place, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
 
 
 def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:

@@ -45,7 +45,7 @@ from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effec
 from lqrsim.stress.multilevel_splitting import MOST, Progress, SplittingResult, check_keep, failure_probability
 from lqrsim.stress.policies import POLICIES, check_designed, make_policy
 from lqrsim.stress.specification import disturbances_as_json
-from lqrsim.stress.statistics import Estimate
+from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.trial_score import TrialScore, collision_score, miss_score
 from lqrsim.versions import versions
 
@@ -318,13 +318,7 @@ class RareFailures:
 
     def summary(self) -> str:
         """The probability with its interval; the number of simulated trials; what splitting may miss; if stopped."""
-        one, plain = self.probability, self.plain_trials
-        interval = f"{100 * one.confidence:g} % interval, {len(self.splitting.repetitions)} repetitions"
-        needed = "unknown, because all repetitions agree" if plain is None else f"about {_rounded(plain)}"
-        lines = [
-            f"probability of failure: {one:.2g} ({interval})",
-            f"simulated: {self.splitting.simulations:,} trials; plain trials for the same standard error: {needed}",
-        ]
+        lines = [self.splitting.summary()]
         if self._may_miss:
             lines.append(
                 f"splitting may miss failures by draws with few values, as of {self._may_miss}; rare_failures(keep=0)"
@@ -425,7 +419,7 @@ class SmallestFailure:
             lines.append(f"{why}: {left} of the distance may be left to gain{then}")
         likely = point.first_order_probability
         lines.append(
-            f"first-order estimate: one trial in {_rounded(1 / max(likely, 1e-300))} fails"
+            f"first-order estimate: one trial in {rounded(1 / max(likely, 1e-300))} fails"
             f" (reliability {1 - likely:.6g}); `lqrsim rare` measures the probability"
         )
         parts = zip(self.shares, self.problem.score.sizes, self.disturbances, strict=True)
@@ -495,9 +489,3 @@ def write_json(
     }
     with save_load.replacing(folder / f"{name}.json") as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _rounded(number: float) -> str:
-    """The number with two significant digits, without an exponent below 1e9."""
-
-    return f"{float(f'{number:.2g}'):,.0f}" if number < 1e9 else f"{number:.2g}"

@@ -29,7 +29,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count, check_function, check_memory, check_number, check_seed, shaped
 from lqrsim.process import keeping
-from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
+from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate, rounded
 
 Score = Callable[[Array], Array]
 Progress = Callable[[int, int, str], object]  # called with the amount done, the whole amount, and the result so far
@@ -81,6 +81,18 @@ class SplittingResult:
         if self.standard_error == 0:
             return float("nan")
         return self.probability.value * (1 - self.probability.value) / self.standard_error**2
+
+    def summary(self) -> str:
+        """Two lines: the probability with its interval, and the number of simulated trials."""
+        one, plain = self.probability, self.plain_trials
+        interval = f"{100 * one.confidence:g} % interval, {len(self.repetitions)} repetitions"
+        needed = f"about {rounded(plain)}" if np.isfinite(plain) else "unknown, because all repetitions agree"
+        return (
+            f"probability of failure: {one:.2g} ({interval})\n"
+            f"simulated: {self.simulations:,} trials; plain trials for the same standard error: {needed}"
+        )
+
+    __str__ = summary
 
 
 def failure_probability(

@@ -51,7 +51,8 @@ class Results:
         reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:
             check_kind("scenario", scenario, str, "the campaign's reference")
-            if from_anywhere(scenario) != from_anywhere(reference):
+            given, known = (os.path.normpath(from_anywhere(one)) for one in (scenario, reference))
+            if given != known:
                 raise InputError(f"scenario: got {excerpt(scenario)}, want {reference}, which {self.folder} was run on")
 
     @cached_property

@@ -214,3 +214,8 @@ def bootstrap(
         rng=np.random.default_rng(seed),
     ).confidence_interval
     return Estimate(value, float(interval.low), float(interval.high), confidence)
+
+
+def rounded(number: float) -> str:
+    """The number with two significant digits, without an exponent below 1e9."""
+    return f"{float(f'{number:.2g}'):,.0f}" if number < 1e9 else f"{number:.2g}"

@@ -121,6 +121,7 @@ SIZE = (640, 480)
 # Pixels: what is thinner is thin, and drawn finer, up to FINEST times, until it is FILLED. Along a rod that is THINNEST
 # every column or row of pixels has one of its own; along a thinner one some have none, and its ends can be missing.
 THIN, FILLED, THINNEST, FINEST = 16.0, 2.0, 1.0, 4
+ROUND = 1e-3  # relative difference of the widths of a silhouette that counts as a circle
 DRAWN_BOUND = 1 / 60  # largest error, in radii of the robot: 5 and 2.8 mm for the packaged robots
 # Orthographic silhouettes of these geoms are symmetric about their centre in any orientation.
 SYMMETRIC_KINDS = (
@@ -163,11 +164,15 @@ def verify_run(
     views = [makers[name](rollout, around=around) for name in cameras.measuring(rollout.plane)]
     measured: list[Array] = []
     offsets: list[Array] = []
-    thickness = _thickness(model, geom, rollout.frames[trial, rows], views)
+    thickness, curved = _thickness(model, geom, rollout.frames[trial, rows], views)
     bound, wanted = DRAWN_BOUND * rollout.radius, 1.0 if thickness >= THIN else FILLED / thickness
-    if model.geom_type[geom] == Geom.mjGEOM_BOX:  # it may lie along the pixels, and be drawn half of one too long
-        wanted = max(wanted, max(view.height for view in views) / SIZE[1] / 2 / max(bound, 1e-9))
+    pixel = max(view.height for view in views) / SIZE[1]
+    # The edge of a thin geom, or a straight edge, may lie along the pixels, and be drawn half of one too far.
+    coarse = thickness < THIN or not curved
+    if coarse:
+        wanted = max(wanted, pixel / 2 / max(bound, 1e-9))
     finer = int(np.clip(np.ceil(wanted), 1, FINEST))
+    bound = max(bound, pixel / finer) if coarse else bound
     size, centre = (finer * SIZE[0], finer * SIZE[1]), mask_centre if thickness >= THIN else mask_middle
     for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views, size):
         measured.append(np.array([view.measure(centre(mask), size) for view, mask in zip(views, masks, strict=True)]))
@@ -175,7 +180,7 @@ def verify_run(
         if progress:
             progress(len(measured), len(rows))
     places, apart = triangulate(views, measured, rollout.plane)
-    name = model.geom(geom).name or model.geom(geom).id
+    name = model.geom(geom).name or f"a geom of {model.body(int(model.geom_bodyid[geom])).name}"
     positions = Positions(
         times,
         seen=places - rollout.of_world(offsets),
@@ -238,18 +243,23 @@ def _corners(model: mujoco.MjModel, geom: int, frames: Array) -> Array:
     return np.stack([np.min(places, axis=0) - reach, np.max(places, axis=0) + reach])
 
 
-def _thickness(model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[Camera]) -> float:
-    """The least width of the geom's silhouette in pictures of `SIZE`, in pixels, over frames (N, nq) and views."""
+def _thickness(model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[Camera]) -> tuple[float, bool]:
+    """The least width of the geom's silhouette in pictures of `SIZE`, in pixels, over frames (N, nq) and views.
+
+    Also whether its edge is curved all round: that of a disc may be straight if it is not seen along its axis.
+    """
     data, angles, least = mujoco.MjData(model), np.linspace(0, np.pi, 60, endpoint=False), np.inf
+    kind, curved = Geom(model.geom_type[geom]), True
     across = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for frame in frames:
         data.qpos = frame
         mujoco.mj_kinematics(model, data)
         for view in views:
             seen = across @ view.axes @ data.geom_xmat[geom].reshape(3, 3)  # unit vectors in the geom's axes
-            reach = _reach(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom], seen)
+            reach = _reach(kind, model.geom_size[geom], seen)
             least = min(least, 2 * float(reach.min()) * SIZE[1] / view.height)
-    return least
+            curved &= kind == Geom.mjGEOM_ELLIPSOID or bool(reach.max() < (1 + ROUND) * reach.min())
+    return least, curved
 
 
 def _reach(kind: mujoco.mjtGeom, size: Array, directions: Array) -> Array:

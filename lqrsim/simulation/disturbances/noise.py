@@ -55,7 +55,7 @@ class AddedError(GaussianDisturbance):
         std, steps = self._deviations(plant), 1 if self.lasts else plan.steps + (self.hook == "measure")
         errors = std * normal(generators, steps, len(std))
         if self.hook == "initial_states":
-            return Effect(initial_states=lambda states: states + errors[:, 0])
+            return Effect(initial_states=lambda states: _off(plant, states, errors[:, 0]))
         hooks: dict[str, Any] = {self.hook: lambda step, values: values + errors[:, 0 if self.lasts else step]}
         return Effect(**hooks)
 
@@ -121,6 +121,9 @@ class MeasurementBias(AddedError):
 class InitialStateError(AddedError):
     """The robot begins in a state that differs from the first state of the plan.
 
+    Kinematic loops of an MJCF, and other equality constraints, are closed again: each trial begins in the state that
+    meets them and is nearest to the drawn one.
+
     Args:
       std: standard deviation in the state's unit; one number, one per state, or numbers by name or unit, such as {"m":
         0.01, "rad": 0.02}, 0 for the others.
@@ -130,6 +133,13 @@ class InitialStateError(AddedError):
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         return Uncertainty(start=self._std_for_filters(plant))
+
+
+def _off(plant: Plant, states: Array, errors: Array) -> Array:
+    """States (K, n) with errors, at which kinematic loops are closed."""
+    moved, found = errors.any(axis=-1), states + errors
+    found[moved] = plant.robot.with_closed_loops(found[moved])
+    return found
 
 
 class WrenchNoise(GaussianDisturbance):
