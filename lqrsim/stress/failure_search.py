@@ -6,7 +6,9 @@ print(problem.smallest_failure())  # the design point, as `lqrsim break`
 """
 
 import json
+import math
 import os
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from functools import cached_property
@@ -53,6 +55,7 @@ FAILURES = {"collision": collision_score, "miss": miss_score}
 ASKED = (  # the fields of a problem that its certificate names
     "scenario", "sweep", "strength", "policy", "design_disturbances", "failure", "goal_radius", "goal_tolerance",
 )  # fmt: skip
+TIE_EVERY = 5.0  # s between reports while the pilot run draws more at a tie
 Report = Callable[[str], object]
 
 
@@ -279,9 +282,16 @@ class ReliabilityProblem:
         if report is None:
             return None
         unit = "m" if len(self.score.plant.world) else self.score.solution.target.unit
+        last, when = math.nan, 0.0
 
         def report_level(level: float) -> None:
-            report(f"level: {-level:.3g} {unit} from failing" if level < 0 else "level: failing")
+            nonlocal last, when
+            now = time.monotonic()
+            tie = ", where scores tie: drawing more" if level == last else ""
+            if not tie or now - when > TIE_EVERY:
+                report(f"level: {-level:.3g} {unit} from failing{tie}" if level < 0 else "level: failing")
+                when = now
+            last = level
 
         return report_level
 

@@ -120,7 +120,7 @@ def failure_probability(
       repetitions: number of independent estimates; the interval follows from their spread.
       seed: seed of all random numbers.
       most_levels: number of levels after which the pilot run gives up.
-      level: called with each level that the pilot run finds.
+      level: called with each level that the pilot run finds, and again for each batch that it draws where scores tie.
       progress: called with the number of finished repetitions, the number of all repetitions, and the estimate so far
         as text.
 
@@ -252,6 +252,8 @@ def _pilot_run(
         if tie or not above.any():
             found = [(vectors[above], scores[above])]
             while sum(len(some) for _, some in found) < enough and drawn < MOST_BATCHES:
+                if on_level is not None:
+                    on_level(level)
                 vectors, scores = another_batch(vectors, scores)
                 above, drawn = scores > level, drawn + 1
                 found.append((vectors[above], scores[above]))
