@@ -18,6 +18,7 @@ from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
 from lqrsim.commands import COMMANDS, console
 from lqrsim.commands.reproduce import SCRIPTS
+from lqrsim.commands.solving import Solve
 from lqrsim.view import gl
 
 OWN_SCENARIOS = """
@@ -93,6 +94,30 @@ def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: py
     assert solution.scenario == "quadrotor,query=2,seed=0"
     again = ls.smooth(ls.scenarios.quadrotor(query=2).problem, stop="cost")
     np.testing.assert_array_equal(solution.policy.gain, again.policy.gain)  # the same program: the same bits
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_solve_that_is_stopped_keeps_its_best_plan(
+    rows: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C after some iterations. The file goes on as a start, and a finished solution that is there stays."""
+    assert main(["solve", "quadrotor", "--starts", "1", "--out", str(tmp_path)]) == 0
+    whole, say = (tmp_path / "solution.npz").read_bytes(), console.say
+
+    def stop(text: str) -> None:
+        say(text)
+        if text.split()[0] == str(rows):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(console, "say", stop)
+    with pytest.raises(KeyboardInterrupt):
+        Solve(scenario="quadrotor", starts=1, out=tmp_path).run()
+    monkeypatch.undo()
+    kept = ls.load(tmp_path / "stopped.npz", ls.Solution)
+    assert (kept.status, len(kept.iterations)) == (ls.Status.INTERRUPTED, rows)
+    assert kept.summary() in capsys.readouterr().out
+    assert (tmp_path / "solution.npz").read_bytes() == whole
+    assert main(["solve", "quadrotor", "--start", str(tmp_path / "stopped.npz"), "--out", str(tmp_path / "on")]) == 0
 
 
 def test_solve_says_that_it_did_not_converge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,7 +52,8 @@ class Solve:
     """Compute a feedback policy for a scenario.
 
     Prints each iteration as it ends, from the hundredth on every tenth, then the status and, if it failed, the remedy.
-    Writes solution.npz in any case; the exit code is 1 if the solver did not converge.
+    Writes solution.npz in any case; the exit code is 1 if the solver did not converge. Ctrl-C writes the best plan so
+    far to stopped.npz, from which --start goes on.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -118,8 +119,15 @@ class Solve:
         if self.finish == "none":
             options["finish"] = None
         scenario = replace(scenario, problem=problem, start=self._start(scenario))
-        solved = console.solve(scenario, self.solver, **options)
-        solution = replace(solved, scenario=from_anywhere(self.scenario))
+        reference = from_anywhere(self.scenario)
+        try:
+            solved = console.solve(scenario, self.solver, **options)
+        except KeyboardInterrupt as stop:
+            if (best := getattr(stop, "solution", None)) is not None:  # a file of its own: solution.npz may be better
+                console.say(best.summary())
+                console.wrote(save_load.save(replace(best, scenario=reference), folder / "stopped.npz"))
+            raise
+        solution = replace(solved, scenario=reference)
         console.wrote(save_load.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
