@@ -118,7 +118,7 @@ def test_what_names_code(target: str, code: bool, settings: str) -> None:
     """A colon in a setting or a drive's letter does not."""
     assert names_code(target + settings) == code
     if code:
-        with pytest.raises(InputError, match="to run that code"):
+        with pytest.raises(InputError, match="needs your code in"):
             resolve(target + settings, registered_only=True)
 
 

@@ -96,9 +96,7 @@ class Robot(abc.ABC):
         Raises:
           InputError: there is none near a state.
         """
-        import numpy as np
-
-        return np.asarray(states, dtype=np.float64)
+        return vectors_of("states", states, len(self.dynamics.state_coordinates))
 
     def actuation(self, control: npt.ArrayLike) -> Array:
         """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default.

@@ -407,8 +407,9 @@ class SolveRun:
             return found
         status = damped.status
         if damped.outcome == declarations.STALLED:
-            # The plan is finite, whatever the undamped method met on its way; the detail names it.
-            lost = self.ending.status in (Status.NOT_FINITE, Status.DIVERGED)
+            # The plan is finite, whatever the undamped method met on its way; the detail names it. What a user's
+            # function raised is to be mended first.
+            lost = self.ending.status in (Status.NOT_FINITE, Status.DIVERGED) and not self.ending.raised
             status = Status.STALLED if lost else self.ending.status
             detail = f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)

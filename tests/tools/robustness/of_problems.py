@@ -252,6 +252,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "World.seen_by": ({"self": world, "plane": "xz", "offset": 0.5},),
         "World.moved": ({"self": world, "seconds": 0.5},),
         "World.displacements": ({"self": world, "times": [0.0, 0.5]},),
+        "Problem.violations": ({"self": place.problem, "rollout": place.rollout},),
         "World.tables": ({"self": world, "times": [0.0, 0.5]},),
         "World.distances": ({"self": world, "point": [0.0, 1.0, 2.0]},),
         "World.distance": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
@@ -282,6 +283,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             for kind, robot, at_rest, (qpos, qvel) in robots
         },
         **{f"{kind}.configuration": ({"self": robot, "state": at_rest},) for kind, robot, at_rest, _ in robots},
+        **{
+            f"{kind}.with_closed_loops": ({"self": robot, "states": [at_rest]},)
+            for kind, robot, at_rest, _ in [*robots, ("Robot", *robots[0][1:])]
+        },
         "check_derivatives": ({"subject": cart, "samples": 2, "spread": 0.3, "tolerance": 1e-5, "seed": 0}, 0.5),
     }  # fmt: skip
 
