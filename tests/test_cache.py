@@ -55,6 +55,7 @@ def finish(process: "subprocess.Popen[str]") -> tuple[list[str], str]:
     return out.split(), errors
 
 
+@pytest.mark.long
 def test_two_processes_compile_the_same_at_once_and_the_third_finds_it(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     first, second = (finish(process) for process in [start(tmp_path, folder), start(tmp_path, folder)])

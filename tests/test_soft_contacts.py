@@ -150,6 +150,7 @@ def hop(robot: ls.MjcfRobot) -> ls.Problem:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_ones(tmp_path: Path) -> None:
     robot = robot_of("leg", 1.0)
     problem = hop(robot)

@@ -72,6 +72,7 @@ def test_all_six_have_the_same_bits_in_other_processes_and_in_any_batch(
     assert shards(again) == shards(results)
 
 
+@pytest.mark.long
 def test_trials_are_those_of_the_controllers_as_users_make_them(
     results: ls.stress.Results, differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
