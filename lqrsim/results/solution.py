@@ -197,7 +197,7 @@ class Solution(Plan):
         if dropped:
             lines[0] += f"; {len(dropped)} were dropped at costs of {min(dropped):.6g} or more"
         if (total := sum(candidate.iterations for candidate in self.candidates)) > len(self.iterations):
-            lines[0] += f"; all took {total} iterations"
+            lines[0] += f"; {total} iterations in all"
         others = [one for one in ended if one.start != best]
         return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
 

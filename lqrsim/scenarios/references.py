@@ -75,10 +75,10 @@ def disturbance_set(name: str, scenario: "Scenario") -> "tuple[Disturbance, ...]
     check_name("disturbances", whole, ["scenario", *PRESETS])
     found = scenario.disturbances if whole == "scenario" else tuple(preset(whole, scenario.plant()))
     if not found:
-        why = f"for scenario {scenario.name} states none" if whole == "scenario" else "for the robot has none of them"
+        why = f"scenario {scenario.name} states none" if whole == "scenario" else "the robot has none of them"
         raise InputError(
-            f"disturbances: got {name!r}, which is empty, {why}, want a set with disturbances: a preset, such as"
-            " --sweep light (of lqrsim simulate: --disturbances light)"
+            f"disturbances: got {name!r}, but {why}, want a set with disturbances: a preset, such as --sweep light (of"
+            " lqrsim simulate: --disturbances light)"
         )
     if not colon:
         return found

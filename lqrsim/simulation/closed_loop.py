@@ -283,14 +283,12 @@ class ClosedLoop:
         """A Rollout of all records."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
-        goal, radius = self.controller_run.moved_goal(), settings.radius
+        moved = self.controller_run.moved_goal()
+        goal = settings.followed.goal if moved is None else moved
+        radius = settings.radius if moved is None else settings.radius_about(moved)
+        changed = () if moved is None else (MOVED,)
         begun = () if settings.starts is None else ("given first states",)
         passing = () if settings.moving is None else (f"moving obstacles {', '.join(settings.moving.names)}",)
-        moved = () if goal is None else (MOVED,)
-        if goal is None:
-            goal = settings.followed.goal
-        else:
-            radius = settings.radius_about(goal)
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -322,7 +320,7 @@ class ClosedLoop:
             reasons=tuple(records.reasons),
             frame_times=np.arange(frames.shape[1]) * (plan.dt / each),
             frames=frames,
-            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing, *moved),
+            disturbances=(*(one.describe(plant) for one in settings.acting), *begun, *passing, *changed),
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},

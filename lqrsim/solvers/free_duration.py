@@ -114,12 +114,16 @@ def solve_for_duration(
 
 
 def _described(solution: Solution, problem: Problem, total: int) -> Solution:
-    """The solution with the free duration among its options, in words, and the iterations that all of it took."""
+    """The solution with the free duration among its options, in words, and with the iterations of all solves."""
     assert problem.duration is not None
     low, high = problem.duration
     price = f", at a price of {problem.time_weight:g} a second" if problem.time_weight else ""
-    effort = f"; all solves took {total} iterations" if total > len(solution.iterations) else ""
-    return replace(solution, options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}{effort}"})
+    effort = f"{total} iterations in all solves" if total > len(solution.iterations) else ""
+    return replace(
+        solution,
+        options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"},
+        detail="; ".join(part for part in (solution.detail, effort) if part),
+    )
 
 
 def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
