@@ -230,8 +230,47 @@ def report(result: Result) -> str:
             table(("problem", "Altro.jl, iterations", "Altro.jl, cost", "target of", "target"), targets),
             *notes,
             *(f"{', '.join(names)}: {what}." for what, names in absent.items()),
+            *_by_measure(result["problems"]),
         ]
     )
+
+
+def _by_measure(problems: dict[str, Any]) -> list[str]:
+    """The same numbers, a table for each measure with a column for each solver, as the pages have them."""
+    solvers = [name for name in CONTESTANTS if any(name in one["solvers"] for one in problems.values())]
+    labels = {
+        name: name + (f" ({family['instances']})" if family["instances"] > 1 else "")
+        for name, family in problems.items()
+    }
+
+    def row(name: str, chosen: Sequence[str], measures: Sequence[str]) -> list[str]:
+        found = problems[name]["solvers"]
+        return [
+            labels[name],
+            *(MEASURES[what](found[one]) if one in found else "" for what in measures for one in chosen),
+        ]
+
+    brief = ("iterations to 1e-8", "ms to 1e-8", "optimality reached")
+    main = [one for one in ("lqrsim", "FATROP", "IPOPT") if one in solvers]
+    heads = [f"{one}, {what}" for what in brief for one in main]
+    parts = ["In short:", table(("problem", *heads), [row(name, main, brief) for name in problems])]
+    for what in MEASURES:
+        parts += [
+            f"By solver: {what}.",
+            table(("problem", *solvers), [row(name, solvers, [what]) for name in problems]),
+        ]
+    return parts
+
+
+MEASURES: dict[str, Callable[[Result], str]] = {
+    "instances solved": lambda one: str(sum(one["solved"])),
+    "iterations to 1e-8": lambda one: _median(one["exact"]["iterations"], "g"),
+    "ms to 1e-8": lambda one: _median(one["exact"]["milliseconds"], ".1f"),
+    "optimality reached": lambda one: _median(one["optimality"], ".0e"),
+    "final cost": lambda one: _median(one["cost"], ".4g"),
+    "iterations to the target": lambda one: _median(one["target"]["iterations"], "g"),
+    "ms to the target": lambda one: _median(one["target"]["milliseconds"], ".1f"),
+}
 
 
 def _against(one: Result, peer: Result | None) -> str:
