@@ -132,3 +132,12 @@ def _slack(solution: ls.Solution) -> ls.Solution:
         states.append(planar_quadrotor.dynamics().step(states[-1], control, planar_quadrotor.DT))
     policy = dataclasses.replace(solution.policy, gain=np.zeros_like(solution.policy.gain), offset=controls)
     return dataclasses.replace(_with_plan(solution, states=np.array(states), controls=controls), policy=policy)
+
+
+@pytest.mark.parametrize(("kind", "number"), [("quadrotor", 14610)])
+def test_a_failed_interior_point_leaves_a_failed_plan_and_its_policy_as_they_were(kind: str, number: int) -> None:
+    """Found by many draws: smoothing from a start of a cost of 1e115 fails, and then the interior point, too."""
+    drawn = draws.draw(kind, number)
+    for solution in draws.solve(drawn):
+        assert contradictions(drawn.problem, solution, drawn.rate) == []
+        assert solution.cost <= solution.iterations[0].cost

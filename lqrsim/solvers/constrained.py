@@ -251,10 +251,9 @@ class Ladder:
         return self._remember(self._point.solve(plan, barrier, multipliers=multipliers))
 
     def _remember(self, found: RunResult | None) -> RunResult | None:
-        """Copy a result if it is the best so far."""
+        """Keep a result if it is the best so far."""
         if found is not None and (self._best is None or found.rank < self._best.rank):
-            law = found.law[0].copy(), found.law[1].copy()
-            self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
+            self._best = found.kept()
         return found
 
     def _worse(self, found: RunResult) -> bool:

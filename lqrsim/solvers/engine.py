@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -242,6 +243,11 @@ class RunResult:
     @property
     def success(self) -> bool:
         return self.status.success
+
+    def kept(self) -> "RunResult":
+        """A copy that later iterations, which write to the same memory, do not change."""
+        arrays = deepcopy((self.states, self.controls, self.law, self.values))
+        return replace(self, **dict(zip(("states", "controls", "law", "values"), arrays, strict=True)))
 
 
 class SolveRun:

@@ -50,7 +50,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_run import OPENING, InteriorRun
+from lqrsim.solvers.interior_run import MUCH, OPENING, InteriorRun, copied
 from lqrsim.solvers.multistart import (
     FOLLOW,
     SWAYS,
@@ -166,9 +166,11 @@ def _without_constraints(run: SolveRun) -> RunResult:
     found = run.solve()
     if found.success or budget.stop.due or budget.left < 2:
         return found
-    point = InteriorRun(run)
-    plan = run.work.best if np.isfinite(found.cost) else point.start()
-    return point.instead(plan) or found
+    found, point = found.kept(), InteriorRun(run)
+    other = point.solve(copied(run.work.best if np.isfinite(found.cost) else point.start()), MUCH)
+    if other is None or other.success or not other.cost < found.cost:
+        return other if other is not None and other.success else found
+    return replace(other, status=found.status, detail=found.detail)
 
 
 class Search:
