@@ -287,4 +287,7 @@ class Stages:
 
 def joined(changes: Motion) -> Array:
     """Changes of states and controls side by side, (T+1, n+m)."""
-    return np.concatenate([changes.states, np.pad(changes.controls, ((0, 1), (0, 0)))], axis=1)
+    n, m = changes.states.shape[1], changes.controls.shape[1]
+    both = np.zeros((len(changes.states), n + m))  # the last knot has no control
+    both[:, :n], both[:-1, n:] = changes.states, changes.controls
+    return both
