@@ -6,6 +6,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -25,7 +26,7 @@ class Kept:
     """
 
     function: Callable[[Values], Values]
-    acts: Array
+    acts: NDArray[np.bool_]
     equality: bool
 
     def violation(self, z: Array) -> float:
@@ -76,11 +77,13 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     if isinstance(constraint, ls.StateBounds):
         bounds = constraint._of(dynamics).items()
         rows = [(i, sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for i, bound in bounds]
-        indices, signs, numbers = (np.array(column) for column in zip(*rows, strict=True))
-        indices, signs, numbers = (column[np.isfinite(numbers)] for column in (indices, signs, numbers))
+        rows = [(i, sign, np.broadcast_to(bound, steps + 1)) for i, sign, bound in rows if np.isfinite(bound).any()]
+        indices, signs = (np.array([row[column] for row in rows]) for column in (0, 1))
+        numbers = np.stack([bound for *_, bound in rows], axis=1)
         goals = [one for one in problem.constraints if isinstance(one, ls.GoalState)]
         fixed = {i for one in goals for i in one._numbers(dynamics)}
-        acts = np.stack([changeable & ~(at_end & (i in fixed)) for i in indices], axis=1)
+        acts = np.stack([changeable & ~(at_end & (i in fixed)) for i in indices], axis=1) & np.isfinite(numbers)
+        numbers = np.where(acts, numbers, 0.0)
         return Kept(lambda z: signs * (z[..., indices] - numbers), acts, False)
     if isinstance(constraint, ls.SymbolicConstraint):
         formula = kkt.numeric(_listed(constraint.function), n, m, tuple(constraint.parameters), True)

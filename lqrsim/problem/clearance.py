@@ -1,16 +1,18 @@
 """The constraint that a robot keeps clear of obstacles."""
 
 import copy
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, real
+from lqrsim.errors import Array, InputError, check_array, check_number, real
 from lqrsim.kernels import clearance, distance_constraint
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomsInWorld, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
+from lqrsim.problem.costs import rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -31,6 +33,7 @@ class Clearance(KeepsClear, Constraint):
       geoms: the colliding geoms of a robot from an MJCF, as for an ObstacleCost: one distance for each body and
         obstacle.
       margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
+        Those of knots move with time when a `Replanner` plans again, as a reference does; see `QuadraticCost`.
     """
 
     def __init__(
@@ -45,13 +48,17 @@ class Clearance(KeepsClear, Constraint):
         self._set_shape(world, radius, balls, geoms)
         self.margin = _checked_margin(margin)
 
-    def ahead(self, steps: int) -> "Clearance":
-        steps = check_count("steps", steps, at_least=0)
+    @property
+    def by_knot(self) -> bool:
+        return isinstance(self.margin, np.ndarray)
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
+        super().ahead(steps, horizon=horizon)
         if not isinstance(self.margin, np.ndarray):
             return self
-        return self._keeping(self.margin[min(steps, len(self.margin) - 1) :])
+        return self._keeping(rows_ahead(self.margin, steps, horizon))
 
-    def _keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
+    def _keeping(self, margin: float | npt.ArrayLike) -> Self:
         """The same constraint with another margin."""
         other = copy.copy(self)
         other.margin = _checked_margin(margin)

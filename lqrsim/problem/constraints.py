@@ -3,9 +3,11 @@
 To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Constraint` and write `bind`.
 """
 
+import copy
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +28,16 @@ from lqrsim.errors import (
     check_number,
     excerpt,
     keep,
+    numbers_of,
 )
-from lqrsim.kernels import state_bound
-from lqrsim.problem.costs import OfFunction, ProblemPart
+from lqrsim.kernels import bound_by_knot, state_bound
+from lqrsim.problem.costs import OfFunction, ProblemPart, rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
 STEPS = ("all", "final")  # the steps at which a constraint can act
+Side = float | Array  # a bound, or one for each knot, (K,)
+Bounds = tuple[npt.ArrayLike, npt.ArrayLike]  # low and high, as given
 _Value = TypeVar("_Value")
 
 
@@ -79,15 +84,6 @@ class ConstraintTerm(Term):
 
 class Constraint(ProblemPart[ConstraintTerm]):
     """A constraint."""
-
-    def ahead(self, steps: int) -> "Constraint":
-        """The constraint for the rest of the plan after `steps` steps: unchanged, unless it differs from step to step.
-
-        Args:
-          steps: number of steps that are over.
-        """
-        check_count("steps", steps, at_least=0)
-        return self
 
 
 class SymbolicConstraint(OfFunction, Constraint):
@@ -219,24 +215,42 @@ class StateBounds(Constraint):
     """Bounds on states, `low <= x_t <= high`, at each step except a start that is given exactly.
 
         ls.StateBounds(height=(0.1, 2.0), velocity=(-np.inf, 1.5))
+        ls.StateBounds(height=(lows, 2.0))  # a lower bound for each knot
 
     At the end, the bounds do not act on a state that a GoalState fixes. A goal may therefore lie on a bound.
 
+    Either bound may have one number for each of the T+1 knots; where it is infinite, it does not act. A waypoint, or a
+    gate that is open for a while, is such a bound. Numbers belong to knots, also with a free duration. When a
+    `Replanner` plans again, they move with time as a reference does, see `QuadraticCost`.
+
     Args:
-      bounds: a dictionary of name or unit of a state: (low, high), in its unit. An infinite number means no bound. A
-        name takes precedence over a unit.
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit, each a number or (T+1,) numbers. An
+        infinite number means no bound. A name takes precedence over a unit.
       **named: name of a state -> (low, high), in place of a dictionary.
 
     Raises:
       InputError: no bounds, no finite bound for a state, low not below high, or a state that is named twice.
     """
 
-    def __init__(
-        self, bounds: Mapping[str, tuple[float, float]] | None = None, /, **named: tuple[float, float]
-    ) -> None:
+    def __init__(self, bounds: Mapping[str, Bounds] | None = None, /, **named: Bounds) -> None:
         self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
 
-    def _of(self, dynamics: Dynamics) -> dict[int, tuple[float, float]]:
+    @property
+    def by_knot(self) -> bool:
+        return any(isinstance(side, np.ndarray) for sides in self.bounds.values() for side in sides)
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
+        super().ahead(steps, horizon=horizon)
+        if not self.by_knot:
+            return self
+        other = copy.copy(self)
+        other.bounds = {
+            name: (_ahead(low, steps, horizon), _ahead(high, steps, horizon))
+            for name, (low, high) in self.bounds.items()
+        }
+        return other
+
+    def _of(self, dynamics: Dynamics) -> dict[int, tuple[Side, Side]]:
         """(low, high) of each bounded state, by index."""
         return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, _bound)
 
@@ -250,19 +264,26 @@ class StateBounds(Constraint):
           InputError: a goal is outside the bounds.
         """
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        data, described = [], []
+        rows, described = [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
-            for i, bound in self._of(dynamics).items():
-                name, number = names[i], bound[side]
-                if not np.isfinite(number):
+            for i, sides in self._of(dynamics).items():
+                name, numbers = names[i], np.atleast_1d(sides[side])
+                finite = numbers[np.isfinite(numbers)]
+                if not len(finite):
                     continue
-                wanted = f"{name} of {word} {_quantity(number, units[i])}"
-                if sign * (goals.get(i, number) - number) < 0:
+                wanted = f"{name} of {word} {_quantities(finite, units[i])}"
+                if i in goals and sign * (goals[i] - numbers[-1]) < 0:
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
-                data.append((i, sign, number, steps - 1 if i in goals else np.inf))
+                rows.append((i, sign, numbers, steps - 1 if i in goals else np.inf))
                 described.append(wanted)
-        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), described.__getitem__)
+        knots = max(len(numbers) for _, _, numbers, _ in rows)
+        if knots == 1:
+            data = np.ravel([(i, sign, numbers[0], last) for i, sign, numbers, last in rows])
+            return ConstraintTerm(source_of(state_bound), data, len(rows), described.__getitem__)
+        table = [[i, sign, last, *np.broadcast_to(numbers, knots)] for i, sign, numbers, last in rows]
+        data = np.concatenate([[knots], np.ravel(table)])
+        return ConstraintTerm(source_of(bound_by_knot), data, len(rows), described.__getitem__)
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
@@ -285,7 +306,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
       InputError: the constraints do not fit the system, or each other.
     """
     goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
-    _check_bounds([one for one in constraints if isinstance(one, StateBounds)], dynamics)
+    _check_bounds([one for one in constraints if isinstance(one, StateBounds)], dynamics, len(times))
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
             term = constraint._bind_to_goal(dynamics, goals, steps)
@@ -295,17 +316,28 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     return tuple(terms)
 
 
-def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics) -> None:
-    """Raises InputError if several bounds of a state leave nothing between them."""
-    found = [one._of(dynamics) for one in bounds]
+def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics, knots: int) -> None:
+    """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
+    names, found = dynamics.state_coordinates.names, [one._of(dynamics) for one in bounds]
+    for i, sides in (item for one in found for item in one.items()):
+        for side in sides:
+            if isinstance(side, np.ndarray) and len(side) != knots:
+                want = f"one, or one for each of {knots} knots"
+                raise InputError(f"StateBounds: {names[i]}: got {len(side)} numbers, want {want}")
     for i in {i for one in found for i in one}:
         lows, highs = zip(*(one[i] for one in found if i in one), strict=True)
-        if not max(lows) < min(highs):
-            name = dynamics.state_coordinates.names[i]
+        low, high = (np.broadcast_to(side, knots) for side in (_greatest(lows), -_greatest([-one for one in highs])))
+        if crossed := np.flatnonzero(~(low < high)).tolist():
+            t, each = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
             raise InputError(
-                f"constraints: got {name} of at least {max(lows):g} and at most {min(highs):g}, want bounds with room"
-                " between them"
+                f"constraints: got {names[i]} of at least {low[t]:g} and at most {high[t]:g}{each}, want bounds with"
+                " room between them"
             )
+
+
+def _greatest(sides: Sequence[Side]) -> Side:
+    """The greatest number, at each knot."""
+    return functools.reduce(np.maximum, sides)
 
 
 def violation_of(term: ConstraintTerm, values: Array) -> float:
@@ -341,15 +373,44 @@ def by_name(
     return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
 
 
-def _bound(field: str, given: object) -> tuple[float, float]:
-    """(low, high), at least one of them finite."""
-    if isinstance(given, (int, float)):
-        raise InputError(f"{field}: got {excerpt(given)}, want (low, high); infinite for no bound")
-    low, high = check_array(field, given, (2,), infinite=True).tolist()  # pyright: ignore[reportArgumentType]
-    if not low < high or not np.isfinite([low, high]).any():
-        raise InputError(f"{field}: got {low:g} to {high:g}, want low below high, and one of them finite")
+def _bound(field: str, given: object) -> tuple[Side, Side]:
+    """(low, high), each a number or numbers (K,), at least one of them finite."""
+    want = "(low, high), each a number or one for each knot; infinite for no bound"
+    sides = check_items(field, given, object, want)
+    if len(sides) != 2:
+        raise InputError(f"{field}: got {len(sides)} items, want {want}")
+    low, high = (_side(f"{field}: {name}", side) for name, side in zip(("low", "high"), sides, strict=True))
+    if isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and len(low) != len(high):
+        raise InputError(f"{field}: got {len(low)} and {len(high)} numbers, want one for each knot in both")
+    lows, highs = np.broadcast_arrays(np.atleast_1d(low), np.atleast_1d(high))
+    wrong = np.flatnonzero(~(lows < highs)).tolist()
+    if wrong or not (np.isfinite(lows).any() or np.isfinite(highs).any()):
+        at = wrong[0] if wrong else 0
+        knot = f" at knot {at}" if wrong and len(lows) > 1 else ""
+        raise InputError(
+            f"{field}: got {lows[at]:g} to {highs[at]:g}{knot}, want low below high, and one of them finite"
+        )
     return low, high
+
+
+def _side(field: str, given: object) -> Side:
+    """A bound, or one for each knot. Raises InputError for anything else."""
+    numbers = numbers_of(field, given, "a number, or one for each knot")
+    numbers = check_array(field, numbers, (None,) if numbers.ndim else (), infinite=True)
+    if not numbers.size:
+        raise InputError(f"{field}: got no numbers, want one, or one for each knot")
+    return numbers if numbers.ndim else numbers.item()
+
+
+def _ahead(side: Side, steps: int, horizon: str) -> Side:
+    return rows_ahead(side, steps, horizon) if isinstance(side, np.ndarray) else side
 
 
 def _quantity(number: float, unit: str) -> str:
     return f"{number:g} {unit}".rstrip()
+
+
+def _quantities(numbers: Array, unit: str) -> str:
+    """The least and the greatest number, or the one that all are."""
+    low, high = numbers.min(), numbers.max()
+    return _quantity(low, unit) if low == high else f"{low:g} to {_quantity(high, unit)}"

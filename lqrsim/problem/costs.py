@@ -8,7 +8,7 @@ import copy
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -120,9 +120,26 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """
 
     @property
+    def by_knot(self) -> bool:
+        """Whether it has other numbers at each knot; initial and final costs may not."""
+        return False
+
+    @property
     def moving(self) -> bool:
         """Whether the term changes with time; see `_bind_at`."""
-        return False
+        return self.by_knot
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
+        """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
+
+        Args:
+          steps: number of steps that are over.
+          horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
+            length, which repeats the last row.
+        """
+        check_count("steps", steps, at_least=0)
+        check_name("horizon", horizon, HORIZONS)
+        return self
 
     def _stated(self) -> Mapping[str, object]:
         """The arguments that it was made from, by name."""
@@ -175,23 +192,6 @@ class Cost(ProblemPart[CostTerm]):
     def name(self) -> str:
         """The name in messages."""
         return type(self).__name__
-
-    @property
-    def by_knot(self) -> bool:
-        """Whether it has other numbers at each knot; only a stage cost may."""
-        return False
-
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "Cost":
-        """The cost for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
-
-        Args:
-          steps: number of steps that are over.
-          horizon: "shrinking" for the rest of the plan, without the first rows; or "moving" for a plan of the same
-            length, which repeats the last row.
-        """
-        check_count("steps", steps, at_least=0)
-        check_name("horizon", horizon, HORIZONS)
-        return self
 
     def _in(self, dynamics: Dynamics) -> "Cost":
         """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
@@ -302,21 +302,17 @@ class _SquareCost(Cost):
     def by_knot(self) -> bool:
         return self.weight.ndim == 3 or self.about.ndim == 2
 
-    @property
-    def moving(self) -> bool:
-        return self.by_knot
-
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "_SquareCost":
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
         super().ahead(steps, horizon=horizon)
         if not self.by_knot:
             return self
 
-        def later(rows: Array) -> Array:
-            return left_after(min(steps, len(rows) - 1), rows, filled=horizon == "moving")
-
         weight, about = self._known
         other = copy.copy(self)
-        other._numbers = later(weight) if weight.ndim == 3 else weight, later(about) if about.ndim == 2 else about
+        other._numbers = (
+            rows_ahead(weight, steps, horizon) if weight.ndim == 3 else weight,
+            rows_ahead(about, steps, horizon) if about.ndim == 2 else about,
+        )
         return other
 
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
@@ -364,6 +360,11 @@ class _SquareCost(Cost):
                 more = "; for a moving horizon, more with longer=True" if rows > steps else ""
                 raise InputError(f"{self.name}: {name}: got {rows} rows, want {want}{more}")
         return self.bind(dynamics)
+
+
+def rows_ahead(rows: Array, steps: int, horizon: str) -> Array:
+    """The rows of the knots from `steps` steps later on; at least one. See `ProblemPart.ahead`."""
+    return left_after(min(steps, len(rows) - 1), rows, filled=horizon == "moving")
 
 
 def _number_or_column(field: str, given: object) -> float | Array:

@@ -179,7 +179,7 @@ class Problem:
     @property
     def moving(self) -> bool:
         """Whether the problem depends on the time at which it begins, as with obstacles that move or a reference."""
-        return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
+        return any(one.moving or one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
@@ -231,22 +231,23 @@ class Problem:
         return self._with(**costs, _terms=self._terms | terms)
 
     def later(self, seconds: float) -> "Problem":
-        """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs with
-        a row for each knot begin with a later one and repeat the last.
+        """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs and
+        constraints with a row for each knot begin with a later one and repeat the last.
 
         Args:
-          seconds: the delay in seconds; with such costs, a multiple of dt.
+          seconds: the delay in seconds; with such costs or constraints, a multiple of dt.
 
         Raises:
           InputError: the delay is no such number.
         """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
-        if any(cost.by_knot for cost in terms_of(self.stage_cost)):
+        if any(one.by_knot for one in (*terms_of(self.stage_cost), *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
-                want = f"a multiple of dt, {self.dt:g} s, not negative: the stage cost has a row for each knot"
+                want = f"a multiple of dt, {self.dt:g} s, not negative: a cost or a constraint has a row for each knot"
                 raise InputError(f"seconds: got {seconds:g}, want {want}")
-            other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"))
+            later = tuple(one.ahead(steps, horizon="moving") for one in self.constraints)
+            other = other._with(stage_cost=self.stage_cost.ahead(steps, horizon="moving"), constraints=later)
         return other._bound_anew() if self.moving else other
 
     def _bound_anew(self) -> "Problem":

@@ -205,7 +205,7 @@ def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> tuple[
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for one in () if problem is None else problem.constraints:
         for i, (least, most) in one._of(robot.dynamics).items() if isinstance(one, StateBounds) else ():
-            low[i], high[i] = max(low[i], least), min(high[i], most)
+            low[i], high[i] = max(low[i], np.min(least)), min(high[i], np.max(most))  # the widest of all knots
     for name, least, mean, most in zip(names, low, middle, high, strict=True):
         if not least <= mean <= most:
             raise InputError(
