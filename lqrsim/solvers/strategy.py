@@ -213,7 +213,7 @@ class Search:
     def widen(self) -> None:
         """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
         # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-        poor = self._says_infeasible or (self._default and self._is_unacceptable)
+        poor = self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
         if not (poor and self._may_go_on):
             return
         if pull(self._problem) > 0:
@@ -551,19 +551,9 @@ class Search:
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
-    def _says_infeasible(self) -> bool:
-        """Whether the best result is INFEASIBLE, which other starts may disprove."""
-        return self._stuck and self.best[1].status is Status.INFEASIBLE
-
-    @property
     def _without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
-
-    @property
-    def _stuck(self) -> bool:
-        """Whether there is a plan whose violation is stationary, but none that satisfies the constraints."""
-        return bool(self._known.evidence) and not self.best[1].success
 
 
 def policy_of(found: RunResult, summary: str) -> InitialGuess:
