@@ -28,7 +28,7 @@ from lqrsim.errors import (
     check_number,
     keep,
 )
-from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
+from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy
@@ -180,9 +180,7 @@ def smooth_chance_constrained(
 
 def _weighing(problem: Problem, times: float) -> Problem:
     """The problem with the weights of its obstacles multiplied."""
-    terms = terms_of(problem.stage_cost)
-    costs = tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms)
-    return problem.with_costs(stage_cost=CostSum(costs))
+    return problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, times))
 
 
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
