@@ -49,12 +49,8 @@ class Clearance(KeepsClear, Constraint):
         steps = check_count("steps", steps, at_least=0)
         if not isinstance(self.margin, np.ndarray):
             return self
-        return self._keeping(self.margin[min(steps, len(self.margin) - 1) :])
-
-    def _keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
-        """The same constraint with another margin."""
         other = copy.copy(self)
-        other.margin = _checked_margin(margin)
+        other.margin = self.margin[min(steps, len(self.margin) - 1) :]
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
