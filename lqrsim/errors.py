@@ -225,6 +225,12 @@ def check_function(
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
 
+def check_progress(progress: object, *, text: bool = False) -> None:
+    """Raises InputError unless it is None or a function of (done, total), with `text` of (done, total, text)."""
+    wanted = "a function progress(done, total, text)" if text else "a function progress(done, total)"
+    check_function("progress", progress, wanted, arguments=2 + text)
+
+
 def check_flag(field: str, value: object) -> bool:
     """`value` as a bool. Raises InputError unless it is True or False."""
     if not isinstance(value, (bool, np.bool_)):

@@ -26,6 +26,7 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_number,
+    check_progress,
     keep,
 )
 from lqrsim.problem.costs import weighing_obstacles
@@ -151,7 +152,7 @@ def smooth_chance_constrained(
     chance = check_number("chance", chance, above=0.0, below=1.0)
     check_count("rounds", rounds)
     check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.kept:
         raise InputError("problem: got a problem without obstacles, want an ObstacleCost or a Clearance in it")

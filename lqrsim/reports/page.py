@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_path
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, check_progress
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
@@ -195,7 +195,7 @@ def report(
     """
     check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
     check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_function("progress", progress, "a function of the numbers of finished parts and of all parts", arguments=2)
+    check_progress(progress)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:

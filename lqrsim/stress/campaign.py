@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
+from lqrsim.errors import InputError, check_count, check_kind, check_path, check_progress, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
@@ -117,7 +117,7 @@ def run_resolved(
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_function("progress", progress, "a function of the numbers of finished trials and of all trials", arguments=2)
+    check_progress(progress)
     given = None if solution is None else solving.given(scenario, solution)
     deterministic = _check_runnable(campaign, scenario, given)
     _check_folder(folder)

@@ -27,6 +27,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     check_path,
+    check_progress,
     check_seed,
     check_text,
     keep,
@@ -272,7 +273,7 @@ class ReliabilityProblem:
     def _begin(self, report: Report | None, progress: Progress | None) -> TrialScore:
         """Check the callbacks, report the summary, and return the score."""
         check_function("report", report, "a function of a line of text", arguments=1)
-        check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+        check_progress(progress, text=True)
         if report is not None:
             report(self.summary())
         return self.score

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from mujoco import mjtGeom as Geom
 
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_progress
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
@@ -31,7 +31,7 @@ Progress = Callable[[int, int], object]
 def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
     """Raises InputError unless the arguments are a solution and a function, or None."""
     check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
-    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
+    check_progress(progress)
 
 
 def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
