@@ -169,6 +169,13 @@ def check_number(
     return number
 
 
+def keep_positive(record: object, *names: str, who: str = "") -> None:
+    """Check fields of a frozen record that are positive numbers, or None. `who` comes before them in messages."""
+    for name in names:
+        if (value := getattr(record, name)) is not None:
+            keep(record, **{name: check_number(f"{who}{name}", value, above=0.0)})
+
+
 def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = LARGEST_COUNT) -> int:
     """`value` as an int from `at_least` to `at_most`. Raises InputError otherwise."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))

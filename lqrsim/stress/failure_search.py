@@ -31,6 +31,7 @@ from lqrsim.errors import (
     check_seed,
     check_text,
     keep,
+    keep_positive,
 )
 from lqrsim.machine import description
 from lqrsim.process import keeping
@@ -104,9 +105,7 @@ class ReliabilityProblem:
         check_name("failure", self.failure, FAILURES)
         kinds = (Solution, str, os.PathLike, type(None))
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
-        for field in ("goal_radius", "goal_tolerance"):
-            if (value := getattr(self, field)) is not None:
-                keep(self, **{field: check_number(field, value, above=0.0)})
+        keep_positive(self, "goal_radius", "goal_tolerance")
 
     @cached_property
     def score(self) -> TrialScore:
