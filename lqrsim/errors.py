@@ -373,6 +373,11 @@ def _bytes(count: int) -> str:
     return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
 
 
+def printable(text: str) -> str:
+    """The text with a question mark for each letter that cannot be printed."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 def excerpt(value: object) -> str:
     """A value as one short line for a message, even if its `__repr__` fails."""
     try:
@@ -387,7 +392,7 @@ def excerpt(value: object) -> str:
         text = " ".join(without_addresses(repr(value)).split())
     except Exception:  # a __repr__ that fails, or recurses without end
         return f"a {type(value).__name__}"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
+    text = printable(text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -429,7 +434,7 @@ def format_error(error: BaseException) -> str:
         text = " ".join(str(error).split())
     except Exception:  # raised by its own __str__
         text = ""
-    text = "".join(letter if letter.isprintable() else "?" for letter in text[:500])
+    text = printable(text[:500])
     where = _line_of_user(error.__traceback__)
     return (f"{type(error).__name__}: {text}" if text else type(error).__name__) + (f" ({where})" if where else "")
 
@@ -448,4 +453,4 @@ def _line_of_user(trace: types.TracebackType | None) -> str:
         if os.path.isfile(file) and not os.path.realpath(file).startswith(_NOT_USERS):
             where = f"{os.path.basename(file)}, line {trace.tb_lineno}"
         trace = trace.tb_next
-    return "".join(letter if letter.isprintable() else "?" for letter in where)
+    return printable(where)

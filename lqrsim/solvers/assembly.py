@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, printable
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import LINE
@@ -79,8 +79,7 @@ def assemble(
 
 def _line(text: str) -> str:
     """A text, which may contain the repr of a user's object, as a printable line that a file can hold."""
-    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
-    return line[: 10 * LINE]
+    return printable(" ".join(text.split()))[: 10 * LINE]
 
 
 def _usable(found: RunResult, options: dict[str, object]) -> str:
