@@ -19,7 +19,7 @@ from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.mjcf_joints import posed
-from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
+from lqrsim.verify.verdict import Criterion, Positions, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.overlays import RIM
@@ -66,7 +66,7 @@ def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
 
 def planned_positions(rollout: Rollout, times: Array) -> Array:
     """Planned positions (N, d)."""
-    return np.stack([np.interp(times, rollout.times, column) for column in rollout.planned_places.T], axis=1)
+    return positions_at(rollout.times, rollout.planned_places, times)
 
 
 def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
@@ -74,8 +74,7 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
     body = robot_body(model, rollout.body)
     places = [place_in(data, rollout, body).copy() for data in posed(model, rollout.frames[trial, good])]
-    columns = rollout.of_world(places).T
-    return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
+    return positions_at(rollout.frame_times[good], rollout.of_world(places), times)
 
 
 def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
