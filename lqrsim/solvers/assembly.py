@@ -94,9 +94,7 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
     if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
         return ""
     if not np.isfinite(plan.optimality):
-        return (
-            "the plan can be used, for it keeps dynamics, limits and constraints; how far the optimum is is not known"
-        )
+        return "the plan can be used, for it keeps dynamics, limits and constraints; whether it is optimal is unknown"
     if plan.optimality > FAR:
         return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
     wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""

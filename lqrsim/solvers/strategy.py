@@ -461,7 +461,7 @@ class Search:
             untried = "no time was left for other starts, which may keep the constraints"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
         elif self._cut_short and np.isfinite(found.cost):
-            untried = "no time was left for all that may make it better"
+            untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
