@@ -52,9 +52,7 @@ from lqrsim.stress.policies import (
     solve,
 )
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign as Campaign
-from lqrsim.stress.specification import Cell as Cell
-from lqrsim.stress.specification import Shard
+from lqrsim.stress.specification import Campaign, Shard
 from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, versions
 
