@@ -98,7 +98,7 @@ class PreparedSolver:
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
         law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
-        guess, budget = InitialGuess(*law, None, None, ""), Budget(self.settings.max_iterations)
+        guess, budget = InitialGuess(*law), Budget(self.settings.max_iterations)
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
         compiled.rollout(self.problem, *law, state)

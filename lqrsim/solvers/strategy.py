@@ -558,4 +558,4 @@ class Search:
 
 def policy_of(found: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
-    return InitialGuess(found.law[0].copy(), found.law[1].copy(), None, None, summary)
+    return InitialGuess(found.law[0].copy(), found.law[1].copy(), summary)
