@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, check_progress
+from lqrsim.results.archive import replacing
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
-from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of

@@ -36,7 +36,7 @@ from lqrsim.errors import (
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
-from lqrsim.results.archive import sha256
+from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -497,5 +497,5 @@ def write_json(
         "stopped": stopped or None,
         "found": found,
     }
-    with save_load.replacing(folder / f"{name}.json") as unfinished:
+    with replacing(folder / f"{name}.json") as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")

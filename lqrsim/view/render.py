@@ -19,9 +19,9 @@ from av.video.reformatter import Colorspace
 from PIL import Image
 
 from lqrsim.errors import InputError, check_name, check_number, check_path, check_progress, excerpt
+from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.captions import Pixels
