@@ -61,8 +61,8 @@ def assemble(
         detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
         remedy=remedy_of(problem, found, log, options),
         policy=policy(*law, nominal[:-1]),
-        cost_to_go=_copied(found.values.get("cost_to_go")),
-        cost_to_come=_copied(found.values.get("cost_to_come")),
+        cost_to_go=copy_of(found.values.get("cost_to_go")),
+        cost_to_come=copy_of(found.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=tuple(log),
         certificate=found.certificate,
@@ -144,8 +144,8 @@ def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 
-def _copied(value: Any) -> Any:
-    """A copy of a value function."""
+def copy_of(value: Any) -> Any:
+    """A copy of a value function; None for None."""
     if value is None:
         return None
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
