@@ -36,7 +36,7 @@ from tqdm import tqdm
 
 from lqrsim.errors import InputError
 from lqrsim.machine import processors
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 
 
 @dataclass(frozen=True, kw_only=True)

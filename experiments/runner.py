@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.machine import description
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 from lqrsim.stress.statistics import Estimate
 from lqrsim.versions import versions
 

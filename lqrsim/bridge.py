@@ -500,7 +500,7 @@ class _Reader:
         return self._waits.wait(self._ros.duration(seconds=seconds)) > 0
 
     def take(self) -> list[Any]:
-        """The oldest message, or None."""
+        """The oldest message, in a list; an empty list if there is none."""
         return self._reader.take(N=1)
 
     def writers(self) -> list[Any]:

@@ -5,7 +5,6 @@ import contextlib
 import io
 import itertools
 import logging
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -157,15 +156,8 @@ def _given_twice(command: Any, arguments: list[str]) -> str:
 @contextlib.contextmanager
 def _unwrapped(printed: io.StringIO) -> Iterator[None]:
     """A block that prints errors to `printed`, in lines so wide that no word is broken."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100000"
-    try:
-        with contextlib.redirect_stderr(printed):
-            yield
-    finally:
-        del os.environ["COLUMNS"]
-        if before is not None:
-            os.environ["COLUMNS"] = before
+    with process.environment(COLUMNS="100000"), contextlib.redirect_stderr(printed):
+        yield
 
 
 if __name__ == "__main__":

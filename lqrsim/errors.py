@@ -169,6 +169,13 @@ def check_number(
     return number
 
 
+def keep_positive(record: object, *names: str, who: str = "") -> None:
+    """Check fields of a frozen record that are positive numbers, or None. `who` comes before them in messages."""
+    for name in names:
+        if (value := getattr(record, name)) is not None:
+            keep(record, **{name: check_number(f"{who}{name}", value, above=0.0)})
+
+
 def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = LARGEST_COUNT) -> int:
     """`value` as an int from `at_least` to `at_most`. Raises InputError otherwise."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
@@ -223,6 +230,12 @@ def check_function(
         ) from None
     except Exception:  # an object may raise anything when it is inspected
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
+
+
+def check_progress(progress: object, *, text: bool = False) -> None:
+    """Raises InputError unless it is None or a function of (done, total), with `text` of (done, total, text)."""
+    wanted = "a function progress(done, total, text)" if text else "a function progress(done, total)"
+    check_function("progress", progress, wanted, arguments=2 + text)
 
 
 def check_flag(field: str, value: object) -> bool:
@@ -360,6 +373,11 @@ def _bytes(count: int) -> str:
     return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
 
 
+def printable(text: str) -> str:
+    """The text with a question mark for each letter that cannot be printed."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 def excerpt(value: object) -> str:
     """A value as one short line for a message, even if its `__repr__` fails."""
     try:
@@ -374,7 +392,7 @@ def excerpt(value: object) -> str:
         text = " ".join(without_addresses(repr(value)).split())
     except Exception:  # a __repr__ that fails, or recurses without end
         return f"a {type(value).__name__}"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
+    text = printable(text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -416,7 +434,7 @@ def format_error(error: BaseException) -> str:
         text = " ".join(str(error).split())
     except Exception:  # raised by its own __str__
         text = ""
-    text = "".join(letter if letter.isprintable() else "?" for letter in text[:500])
+    text = printable(text[:500])
     where = _line_of_user(error.__traceback__)
     return (f"{type(error).__name__}: {text}" if text else type(error).__name__) + (f" ({where})" if where else "")
 
@@ -435,4 +453,4 @@ def _line_of_user(trace: types.TracebackType | None) -> str:
         if os.path.isfile(file) and not os.path.realpath(file).startswith(_NOT_USERS):
             where = f"{os.path.basename(file)}, line {trace.tb_lineno}"
         trace = trace.tb_next
-    return "".join(letter if letter.isprintable() else "?" for letter in where)
+    return printable(where)

@@ -167,6 +167,21 @@ def keeping(make: Callable[[Any], Any]) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def environment(**values: str) -> Iterator[None]:
+    """A block in which variables of the environment have these values."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 def run_script(arguments: list[str]) -> None:
     """Run a Python file as a program with its arguments; a signal lets it tidy up, and ends it silently."""
     handle_signals()

@@ -24,9 +24,10 @@ from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
-from lqrsim.stress.campaign import Campaign, Cell, run_campaign
+from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import Damaged, unpack
 from lqrsim.stress.results import Results, differences, replay
+from lqrsim.stress.specification import Campaign, Cell
 
 OWN = """
 import dataclasses

@@ -30,16 +30,17 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.reports.page import report
-from lqrsim.results.goal import OF_RANGE, Target, endings
+from lqrsim.results.goal import OF_RANGE, OUTCOMES, Target, endings
 from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress import trials
-from lqrsim.stress.campaign import Campaign, run_campaign
-from lqrsim.stress.outcome_table import OUTCOMES, Outcomes, outcomes
+from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.results import Results, differences, replay
+from lqrsim.stress.specification import Campaign
 
 ARM = """<mujoco>
   <option timestep="0.01"/>

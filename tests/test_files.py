@@ -26,7 +26,7 @@ from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.results import save_load
+from lqrsim.results.archive import replacing
 from lqrsim.results.fields import declared
 
 fuzzer: ModuleType = importlib.import_module("robustness.files")
@@ -599,7 +599,7 @@ def test_a_failed_write_leaves_nothing_and_keeps_the_old_file(tmp_path: Path, dr
     path.write_text("old")
 
     def interrupted() -> None:
-        with save_load.replacing(path) as unfinished:
+        with replacing(path) as unfinished:
             unfinished.write_text("half")
             raise KeyboardInterrupt
 

@@ -17,8 +17,9 @@ from llvmlite.binding import FeatureMap
 import lqrsim as ls
 from lqrsim import machine, versions
 from lqrsim.cli import main
-from lqrsim.stress.campaign import Campaign, run_campaign
+from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
+from lqrsim.stress.specification import Campaign
 
 CAMPAIGN = Campaign(
     scenario="differential_drive",

@@ -7,9 +7,10 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.control.replanner import Replanner
 from lqrsim.disturbances import ForceNoise, MeasurementNoise, Push
+from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.simulation.plant import Plant
-from lqrsim.stress.outcome_table import OUTCOMES, outcomes
+from lqrsim.stress.outcome_table import outcomes
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ COMMAND = [sys.executable, "-m", "lqrsim.cli"]
 PICTURE = """
 import sys, time
 from pathlib import Path
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 with replacing(Path(sys.argv[sys.argv.index("--out") + 1]) / "figures" / "a.png") as unfinished:
     unfinished.write_bytes(b"half")
     time.sleep(60)

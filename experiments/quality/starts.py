@@ -9,7 +9,7 @@ from runner import judge, progress
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 from quality.common import (
     ALL,
     NONE,

@@ -76,18 +76,11 @@ class Bridge:
     def _be_robot(self, topics: dict[str, Any]) -> int:
         from lqrsim import bridge
         from lqrsim.commands import console
-        from lqrsim.errors import InputError
-        from lqrsim.results import save_load
-        from lqrsim.results.solution import Solution
-        from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
 
-        solution = save_load.load(self.policy, Solution)
-        if not self.scenario and not solution.scenario:
-            raise InputError("--scenario: got none, and the solution names none, want the scenario to run with --robot")
-        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario).settled(solution)
+        solution, scenario = console.load_with_scenario(self.policy, self.scenario)
         with bridge.SimulatedRobot(solution, **topics) as robot:
-            rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough(None, None))
+            rollout = simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough())
         console.say(rollout.summary())
         console.say(robot.summary())
         console.result(outcome=rollout.outcome, round_trips=robot.round_trips)

@@ -149,6 +149,24 @@ def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "S
     return solution
 
 
+def load_with_scenario(path: Path, named: str | None) -> "tuple[Solution, Scenario]":
+    """The solution in a file, and the scenario in which it runs: the named one, else its own if `lqrsim list` has it.
+
+    Raises:
+      InputError: the file is no solution, or no scenario is named.
+    """
+    from lqrsim.results import save_load
+    from lqrsim.results.solution import Solution
+    from lqrsim.scenarios.references import resolve
+
+    solution = save_load.load(path, Solution)
+    if not named and not solution.scenario:
+        raise InputError(
+            "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
+        )
+    return solution, resolve(named or solution.scenario, registered_only=not named).settled(solution)
+
+
 def bar(**options: Any) -> "tqdm[Any]":
     """A progress bar, with the options of tqdm."""
     from tqdm import tqdm

@@ -13,7 +13,7 @@ from typing import Any
 from lqrsim.commands import console
 from lqrsim.errors import InputError, check_name
 from lqrsim.machine import description
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 
 # In the wheel, experiments/ is inside the package; in the repository, next to it.
 _PACKAGED = [Path(__file__).parents[1] / "experiments", Path(__file__).parents[2] / "experiments"]

@@ -213,8 +213,7 @@ class Simulate:
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
-        from lqrsim.results.solution import Solution
-        from lqrsim.scenarios.references import disturbance_set, resolve
+        from lqrsim.scenarios.references import disturbance_set
         from lqrsim.simulation.closed_loop import simulate
         from lqrsim.simulation.uncertainty_of import tube_under
         from lqrsim.stress.policies import check_designed, make_controller
@@ -223,12 +222,7 @@ class Simulate:
             raise InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
-        solution = save_load.load(self.solution, Solution)
-        if not self.scenario and not solution.scenario:
-            raise InputError(
-                "--scenario: got none, and the solution names none, want the scenario with the robot and the scene"
-            )
-        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario).settled(solution)
+        solution, scenario = console.load_with_scenario(self.solution, self.scenario)
         if self.open_loop:
             solution = solution.open_loop()
         if self.design_disturbances is not None:

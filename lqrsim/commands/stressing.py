@@ -72,9 +72,10 @@ class Stress:
         from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import disturbance_set, folder_name, names_code, resolve
         from lqrsim.scenarios.solutions import given
-        from lqrsim.stress.campaign import Campaign, run_resolved
+        from lqrsim.stress.campaign import run_resolved
         from lqrsim.stress.policies import DEFAULT_POLICIES, impossible_policies
         from lqrsim.stress.results import Results
+        from lqrsim.stress.specification import Campaign
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/stress") / folder_name(scenario)

@@ -26,9 +26,10 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_number,
+    check_progress,
     keep,
 )
-from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
+from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy
@@ -151,7 +152,7 @@ def smooth_chance_constrained(
     chance = check_number("chance", chance, above=0.0, below=1.0)
     check_count("rounds", rounds)
     check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     surroundings = Surroundings.of(problem, uncertainty.obstacles)
     if not surroundings.kept:
         raise InputError("problem: got a problem without obstacles, want an ObstacleCost or a Clearance in it")
@@ -180,9 +181,7 @@ def smooth_chance_constrained(
 
 def _weighing(problem: Problem, times: float) -> Problem:
     """The problem with the weights of its obstacles multiplied."""
-    terms = terms_of(problem.stage_cost)
-    costs = tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms)
-    return problem.with_costs(stage_cost=CostSum(costs))
+    return problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, times))
 
 
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:

@@ -108,7 +108,7 @@ class ReplannedRun(ControllerRun):
         if not self._always and self._leads_there(problem, gain, offset, here):
             return
         plan = law.plan
-        start = InitialGuess(gain, in_c_order(offset), plan.shifted(done, horizon="shrinking").cost_to_go, None, "")
+        start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)
         solution = self._rule.solve(SolveRequest(step, step, here, start, problem))
         if not self.log.enter(step, trial, solution):
             return

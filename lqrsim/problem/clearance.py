@@ -56,12 +56,8 @@ class Clearance(KeepsClear, Constraint):
         super().ahead(steps, horizon=horizon)
         if not isinstance(self.margin, np.ndarray):
             return self
-        return self._keeping(rows_ahead(self.margin, steps, horizon))
-
-    def _keeping(self, margin: float | npt.ArrayLike) -> Self:
-        """The same constraint with another margin."""
         other = copy.copy(self)
-        other.margin = _checked_margin(margin)
+        other.margin = rows_ahead(self.margin, steps, horizon)
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:

@@ -540,6 +540,13 @@ class ObstacleCost(KeepsClear, Cost):
         )
 
 
+def weighing_obstacles(cost: Cost, times: float) -> CostSum:
+    """The cost with the weights of its obstacles multiplied."""
+    return CostSum(
+        tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms_of(cost))
+    )
+
+
 class SymbolicCost(OfFunction, Cost):
     """A cost stated as a formula.
 

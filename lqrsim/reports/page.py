@@ -18,9 +18,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_path
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_path, check_progress
+from lqrsim.results.archive import replacing
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
-from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of
@@ -195,7 +195,7 @@ def report(
     """
     check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
     check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
-    check_function("progress", progress, "a function of the numbers of finished parts and of all parts", arguments=2)
+    check_progress(progress)
     path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:
@@ -247,7 +247,7 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
         "warnings": warnings,
         "facts": _facts(results, table, scenario),
         "commands": commands,
-        "asked": json.dumps(manifest.get("campaign"), indent=2, ensure_ascii=False),
+        "asked": json.dumps(manifest["campaign"], indent=2, ensure_ascii=False),
         "breaks": breaks_table(table),
         "breaks_note": f"The lowest tested strength at which the 95 % interval of the success rate is entirely"
         f" below {100 * BROKEN_BELOW:g} %, in ascending order.",
@@ -291,7 +291,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
         "Policies": [
             ", ".join(policies(table)),
-            *([manifest["left_out"]] if manifest.get("left_out") else []),
+            *([manifest["left_out"]] if manifest["left_out"] else []),
             *manifest["remarks"],
         ],
         "Plans": results.plans(),
@@ -307,10 +307,8 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.",
             *([f"Left out of the design: {'; '.join(unknown)}."] if unknown else []),
         ]
-    if manifest.get("versions"):
-        facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
-    if manifest.get("machine"):
-        facts["Machine"] = [str(manifest["machine"])]
+    facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
+    facts["Machine"] = [manifest["machine"]]
     return facts
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_kind, check_name, check_path, excerpt
 from lqrsim.results.archive import Arrays, Header, anything, canonical, digest, opened, parse, write
-from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.fields import Declared, Sizes, check_sizes, declarations, declared
 from lqrsim.results.funnel import Funnel

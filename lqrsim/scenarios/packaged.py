@@ -18,6 +18,7 @@ from lqrsim.errors import (
     check_seed,
     check_text,
     keep,
+    keep_positive,
 )
 from lqrsim.problem.costs import ControlCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import Problem
@@ -110,9 +111,7 @@ class Scenario:
         check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
         check_kind("Scenario: problem", self.problem, Problem, "a Problem")
         check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
-        for name in ("goal_radius", "goal_tolerance"):
-            if (value := getattr(self, name)) is not None:
-                keep(self, **{name: check_number(f"Scenario: {name}", value, above=0.0)})
+        keep_positive(self, "goal_radius", "goal_tolerance", who="Scenario: ")
         wanted = "disturbances, such as ControlNoise(0.05)"
         keep(self, disturbances=check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted))
         if not is_function(self.start):  # a function is called when the scenario is solved

@@ -2,7 +2,7 @@
 
 import copy
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -194,11 +194,23 @@ def _unit(model: mujoco.MjModel, number: int) -> str:
     return f"{length}/s" if bias[1] == 0 and gain[0] == -bias[2] else ""
 
 
+def placed(model: mujoco.MjModel, qpos: Array | None = None) -> mujoco.MjData:
+    """MuJoCo's data with the places of all bodies at positions (nq,), by default at rest."""
+    return next(posed(model, [model.qpos0 if qpos is None else qpos]))
+
+
+def posed(model: mujoco.MjModel, positions: Iterable[Array]) -> Iterator[mujoco.MjData]:
+    """MuJoCo's data with the places of all bodies at each of these positions (nq,): one object, which changes."""
+    data = mujoco.MjData(model)
+    for qpos in positions:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        yield data
+
+
 def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     """The names of the bodies that touch, each pair once."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
+    data = placed(model, qpos)
     mujoco.mj_collision(model, data)
     bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
     return [
@@ -356,9 +368,7 @@ def position_of(model: mujoco.MjModel, body: int) -> Axes:
 
 def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
     """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
+    data = placed(model, qpos)
     return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
 
 
@@ -380,8 +390,7 @@ def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
     Returns:
       The number of the geom's body, its position (3,) there, and the radius of its bounding ball in metres.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    data = placed(model)
     moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
     own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))
     if not len(own):

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_joints import placed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -26,7 +27,7 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     Args:
       body: the robot's first that moves. floors: whether there may be ground for standing on.
     """
-    data, base, bodies, pairs = _at_rest(model), _base(model), model.geom_bodyid.tolist(), touching_pairs
+    data, base, bodies, pairs = placed(model), _base(model), model.geom_bodyid.tolist(), touching_pairs
     level, stood_on = set[int](), set[int]()
     if floors:
         level, stood_on = _ground(model, data), _supports(model, pairs(model, candidates))
@@ -47,7 +48,7 @@ def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors
     Args:
       body, floors: as of `in_the_way`. A free joint, or a slide that is not level, lets it sink.
     """
-    data, touched = _at_rest(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
+    data, touched = placed(model), set(avoidable_pairs(model, candidates)[:, 1].tolist())
     ground = set[int]()
     if floors:
         pairs = touching_pairs(model, candidates)
@@ -169,12 +170,6 @@ def _ground(model: mujoco.MjModel, data: mujoco.MjData) -> set[int]:
     return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
 
 
-def _at_rest(model: mujoco.MjModel) -> mujoco.MjData:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return data
-
-
 def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs whose geoms touch or overlap."""
     found, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
@@ -186,7 +181,7 @@ def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDAr
 
 def _always_touch(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom."""
-    data = _at_rest(model)
+    data = placed(model)
     always = _touch(model, data, pairs)
     always &= ~_moved_by(model, pairs, _FREE)
     rng, kept = np.random.default_rng(0), np.flatnonzero(always)

@@ -279,8 +279,7 @@ class Plant:
           simulations: K of them.
           displaced: (K, obstacles, 3), in metres along the world's axes.
         """
-        places, drawn = simulations.expand("geom_pos"), mujoco.MjData(self.model)
-        mujoco.mj_kinematics(self.model, drawn)
+        places, drawn = simulations.expand("geom_pos"), mjcf_joints.placed(self.model)
         for number, name in enumerate(self.world.names):
             geom = self.model.geom(name)
             places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)

@@ -17,6 +17,7 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_memory,
+    check_progress,
     check_seed,
     check_text,
 )
@@ -93,8 +94,7 @@ class RunSettings:
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
         wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
         check_function("generators", self.generators, wanted, arguments=2)
-        wanted = "a function of the numbers of finished periods and of all periods"
-        check_function("progress", self.progress, wanted, arguments=2)
+        check_progress(self.progress)
         wanted = "a function of the time, MuJoCo's qpos and which trials are unstable"
         check_function("watch", self.watch, wanted, arguments=3)
         self.law, plan = as_controller(self.controller, self.plan, self.plant.robot.dynamics)

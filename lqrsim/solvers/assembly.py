@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, printable
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import LINE
@@ -61,8 +61,8 @@ def assemble(
         detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
         remedy=remedy_of(problem, found, log, options),
         policy=policy(*law, nominal[:-1]),
-        cost_to_go=_copied(found.values.get("cost_to_go")),
-        cost_to_come=_copied(found.values.get("cost_to_come")),
+        cost_to_go=copy_of(found.values.get("cost_to_go")),
+        cost_to_come=copy_of(found.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=tuple(log),
         certificate=found.certificate,
@@ -79,8 +79,7 @@ def assemble(
 
 def _line(text: str) -> str:
     """A text, which may contain the repr of a user's object, as a printable line that a file can hold."""
-    line = "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
-    return line[: 10 * LINE]
+    return printable(" ".join(text.split()))[: 10 * LINE]
 
 
 def _usable(found: RunResult, options: dict[str, object]) -> str:
@@ -95,9 +94,7 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
     if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
         return ""
     if not np.isfinite(plan.optimality):
-        return (
-            "the plan can be used, for it keeps dynamics, limits and constraints; how far the optimum is is not known"
-        )
+        return "the plan can be used, for it keeps dynamics, limits and constraints; whether it is optimal is unknown"
     if plan.optimality > FAR:
         return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
     wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""
@@ -147,8 +144,8 @@ def _flat_controls(problem: Problem, found: RunResult) -> list[str]:
     return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 
-def _copied(value: Any) -> Any:
-    """A copy of a value function."""
+def copy_of(value: Any) -> Any:
+    """A copy of a value function; None for None."""
     if value is None:
         return None
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))

@@ -19,7 +19,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG, Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
-from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
+from lqrsim.problem.costs import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Multipliers, Status
 from lqrsim.results.value_functions import Moments
@@ -100,8 +100,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     problem, budget = run.problem, run.budget
     if not (run.settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
         return run, found
-    costs = [cost.weighing(0.0) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
-    plain = problem.with_costs(stage_cost=CostSum(tuple(costs)))
+    plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
     without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
     with budget.without_costs():
         kept = without.solve()

@@ -50,16 +50,13 @@ def certified(
       claimed: the last cost in the log; None if the solver does not claim success.
       tolerance: tolerance of the optimality; None if only the cost was tested.
     """
-    numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
-
-    def none() -> CostToGo:
-        return CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
-
-    if value is None and problem.noise_term is not None:  # the cost of noise is weighed by the policy's own cost-to-go
-        work(declarations.EVALUATE, none(), numbers)
-    else:
-        parts = () if value is None else (value.hessian, value.gradient, np.asarray(value.constant))
-        work(declarations.CERTIFY, CostToGo(*map(in_c_order, parts)) if parts else none(), numbers)
+    numbers = np.zeros(1, CERTIFICATE)
+    to_go = no_value(states)
+    if value is not None:
+        to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
+    # Without a cost-to-go, the cost of noise is weighed by the policy's own.
+    weighed = value is None and problem.noise_term is not None
+    work(declarations.EVALUATE if weighed else declarations.CERTIFY, to_go, numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
@@ -68,11 +65,17 @@ def certified(
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
         own = np.zeros(1, CERTIFICATE)
-        work(declarations.EVALUATE, none(), own)
+        work(declarations.EVALUATE, no_value(states), own)
         optimality = certificate_of(problem, own[0], states, violation=violation).optimality
         certificate = replace(certificate, optimality=optimality)
     rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
+
+
+def no_value(states: Array) -> CostToGo:
+    """An empty cost-to-go along states (T+1, n)."""
+    knots, n = states.shape
+    return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:

@@ -36,7 +36,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Mul
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
-from lqrsim.solvers.certify import certified
+from lqrsim.solvers.certify import certified, no_value
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings
 
@@ -551,7 +551,7 @@ class SolveRun:
 
     def _expected_cost(self, found: RunResult) -> float:
         """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
-        out, none = np.zeros(1, CERTIFICATE), _no_value(found.states)
+        out, none = np.zeros(1, CERTIFICATE), no_value(found.states)
         task, first, last, options, _, *rest = self._check_arguments(declarations.EVALUATE, found, none, out)
         self._loop(task, first, last, options, self._without_penalties(), *rest)
         return float(out[0]["cost"])
@@ -574,7 +574,7 @@ class SolveRun:
         term, arrays = self.problem.noise_term, self.work.arrays
         if term is None or not (term.active or self.problem.risk):
             return
-        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), _no_value(plan.states)
+        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), no_value(plan.states)
         task, first, last, options, _, *_ = self._plan_arguments(declarations.LINEARIZE, 0, 0, rows)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
@@ -648,12 +648,6 @@ class SolveRun:
 
     def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
-
-
-def _no_value(states: Array) -> CostToGo:
-    """An empty cost-to-go along states (T+1, n)."""
-    knots, n = states.shape
-    return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
 class Workspace:

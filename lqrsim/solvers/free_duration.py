@@ -93,8 +93,8 @@ def solve_for_duration(
         ordinary, found = best
         m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
         guess = InitialGuess(
-            np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
-            f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
+            np.zeros((ordinary.steps, m, n)), found.plan.controls, f"a plan of {ordinary.steps * ordinary.dt:.6g} s",
+            found=found, log=tuple(log),
         )  # fmt: skip
         chosen = solved(ordinary, replace(settings, start=guess, starts=None))  # its log begins with the search's
         return stop.finish(_described(chosen, problem, total))

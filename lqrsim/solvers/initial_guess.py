@@ -113,9 +113,9 @@ class InitialGuess:
 
     Attributes:
       gain, offset: (T, m, n) and (T, m), the policy to begin with.
+      summary: its entry in the options of a solution.
       cost_to_go: the cost-to-go, or None if unknown.
       trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
-      summary: its entry in the options of a solution.
       prior: added to the cost in the first iterations.
       multipliers: multipliers of the constraints; empty if unknown.
       found: a result that the interior point has already found, with the iterations in `log`; only finishing remains.
@@ -123,9 +123,9 @@ class InitialGuess:
 
     gain: Array
     offset: Array
-    cost_to_go: Quadratic | None
-    trajectory: Trajectory | None
-    summary: object
+    summary: object = ""
+    cost_to_go: Quadratic | None = None
+    trajectory: Trajectory | None = None
     prior: InitialPrior | None = None
     multipliers: tuple[Multipliers, ...] = ()
     found: "Found | None" = None
@@ -213,16 +213,16 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
         if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
             multipliers = ()  # they belong to other constraints
         summary = _summary(start, policy.gain, policy.offset)
-        return InitialGuess(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
+        return InitialGuess(policy.gain, policy.offset, summary, value, multipliers=multipliers)
     if isinstance(start, AffinePolicy):
         gain = check_array("start: gain", start.gain, (steps, m, n))
         offset = check_array("start: offset", start.offset, (steps, m))
-        return InitialGuess(gain, offset, None, None, _summary(start, gain, offset))
+        return InitialGuess(gain, offset, _summary(start, gain, offset))
     if isinstance(start, Trajectory):
         states = check_array("start: states", start.states, (steps + 1, n))
         controls = check_array("start: controls", start.controls, (steps, m))
         given = Trajectory(states, controls, problem.dt)
-        return InitialGuess(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
+        return InitialGuess(np.zeros((steps, m, n)), controls, _summary(start, states, controls), trajectory=given)
     wanted, given = problem.nominal_controls if start is None else start, None
     try:
         given = numbers_of("start", wanted)
@@ -235,7 +235,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
         ) from None
     controls = check_array("start", controls, (steps, m))
     summary = controls[0] if (controls == controls[0]).all() else controls
-    return InitialGuess(np.zeros((steps, m, n)), controls, None, None, summary.tolist())
+    return InitialGuess(np.zeros((steps, m, n)), controls, summary.tolist())
 
 
 def _summary(start: object, *arrays: Array) -> str:

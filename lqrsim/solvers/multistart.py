@@ -11,7 +11,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import StateBounds
-from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
+from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of, weighing_obstacles
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
@@ -152,13 +152,10 @@ def reweighted(problem: Problem, times: float) -> Problem:
     """
 
     def heavier(cost: Cost) -> Cost:
-        if isinstance(cost, ObstacleCost):
-            return cost.weighing(times * cost.weight)
         return QuadraticCost(times * cost.weight, about=cost.about) if isinstance(cost, QuadraticCost) else cost
 
-    stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
-    final = [heavier(cost) for cost in terms_of(problem.final_cost)]
-    return problem.with_costs(stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
+    stage, final = (weighing_obstacles(cost, times) for cost in (problem.stage_cost, problem.final_cost))
+    return problem.with_costs(stage_cost=stage, final_cost=CostSum(tuple(map(heavier, final.terms))))
 
 
 def sinusoidal_controls(problem: Problem, cycles: int) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.codegen.user_functions import UserFunction
-from lqrsim.errors import InputError, check_count, check_function, check_items, check_kind
+from lqrsim.errors import InputError, check_count, check_items, check_kind, check_progress
 from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, functions_of
 from lqrsim.problem.noise import Noise
@@ -32,7 +32,7 @@ def solve_all(
     progress: Callable[[int, int], object] | None,
 ) -> list[Solution]:
     """Solve each problem with `solve(problem, settings)`, on several threads; return the solutions in order."""
-    check_function("progress", progress, "a function of two numbers: solved, all", arguments=2)
+    check_progress(progress)
     threads = check_threads(threads)
     for i, problem in enumerate(problems):
         try:

@@ -18,7 +18,7 @@ from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajec
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
-from lqrsim.solvers.assembly import clearance_of, goal_radius_of
+from lqrsim.solvers.assembly import clearance_of, copy_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.constrained import Known, Ladder
@@ -98,7 +98,7 @@ class PreparedSolver:
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
         law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
-        guess, budget = InitialGuess(*law, None, None, ""), Budget(self.settings.max_iterations)
+        guess, budget = InitialGuess(*law), Budget(self.settings.max_iterations)
         run = SolveRun(self.problem, self.settings, guess, state, budget)
         run.roll_out()
         compiled.rollout(self.problem, *law, state)
@@ -204,9 +204,6 @@ class PreparedSolver:
     ) -> Replan:
         # The next solve overwrites this memory.
         states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
-        value = best.cost_to_go
-        if value is not None:
-            value = Quadratic(value.hessian.copy(), value.gradient.copy(), np.array(value.constant))
         policy = AffinePolicy(
             gain=gain, offset=offset, nominal=states[:-1].copy(), dt=problem.dt, state_coordinates=self._states,
             control_coordinates=self._controls,
@@ -214,7 +211,7 @@ class PreparedSolver:
         return Replan(
             status=found.status, detail=found.detail, improved=best.improved, policy=policy,
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
-            violation=best.violation, cost_to_go=value, multipliers=best.multipliers,
+            violation=best.violation, cost_to_go=copy_of(best.cost_to_go), multipliers=best.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
             seconds=time.perf_counter() - clock, iterating=iterating,
         )  # fmt: skip

@@ -16,6 +16,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     keep,
+    keep_positive,
 )
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
@@ -44,16 +45,11 @@ class Settings:
         if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # Plain Python numbers: NumPy's numbers are other types for the compiler, and JSON has no form for them.
-        self._check_positive("tolerance")
+        keep_positive(self, "tolerance")
         # A log of this length takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
         keep(self, max_iterations=most)
-        self._check_positive("time_limit")
-
-    def _check_positive(self, name: str) -> None:
-        """Check an option that is a positive number, or None for its default."""
-        if (value := getattr(self, name)) is not None:
-            keep(self, **{name: check_number(name, value, above=0.0)})
+        keep_positive(self, "time_limit")
 
     def options(self, start: InitialGuess) -> dict[str, object]:
         """The options that a solution records."""
@@ -76,7 +72,7 @@ class SmootherSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_positive("elastic")
+        keep_positive(self, "elastic")
         if self.finish is not None:
             check_name("finish", self.finish, ("newton",))
         if self.starts is not None:
@@ -84,8 +80,7 @@ class SmootherSettings(Settings):
             if self.starts > 1 and self.start is not None:
                 raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         keep(self, gap_tolerance=check_number("gap_tolerance", self.gap_tolerance, above=0.0))
-        self._check_positive("constraint_tolerance")
-        self._check_positive("penalty")
+        keep_positive(self, "constraint_tolerance", "penalty")
         if self.penalty is not None and self.start is None:
             raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
         check_name("form", self.form, tuple(compiled.FORMS))

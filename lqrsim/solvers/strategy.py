@@ -215,7 +215,7 @@ class Search:
     def widen(self) -> None:
         """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
         # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-        poor = self._says_infeasible or (self._default and self._is_unacceptable)
+        poor = self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
         if not (poor and self._may_go_on):
             return
         if pull(self._problem) > 0:
@@ -463,7 +463,7 @@ class Search:
             untried = "no time was left for other starts, which may keep the constraints"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
         elif self._cut_short and np.isfinite(found.cost):
-            untried = "no time was left for all that may make it better"
+            untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -553,21 +553,11 @@ class Search:
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
-    def _says_infeasible(self) -> bool:
-        """Whether the best result is INFEASIBLE, which other starts may disprove."""
-        return self._stuck and self.best[1].status is Status.INFEASIBLE
-
-    @property
     def _without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
 
-    @property
-    def _stuck(self) -> bool:
-        """Whether there is a plan whose violation is stationary, but none that satisfies the constraints."""
-        return bool(self._known.evidence) and not self.best[1].success
-
 
 def policy_of(found: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
-    return InitialGuess(found.law[0].copy(), found.law[1].copy(), None, None, summary)
+    return InitialGuess(found.law[0].copy(), found.law[1].copy(), summary)

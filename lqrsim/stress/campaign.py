@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
+from lqrsim.errors import InputError, check_count, check_kind, check_path, check_progress, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
@@ -52,9 +52,7 @@ from lqrsim.stress.policies import (
     solve,
 )
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign as Campaign
-from lqrsim.stress.specification import Cell as Cell
-from lqrsim.stress.specification import Shard
+from lqrsim.stress.specification import Campaign, Shard
 from lqrsim.stress.trials import Job
 from lqrsim.versions import changed, versions
 
@@ -117,7 +115,7 @@ def run_resolved(
     batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
-    check_function("progress", progress, "a function of the numbers of finished trials and of all trials", arguments=2)
+    check_progress(progress)
     given = None if solution is None else solving.given(scenario, solution)
     deterministic = _check_runnable(campaign, scenario, given)
     _check_folder(folder)

@@ -27,9 +27,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lqrsim.errors import InputError, excerpt
-from lqrsim.results.archive import Other, blamed, canonical, parse, sha256
+from lqrsim.results.archive import Other, blamed, canonical, parse, replacing, sha256
 from lqrsim.results.fields import Line, check_fields
-from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import Campaign, Cell, Shard
 

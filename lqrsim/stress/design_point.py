@@ -27,6 +27,7 @@ from lqrsim.errors import (
     check_count,
     check_function,
     check_memory,
+    check_progress,
     check_seed,
 )
 from lqrsim.process import keeping
@@ -94,7 +95,7 @@ def smallest_failure(
       KeyboardInterrupt: Ctrl-C; its `found` is the DesignPoint after the rounds that are done, if any.
     """
     check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     size = check_count("size", size)
     rounds = check_count("rounds", rounds, at_most=MOST)
     pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs, at_least=2)

@@ -195,16 +195,8 @@ def _worker_environment() -> Iterator[None]:
     glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
     if glfw is not None and sys.platform != "win32":  # on Windows it starts no process
         ours["PYGLFW_LIBRARY"] = glfw._name
-    before = {name: os.environ.get(name) for name in ours}
-    os.environ.update(ours)
-    try:
+    with process.environment(**ours):
         yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 @contextlib.contextmanager

@@ -27,14 +27,16 @@ from lqrsim.errors import (
     check_name,
     check_number,
     check_path,
+    check_progress,
     check_seed,
     check_text,
     keep,
+    keep_positive,
 )
 from lqrsim.machine import description
 from lqrsim.process import keeping
 from lqrsim.results import save_load
-from lqrsim.results.archive import sha256
+from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.certificate import FailureCertificate
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -103,9 +105,7 @@ class ReliabilityProblem:
         check_name("failure", self.failure, FAILURES)
         kinds = (Solution, str, os.PathLike, type(None))
         check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
-        for field in ("goal_radius", "goal_tolerance"):
-            if (value := getattr(self, field)) is not None:
-                keep(self, **{field: check_number(field, value, above=0.0)})
+        keep_positive(self, "goal_radius", "goal_tolerance")
 
     @cached_property
     def score(self) -> TrialScore:
@@ -272,7 +272,7 @@ class ReliabilityProblem:
     def _begin(self, report: Report | None, progress: Progress | None) -> TrialScore:
         """Check the callbacks, report the summary, and return the score."""
         check_function("report", report, "a function of a line of text", arguments=1)
-        check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+        check_progress(progress, text=True)
         if report is not None:
             report(self.summary())
         return self.score
@@ -497,5 +497,5 @@ def write_json(
         "stopped": stopped or None,
         "found": found,
     }
-    with save_load.replacing(folder / f"{name}.json") as unfinished:
+    with replacing(folder / f"{name}.json") as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")

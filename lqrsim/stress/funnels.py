@@ -14,11 +14,11 @@ from lqrsim.errors import (
     InputError,
     check_array,
     check_count,
-    check_function,
     check_items,
     check_kind,
     check_name,
     check_number,
+    check_progress,
     check_seed,
     check_symmetric,
     excerpt,
@@ -101,7 +101,7 @@ def funnel(
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     space, steps = solution.policy.state_coordinates, solution.trajectory.steps
     asked = FunnelOptions.of(space, steps, rate, confidence, knots, states, failures, largest, seed)
     blank = _blank(trials, asked, shape)

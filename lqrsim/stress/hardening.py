@@ -35,6 +35,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     check_path,
+    check_progress,
     check_seed,
 )
 from lqrsim.problem.problem import Problem
@@ -223,7 +224,7 @@ def harden(
     check_count("repetitions", repetitions, at_least=2)
     seed = check_seed("seed", seed)
     check_function("report", report, "a function of a line of text", arguments=1)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     options = {"rounds": rounds, "seed": seed, "particles": particles, "repetitions": repetitions}
     search, say = _Search(problem, chance, options), report or (lambda line: None)
     seeds, total = count(seed), 2 * rounds * repetitions

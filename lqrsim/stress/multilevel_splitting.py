@@ -27,7 +27,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_count, check_function, check_memory, check_number, check_seed, shaped
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_function,
+    check_memory,
+    check_number,
+    check_progress,
+    check_seed,
+    shaped,
+)
 from lqrsim.process import keeping
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate, rounded
 
@@ -139,7 +149,7 @@ def failure_probability(
     check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
     most_levels = check_count("most_levels", most_levels, at_most=MOST)
     check_function("level", level, "a function of a level", arguments=1)
-    check_function("progress", progress, "a function of how much is done, of how much, and a text", arguments=3)
+    check_progress(progress, text=True)
     counted = CountedScore(score)
     first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
     levels, step_sizes, batches = np.zeros(1), np.zeros(0), [1]

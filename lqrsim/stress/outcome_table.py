@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_shape, excerpt, keep, numbers_of, shaped
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
-from lqrsim.results.goal import OUTCOMES as OUTCOMES
+from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.solvers import compiled
 

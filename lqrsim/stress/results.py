@@ -13,6 +13,7 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
 from lqrsim.results import notebook, save_load
 from lqrsim.results.archive import sha256
+from lqrsim.results.goal import OUTCOMES
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
@@ -20,7 +21,7 @@ from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.analysis import Success, success
 from lqrsim.stress.campaign_files import GIVEN, Damaged, Table, cells_of, digest_of_solution, read, read_manifest
-from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
+from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard
 from lqrsim.stress.statistics import CONFIDENCE
 from lqrsim.stress.trials import Trials

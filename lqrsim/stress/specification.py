@@ -21,6 +21,7 @@ from lqrsim.errors import (
     check_text,
     excerpt,
     keep,
+    keep_positive,
 )
 from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
@@ -171,9 +172,7 @@ class Campaign:
                 f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which takes {files}"
                 f" files, want at most {_MOST_FILES}: fewer trials, or larger shards"
             )
-        for field in ("replan_every", "goal_radius", "goal_tolerance"):
-            if (value := getattr(self, field)) is not None:
-                keep(self, **{field: check_number(field, value, above=0.0)})
+        keep_positive(self, "replan_every", "goal_radius", "goal_tolerance")
         keep(self, time_limit=check_number("time_limit", self.time_limit, above=0.0))
 
     @property

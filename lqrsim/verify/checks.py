@@ -12,13 +12,14 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from mujoco import mjtGeom as Geom
 
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_progress
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
+from lqrsim.scenes.mjcf_joints import posed
+from lqrsim.verify.verdict import Criterion, Positions, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.overlays import RIM
@@ -31,7 +32,7 @@ Progress = Callable[[int, int], object]
 def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
     """Raises InputError unless the arguments are a solution and a function, or None."""
     check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
-    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
+    check_progress(progress)
 
 
 def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
@@ -65,19 +66,15 @@ def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
 
 def planned_positions(rollout: Rollout, times: Array) -> Array:
     """Planned positions (N, d)."""
-    return np.stack([np.interp(times, rollout.times, column) for column in rollout.planned_places.T], axis=1)
+    return positions_at(rollout.times, rollout.planned_places, times)
 
 
 def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
     """Positions (N, d) of the robot's body from the frames, which are denser than the states."""
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
-    data, body, places = mujoco.MjData(model), robot_body(model, rollout.body), []
-    for frame in rollout.frames[trial, good]:
-        data.qpos = frame
-        mujoco.mj_kinematics(model, data)
-        places.append(place_in(data, rollout, body).copy())
-    columns = rollout.of_world(places).T
-    return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
+    body = robot_body(model, rollout.body)
+    places = [place_in(data, rollout, body).copy() for data in posed(model, rollout.frames[trial, good])]
+    return positions_at(rollout.frame_times[good], rollout.of_world(places), times)
 
 
 def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
@@ -234,11 +231,7 @@ def _tracked_geom(model: mujoco.MjModel, body: int, place: Array | None = None) 
 
 def _corners(model: mujoco.MjModel, geom: int, frames: Array) -> Array:
     """The lowest and the highest corner (2, 3) of a box in the world that has a geom in it in all frames (N, nq)."""
-    data, places = mujoco.MjData(model), []
-    for frame in frames:
-        data.qpos = frame
-        mujoco.mj_kinematics(model, data)
-        places.append(data.geom_xpos[geom].copy())
+    places = [data.geom_xpos[geom].copy() for data in posed(model, frames)]
     reach = float(model.geom_rbound[geom])
     return np.stack([np.min(places, axis=0) - reach, np.max(places, axis=0) + reach])
 
@@ -248,12 +241,10 @@ def _thickness(model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[
 
     Also whether its edge is curved all round: that of a disc may be straight if it is not seen along its axis.
     """
-    data, angles, least = mujoco.MjData(model), np.linspace(0, np.pi, 60, endpoint=False), np.inf
+    angles, least = np.linspace(0, np.pi, 60, endpoint=False), np.inf
     kind, curved = Geom(model.geom_type[geom]), True
     across = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    for frame in frames:
-        data.qpos = frame
-        mujoco.mj_kinematics(model, data)
+    for data in posed(model, frames):
         for view in views:
             seen = across @ view.axes @ data.geom_xmat[geom].reshape(3, 3)  # unit vectors in the geom's axes
             reach = _reach(kind, model.geom_size[geom], seen)
@@ -283,12 +274,10 @@ def _silhouettes(
     model.geom_group[:], model.geom_group[geom] = 1, 0
     model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
     model.vis.global_.offwidth, model.vis.global_.offheight = size
-    data, options = mujoco.MjData(model), mujoco.MjvOption()
+    options = mujoco.MjvOption()
     options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
     with mujoco.Renderer(model, size[1], size[0]) as renderer:
-        for frame in frames:
-            data.qpos = frame
-            mujoco.mj_kinematics(model, data)
+        for data in posed(model, frames):
             mujoco.mj_camlight(model, data)
             masks = []
             for view in views:

@@ -42,10 +42,10 @@ def diagnose(
         moved = np.round(1e3 * offset).astype(int).tolist()
         candidates.append((error - offset, f"a camera is off: it moves the robot by {moved} mm"))
     if abs(late) > interval / 4:
-        shown = _positions_at(times, actual, times[numbers] + late)
+        shown = positions_at(times, actual, times[numbers] + late)
         candidates.append((where - shown, f"pictures show the run {_in_frames(late, interval)}"))
     if abs(ahead) > interval / 4 and split > FEW_FRAMES:  # otherwise the whole video is late or early
-        shown = _positions_at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
+        shown = positions_at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
         said = "left out" if ahead > 0 else "shown twice"
         said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(ahead, interval)}"
         candidates.append((where - shown, said))
@@ -83,7 +83,8 @@ def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
     return split, float(tails[0][split] / max(tails[1][split], 1e-12))
 
 
-def _positions_at(times: Array, places: Array, when: Array) -> Array:
+def positions_at(times: Array, places: Array, when: Array) -> Array:
+    """Places (N, d) at other times (k,), linearly between those at `times` (N,)."""
     return np.stack([np.interp(when, times, column) for column in places.T], axis=1)
 
 

@@ -22,10 +22,7 @@ Colour = tuple[float, float, float]
 # The mark by which a robot's position is read from a video: a green ball at the origin of its body, in front of a black
 # ball. Nothing else is pure green. The mark emits all of its light, so it looks the same in the sun and in the shade.
 MARK_RGB = (0.0, 1.0, 0.0)
-RIM = (
-    # Radius of the black ball, in radii of the green one: a video then blurs the same colour into the mark all around.
-    1.8
-)
+RIM = 1.8  # radius of the black ball, in radii of the green one: a video then blurs one colour into the whole edge
 PLAN_RGB = (0.78, 0.08, 0.42)  # colour of the plan; neither the error map nor a robot has it
 
 # Opacities for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a

@@ -18,10 +18,10 @@ import numpy as np
 from av.video.reformatter import Colorspace
 from PIL import Image
 
-from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
+from lqrsim.errors import InputError, check_name, check_number, check_path, check_progress, excerpt
+from lqrsim.results.archive import replacing
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.captions import Pixels
@@ -171,7 +171,7 @@ def render(
       InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
     """
     path = _checked_path(path, ".mp4", ".gif")
-    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
+    check_progress(progress)
     animated = path.suffix.lower() == ".gif"
     fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)

@@ -13,10 +13,9 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError, check_path
-from lqrsim.results.archive import sha256
+from lqrsim.results.archive import replacing, sha256
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.save_load import replacing
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, PLAN_RGB, TUBE, DrawnFunnel, of_funnel
 from lqrsim.view.recorded_trial import RecordedTrial

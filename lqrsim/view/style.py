@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from lqrsim.errors import InputError, check_path, excerpt
-from lqrsim.results.save_load import replacing
+from lqrsim.results.archive import replacing
 
 PLAN = "#222222"
 RUNS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # distinct for the colour-blind, and in grey by lightness

@@ -143,7 +143,7 @@ def compute(queries: int, trials: int, place: str) -> dict[str, list[Any]]:
             results = ls.stress.run_campaign(
                 ls.stress.Campaign(scenario=name, sweeps=sweeps, strengths=(0.5, 1.0), trials=trials), folder, workers=0
             )
-            cells = [vars(results.outcomes(cell)) for cell in results.campaign.cells]
+            cells = [results.outcomes(cell).columns() for cell in results.campaign.cells]
         lines[f"campaign {name}"] = [_table(cell, f"campaign {name}/{i}", arrays) for i, cell in enumerate(cells)]
     np.savez(Path(place) / "arrays.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return lines

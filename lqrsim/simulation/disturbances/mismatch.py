@@ -19,6 +19,7 @@ from mujoco import batch
 from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown, possible_unknowns
 from lqrsim.errors import Array, InputError, check_name, check_number, check_text, keep
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.scenes.mjcf_joints import placed
 from lqrsim.simulation.disturbances.actuation import check_gains
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
@@ -352,6 +353,5 @@ def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
 
 def upward(plant: Plant, children: npt.NDArray[np.intp]) -> Array:
     """The world's upward direction in the axes of each body's parent, (bodies, 3), in the model's initial pose."""
-    drawn = mujoco.MjData(plant.model)
-    mujoco.mj_kinematics(plant.model, drawn)
+    drawn = placed(plant.model)
     return drawn.xmat[plant.model.body_parentid[children]].reshape(-1, 3, 3)[:, 2]

@@ -31,9 +31,10 @@ from lqrsim.control.tubes import predict_tube
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import LONGEST, InputError
 from lqrsim.simulation.disturbances import MeasurementNoise
-from lqrsim.stress.campaign import Campaign, run_campaign
+from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.campaign_files import digest_of_rows
 from lqrsim.stress.results import Results
+from lqrsim.stress.specification import Campaign
 from lqrsim.view.recorded_trial import RecordedTrial
 from robustness import mutations
 from robustness.common import Config, Hang, limited
