@@ -18,7 +18,7 @@ from lqrsim.control.collision_chance import Surroundings, both_below, collision_
 from lqrsim.control.controllers import Feedback
 from lqrsim.control.linear_loop import LinearLoop, kernels
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import SampledLoop, sample_loop
+from lqrsim.control.sampled_loop import Counted, SampledLoop, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 from lqrsim.problem.collision_shape import KeepsClear, each_once
@@ -308,8 +308,8 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
         offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, np.full(1, -1e6), np.full(1, 1e6))
     moments, n = loop.moments(), loop.model.n
-    surroundings = Surroundings.of(system.problem, 0.0)
-    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, 20_000, 0)
+    surroundings, counted = Surroundings.of(system.problem, 0.0), Counted.of(system.solution, ())
+    found = sample_loop(loop.model, controller, (loop.low, loop.high), surroundings, counted, 20_000, 0)
     std = np.sqrt(np.diagonal(moments.covariance[:, :n, :n], axis1=1, axis2=2))
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), std, rtol=0.05)
     assert (np.abs(found.mean - moments.mean[:, :n]) < 5 * std / np.sqrt(20_000)).all()

@@ -102,7 +102,7 @@ class SafePlan:
         lines += [f"  {low:5.3f} to {high:5.3f}  {cost:10.6g}  {chance:.3g}" for low, high, cost, chance in self.rounds]
         verdict = "as asked" if self.success else "MORE than asked" if self.solution.success else "no solution"
         lines.append(f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})")
-        if (strays := 100 * self.tube.strays) > 100 * self.asked:
+        if (strays := 100 * (self.tube.strays or 0.0)) > 100 * self.asked:
             lines.append(f"  {strays:.3g} % of the trials leave the plan by over six standard deviations")
         if self.weight != 1:
             lines.append(

@@ -7,23 +7,48 @@ them are compared on the same trials.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv
 
-from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller, turn_to_nearest
 from lqrsim.control.plan_model import Lag, PlanModel
 from lqrsim.control.uncertainty import per_entry
 from lqrsim.errors import Array
+from lqrsim.results.goal import scale_of
+from lqrsim.results.solution import Solution
 
 # The weight of a predicted chance, as a number of collisions that is combined with the collisions of the trials. If the
 # trials have fewer, the prediction is the more precise of the two.
 PRIOR = 4.0
 REFUTED = 0.025  # a prediction is refuted if the trials' number of collisions has a tail probability below this
+
+
+class Counted(NamedTuple):
+    """The states in which a distance from the plan is measured: the position, or else what the goal asks for.
+
+    Attributes:
+      states: their indices. scale: (C,) what each is divided by: 1, or its range over the plan.
+    """
+
+    states: list[int]
+    scale: Array
+
+    @classmethod
+    def of(cls, solution: Solution, position: Sequence[int]) -> Self:
+        if position:
+            return cls(list(position), np.ones(len(position)))
+        counts = np.flatnonzero(np.isfinite(solution.target.state)).tolist()
+        return cls(counts, scale_of(solution.trajectory.states)[counts])
+
+    def distance(self, off: Array) -> Array:
+        """Of deviations (..., n)."""
+        return np.linalg.norm(off[..., self.states] / self.scale, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +61,7 @@ class SampledLoop:
       command: standard deviation of each command, (T, m). saturation: fraction of the commands at their limits, (T, m).
         Like the moments, they are over the trials whose states stay finite.
       collided: whether each trial collides at a knot, or its state is not finite, (K,).
-      farthest: largest distance of each trial from its plan in m, (K,).
+      farthest: largest distance of each trial from its plan, (K,), in m, or as `Counted` has it.
     """
 
     mean: Array
@@ -58,8 +83,8 @@ class SampledLoop:
 
 
 def sample_loop(
-    model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings, trials: int,
-    seed: int,
+    model: PlanModel, controller: Controller, limits: tuple[Array, Array], surroundings: Surroundings,
+    counted: Counted, trials: int, seed: int,
 ) -> SampledLoop:  # fmt: skip
     """Run K trials of a controller.
 
@@ -68,7 +93,7 @@ def sample_loop(
     """
     plan, n = model.plan, model.n
     robots, run = _Robots(model, limits, trials, np.random.default_rng(seed)), controller.start(trials)
-    displaced, place = surroundings.displacements(robots.rng, trials), list(surroundings.place)
+    displaced = surroundings.displacements(robots.rng, trials)
     collided, farthest = np.zeros(trials, dtype=bool), np.zeros(trials)
     states, commands = np.empty((plan.steps + 1, trials, n)), np.empty((plan.steps, trials, model.m))
     with np.errstate(over="ignore", invalid="ignore"):  # of lost trials
@@ -77,8 +102,8 @@ def sample_loop(
             finite = np.isfinite(states[t]).all(axis=1)
             collided |= ~finite
             collided[finite] |= surroundings.nearest(states[t, finite], [one[finite] for one in displaced]) < 0
-            off = states[t][:, place] - plan.states[t, place]
-            farthest = np.maximum(farthest, np.where(finite, np.linalg.norm(off, axis=1), np.inf))
+            off = counted.distance(states[t] - plan.states[t])
+            farthest = np.maximum(farthest, np.where(finite, off, np.inf))
             if t < plan.steps:
                 commands[t] = robots.advance(t, run.control(t, robots.measure(t)))
     stayed = np.isfinite(farthest)
@@ -105,7 +130,9 @@ class _Robots:
         self._shaken = per_entry("Uncertainty: control", told.control, model.dynamics.control_coordinates)
         self._roots = replace(model, uncertainty=replace(told, control=0.0)).process_root
         arrived = Lag.of(told.lag, plan.dt)
-        self._predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
+        predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
+        self._command = np.zeros((trials, model.m))
+        self._predict = model.compiled.lay_out("predict", trials, self._command, predictor, self.z)
         # Measurements and commands under way. The first measurement is repeated until it arrives. The plan's controls
         # are applied until the first command arrives.
         self._late_measured = deque[Array]()
@@ -139,7 +166,7 @@ class _Robots:
         self._late_commands.append(commands)
         lost = self.rng.random((self._trials, 1)) < told.command_loss
         self._applied = np.where(lost, self._applied, self._late_commands.popleft())
-        shaken = np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits)
-        model.compiled.predict(self._trials, in_c_order(shaken), self._predictor, self.z)
+        np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits, out=self._command)
+        self._predict()
         self.z += self._normal(model.size) @ self._roots[t].T
-        return shaken
+        return self._command

@@ -8,23 +8,26 @@ better predictions, but only with the linear model for which they are tuned.
 
 The linear model is wrong where controls are often at their limits. Saturation therefore also counts against a law. And
 it says nothing of dynamics that bend within the tube: a tight law can turn a sailboat into the wind, from where it does
-not return. A law must therefore bring the nonlinear model back from a few likely deviations.
+not return. A law must therefore bring the nonlinear model back from a few likely deviations. Nor does it say what the
+limits do to a law that works against a wrong parameter, so `track` also runs a few trials with unknowns that are drawn.
 
 If collisions are what makes a law fail, laws with an emphasis on the deviations that lead to them compete with it.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
+from lqrsim.control.controllers import Feedback
 from lqrsim.control.emphasis import emphasis_of
 from lqrsim.control.kalman import KalmanFilter
 from lqrsim.control.linear_loop import ClosedLoop, LinearLoop
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.sampled_loop import Counted, sample_loop
 from lqrsim.control.tracking_laws import AT_END, Averse, Laws, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_kind, check_number
@@ -52,8 +55,11 @@ NARROW = 0.02
 # is, the gentler the laws are, and the weaker their emphasis.
 FRAGILE = 5.0
 # The deviations from which a law must bring the model back: pairs drawn from the tube at this number of knots. It does
-# not if the model gets farther from the plan than LOST times the widest part of the tube.
+# not if the model gets farther from the plan than LOST times the widest part of the tube. The same counts for the
+# trials with unknowns that are drawn, which are run if more than LIMITED of the commands are beyond the limits.
 KNOTS, PAIRS, LOST = 3, 3, 6.0
+TRIALS, LIMITED = 100, 1e-3
+OPEN = Surroundings((), (), (), (), 0.0)
 
 
 class Predictions(NamedTuple):
@@ -66,7 +72,7 @@ class Predictions(NamedTuple):
 
 def choose_tolerances(
     problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
-    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments],
+    moments: Callable[[Laws, tuple[Array, Array]], LoopMoments], truth: PlanModel | None = None,
 ) -> tuple[Weights, Laws]:  # fmt: skip
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
@@ -75,7 +81,9 @@ def choose_tolerances(
       effort: largest change of each control, (m,).
       at_end: as in `track`.
       moments: predicts the states' moments under C laws and the limits of the controls.
+      truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
+    counted = Counted.of(solution, problem.dynamics.state_coordinates.position)
     tried, space = tolerances_to_try(model, effort, at_end, solution.target), solution.policy.control_coordinates
     limits = np.array(space.low), np.array(space.high)
     gain, offset = tracking_laws(model, tried)
@@ -85,7 +93,14 @@ def choose_tolerances(
     worth = worth_of(told, least)
 
     def lost(found: LoopMoments, laws: Laws, i: int) -> int:
-        return runs_lost(problem, solution, (laws[0][i], laws[1][i]), found.mean[i], found.covariance[i])
+        law = laws[0][i], laws[1][i]
+        limited = found.saturation[i].mean() > LIMITED
+        far = LOST * np.sqrt(_squares(counted, found.covariance[i]).max())
+        count = runs_lost(problem, solution, law, found.mean[i], found.covariance[i], counted, far)
+        if count or not limited or truth is None or not truth.uncertainty.unknowns:
+            return count
+        run = Feedback(_policy_of(solution, law))
+        return int((sample_loop(truth, run, limits, OPEN, counted, TRIALS, 0).farthest > far).sum())
 
     left = dict[int, int]()
     for best in sorted(range(len(worth)), key=lambda i: (worth[i], -i)):  # of equals the gentlest first
@@ -139,31 +154,37 @@ def predictions(
     surroundings, plan = Surroundings.of(problem, uncertainty.obstacles), model.plan.states
     mean, covariance = moments.mean, moments.covariance
     collide = collision_chance(plan + mean, covariance, moments.across, surroundings)[1]
-    counts, scale = _counted(solution, model.dynamics.state_coordinates.position)
-    squares = (np.diagonal(covariance, axis1=-2, axis2=-1)[..., counts] + mean[..., counts] ** 2) / scale**2
-    width = np.sqrt(squares.sum(axis=-1).mean(axis=-1))
+    counted = Counted.of(solution, model.dynamics.state_coordinates.position)
+    squares = _squares(counted, covariance) + counted.distance(mean) ** 2
+    width = np.sqrt(squares.mean(axis=-1))
     miss = _miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
     return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
 
 
-def runs_lost(problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array) -> int:
+def runs_lost(
+    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, counted: Counted, far: float
+) -> int:
     """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
 
-    The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n).
+    The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that gets
+    farther from the plan than `far` is lost.
     """
     plan, n, rng, lost = solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
     gain, offset = law_about(plan.states, plan.controls + law[1], law[0][..., :n])
-    counts, scale = _counted(solution, problem.dynamics.state_coordinates.position)
-    widest = np.sqrt((np.diagonal(covariance, axis1=1, axis2=2)[:, counts] / scale**2).sum(axis=1).max())
     for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
         variances, axes = np.linalg.eigh(covariance[t])
         off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
         for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
             states, _ = rollout(problem, gain[t:], offset[t:], start)
             with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
-                away = np.linalg.norm((states - plan.states[t:])[:, counts] / scale, axis=1)
-            lost += not (away <= LOST * widest).all()
+                away = counted.distance(states - plan.states[t:])
+            lost += not (away <= far).all()
     return lost
+
+
+def _squares(counted: Counted, covariance: Array) -> Array:
+    """The mean squared distance from the mean, by covariances (..., n, n)."""
+    return (np.diagonal(covariance, axis1=-2, axis2=-1)[..., counted.states] / counted.scale**2).sum(axis=-1)
 
 
 def narrowest(model: PlanModel, widths: Array) -> float:
@@ -192,14 +213,6 @@ def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
     """Replace numbers (..., n) by the rms over all states of the same unit."""
     same = np.array([[one == other for other in units] for one in units], dtype=np.float64)
     return np.sqrt(numbers**2 @ same / same.sum(axis=0))
-
-
-def _counted(solution: Solution, position: Sequence[int]) -> tuple[list[int], Array]:
-    """The states in which a tube is measured, and their scales: the position, or else what the goal asks for."""
-    if position:
-        return list(position), np.ones(len(position))
-    counts = np.flatnonzero(np.isfinite(solution.target.state)).tolist()
-    return counts, scale_of(solution.trajectory.states)[counts]
 
 
 def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
@@ -306,15 +319,21 @@ def track(
         def moments(laws: Laws, limits: tuple[Array, Array]) -> LoopMoments:
             return LinearLoop(truth, laws[0][..., : model.n], laws[1], None, *limits).moments(model.n)
 
-        _, (gain, offset) = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments)
-    gain = gain[..., : model.n]  # the command in force has no effect on a command that arrives
+        _, (gain, offset) = choose_tolerances(problem, solution, uncertainty, model, efforts, at_end, moments, truth)
+    return _policy_of(solution, (gain, offset))
+
+
+def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
+    """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
+    plan, (gain, offset), own = solution.trajectory, law, solution.policy
+    gain = gain[..., : plan.states.shape[1]]
     return AffinePolicy(
         gain=gain,
         offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
         nominal=plan.states[:-1].copy(),
         dt=plan.dt,
-        state_coordinates=dynamics.state_coordinates,
-        control_coordinates=solution.policy.control_coordinates,
+        state_coordinates=own.state_coordinates,
+        control_coordinates=own.control_coordinates,
     )
 
 

@@ -16,7 +16,7 @@ from lqrsim.control.controllers import ControllerLike, Feedback
 from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import SampledLoop, sample_loop
+from lqrsim.control.sampled_loop import Counted, SampledLoop, sample_loop
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind
@@ -55,7 +55,8 @@ class Tube:
         if it refutes the moments' chance, else both combined.
       samples: number of sampled trials.
       strays: fraction of the trials that get farther from the plan than six of the position's largest standard
-        deviations. The moments do not describe them.
+        deviations; without a position, of the states of the goal, each divided by its range over the plan. The moments
+        do not describe them. None without trials.
 
     Raises:
       InputError: arrays that do not fit together.
@@ -73,7 +74,7 @@ class Tube:
     linear_chance: Annotated[float, SHARE]
     collision_chance: Annotated[float, SHARE]
     samples: int = 0
-    strays: Annotated[float, SHARE] = 0.0
+    strays: Annotated[float, SHARE] | None = None
 
     __repr__ = repr_of
 
@@ -168,13 +169,15 @@ def predict_tube(
             f"predict_tube: samples: got 0 and a {' and a '.join(late)} control periods, which the moments do not have,"
             " want more than 0"
         )
-    trials = sample_loop(loop.model, law, (loop.low, loop.high), surroundings, samples, seed) if samples else None
-    return _tube(loop, None if late else loop.moments(), trials, surroundings)
+    counted, limits = Counted.of(solution, problem.dynamics.state_coordinates.position), (loop.low, loop.high)
+    trials = sample_loop(loop.model, law, limits, surroundings, counted, samples, seed) if samples else None
+    return _tube(loop, None if late else loop.moments(), trials, surroundings, counted)
 
 
 def _tube(
-    loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings
-) -> Tube:
+    loop: LinearLoop, moments: LoopMoments | None, trials: SampledLoop | None, surroundings: Surroundings,
+    counted: Counted,
+) -> Tube:  # fmt: skip
     """The tube by the moments, or else by the moments of the trials."""
     model, n, estimate = loop.model, loop.model.n, None
     if moments is not None and loop.filter_gain is not None:
@@ -187,9 +190,10 @@ def _tube(
     across = shown.across[:, :n, :n]
     chance, linear = collision_chance(model.plan.states + mean, covariance, across, surroundings)
     linear = float(linear)
-    place, strays = list(model.dynamics.state_coordinates.position), 0.0
-    if trials is not None and place:
-        widest = np.sqrt(max(np.linalg.eigvalsh(covariance[:, place][:, :, place]).max(), 0.0))
+    strays = None
+    if trials is not None:
+        own = covariance[:, counted.states][:, :, counted.states] / np.outer(counted.scale, counted.scale)
+        widest = np.sqrt(max(np.linalg.eigvalsh(own).max(), 0.0))
         strays = float((trials.farthest > STRAY * widest).mean())
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,

@@ -15,6 +15,7 @@ from lqrsim.results.coordinates import Coordinates
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 TOLERANCE = 0.1  # default tolerance of the scaled error
+NEAR = 4.0  # robot radii within which a start is so near its goal that the radius says little
 STAYS = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
 OF_RANGE = "of the plan's range"
 
@@ -139,12 +140,13 @@ class Target:
         return self.on_the_way(TOLERANCE) if radius is None and not self.places else radius
 
     def on_the_way(self, radius: float) -> float:
-        """The radius; if the plan starts within it, a tenth of the way, so that the start has not reached the target.
+        """The radius; if the plan starts near the target for it, a tenth of the way, so that the start is far from it.
 
-        A plan that starts at its target, within a thousandth of the radius, keeps the radius.
+        Near is within four radii in metres, for the radius of a robot with arms is their reach; else within one. A plan
+        that starts at its target, within a thousandth of the radius, keeps the radius.
         """
-        way = float(self.distance(self.plan[0]))
-        return TOLERANCE * way if STAYS * radius < way <= radius else radius
+        way, near = float(self.distance(self.plan[0])), NEAR * radius if self.places else radius
+        return TOLERANCE * way if STAYS * radius < way <= near else radius
 
     def describe(self, distance: float) -> str:
         """A distance as text: "0.1 m from the goal"."""

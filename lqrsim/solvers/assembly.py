@@ -154,7 +154,7 @@ def copy_of(value: Any) -> Any:
 def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:
     """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position.
 
-    For a plan (T+1, n) that starts within the radius, it is a tenth of the way.
+    For a plan (T+1, n) that starts near the goal, it is less; see `Target.on_the_way`.
     """
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
