@@ -166,7 +166,7 @@ def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tm
 
 
 HAND = """<mujoco model="hand">{asset}<worldbody><body name="hand" pos=".5 0 0">
-  <joint name="grip" range="-40 40"/><geom size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
+  <joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
 </body></worldbody><actuator><position name="grip" joint="grip" kp="3"/></actuator></mujoco>"""
 TETRA = "v 0 0 0\nv {0} 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -176,7 +176,7 @@ TETRA = "v 0 0 0\nv {0} 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 
 def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monkeypatch):
     """As MuJoCo finds it by the path of the file, wherever the process runs, and whatever lies there."""
     asset = '<asset><mesh name="claw" file="claw.obj"/></asset>' if meshed else ""
-    geom = '<geom type="mesh" mesh="claw" mass="1"/>' if meshed else ""
+    geom = '<geom name="claw" type="mesh" mesh="claw" mass="1"/>' if meshed else ""
     for folder, size, length in ((tmp_path / "robot", 0.1, 0.1), (tmp_path / "elsewhere", 0.2, 0.3)):
         for own in (folder, folder / "parts"):
             own.mkdir(parents=True, exist_ok=True)
@@ -192,6 +192,22 @@ def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monk
     assert model.nq == 2
     for field in ("body_mass", "body_inertia", "body_pos", "geom_size", "jnt_range", "actuator_gainprm", "site_pos"):
         np.testing.assert_array_equal(getattr(model, field), getattr(wanted, field), err_msg=field)
+
+
+@pytest.mark.parametrize("unnamed", ["body", "joint", "geom", "position"])
+def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
+    """A state or control without a name of its own could not be told from another."""
+    hand = HAND.format(asset="", geom='<body name="tip"><geom name="nail" size=".1"/></body>', size=0.1)
+    name = {"body": ' name="tip"', "joint": ' name="grip"', "geom": ' name="nail"', "position": ' name="grip"'}[unnamed]
+    hand = hand.replace(f"<{unnamed}{name}", f"<{unnamed}").replace(' joint="grip"', ' site="tip"')
+    (tmp_path / "hand.xml").write_text(hand)
+    path = tmp_path / "arm.xml"
+    path.write_text("""<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody><body name="arm">
+      <joint name="turn"/><geom size=".1"/><attach model="hand" body="hand" prefix="left_"/>
+    </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
+    kind = "actuator" if unnamed == "position" else unnamed
+    with pytest.raises(InputError, match=f"attached model whose {kind} .* has no name"):
+        MjcfRobot(path)
 
 
 @pytest.mark.parametrize(

@@ -111,6 +111,19 @@ def named(xml: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+def check_attached(xml: str, model: mujoco.MjModel, what: str) -> None:
+    """Raises InputError if a model that the MJCF attaches has elements without a name, which its text cannot name."""
+    if "<attach" not in xml:
+        return
+    for kind, count in (("body", model.nbody), ("joint", model.njnt), ("geom", model.ngeom), ("actuator", model.nu)):
+        for number in range(count):
+            if not getattr(model, kind)(number).name:
+                raise InputError(
+                    f"{what}: got an attached model whose {kind} {number}, counted from 0, has no name, want names of"
+                    " its bodies, joints, geoms and actuators in its own file"
+                )
+
+
 def lit(xml: str, model: mujoco.MjModel) -> str:
     """An MJCF with a light named overview added if it has none.
 
