@@ -123,7 +123,8 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
       name_or_path: a name in models/, or the path of an MJCF file.
       obstacles: the geoms fixed to the world that are obstacles: all that can collide; none, with False; names of
         geoms, or of bodies for all of their geoms; or a function that says whether a geom, as from
-        `model.geom(number)`, is an obstacle.
+        `model.geom(number)`, is an obstacle. In runs the robot passes through geoms that are left out, except ground
+        and what it stands on; an `MjcfRobot` does not, because its plans have their contacts.
 
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
