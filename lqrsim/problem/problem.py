@@ -25,7 +25,16 @@ from lqrsim.errors import (
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
-from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, in_system, terms_of
+from lqrsim.problem.costs import (
+    ControlCost,
+    Cost,
+    CostTerm,
+    ObstacleCost,
+    QuadraticCost,
+    bound_at,
+    in_system,
+    terms_of,
+)
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
@@ -184,7 +193,7 @@ class Problem:
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
         return tuple(
-            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
+            check_kind(f"{type(cost).__name__}.bind", bound_at(cost, self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
         )
 
