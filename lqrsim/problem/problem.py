@@ -480,7 +480,8 @@ class Problem:
 
         Returns:
           Name of a constraint -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in
-          seconds; zeros for a trial without one. Only constraints that some trial violates.
+          seconds; zeros for a trial without one. Only constraints that some trial violates. If several have the same
+          name, the largest violation of all of them.
 
         Raises:
           InputError: the runs have other states, controls or steps.
@@ -496,7 +497,8 @@ class Problem:
             if not isinstance(constraint, KeepsClear):
                 runs = rollout.states, rollout.applied, rollout.counts
                 for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
-                    found[name] = np.stack([by, rollout.times[knots]], axis=1)
+                    own = np.stack([by, rollout.times[knots]], axis=1)
+                    found[name] = np.where(by[:, None] > found[name][:, :1], own, found[name]) if name in found else own
         return found
 
     @property
