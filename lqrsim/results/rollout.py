@@ -105,6 +105,7 @@ class Rollout:
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
       balls: positions of the robot's balls, if it has balls and frames were recorded; else None.
+      obstacle_geoms: (obstacles,) numbers of the geoms of `model` that are displaced by `displaced`; None if unknown.
       controller_run: the controller's run (`ControllerRun`) with its records: the estimates of an `OffsetFree`, the log
         of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
@@ -143,6 +144,7 @@ class Rollout:
     tube: Annotated[Array, "T+1 p p", Bounds()] | None = None
     collision_chance: Annotated[Array, "T+1", Bounds(at_least=0.0, at_most=1.0)] | None = None
     balls: BallRecord | None = None
+    obstacle_geoms: Annotated[npt.NDArray[np.int64], "obstacles", Bounds(at_least=0)] | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -40,7 +40,12 @@ FORMATS: dict[type, tuple[str, int]] = {
 }
 VERSIONS = dict(FORMATS.values())
 # Fields that older files of the same version lack.
-LATER = {(Certificate, "contacts"), (FailureCertificate, "keep"), (Solution, "problem_parts")}
+LATER = {
+    (Certificate, "contacts"),
+    (FailureCertificate, "keep"),
+    (Rollout, "obstacle_geoms"),
+    (Solution, "problem_parts"),
+}
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:

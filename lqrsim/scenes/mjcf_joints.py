@@ -375,6 +375,16 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
     return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
 
 
+def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vectors: Array) -> Array:
+    """Vectors (..., k, 3) along the world's axes, each in the axes of the body of its geom (k,), at rest."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    axes = data.xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
+    # By elements, so that the bits of one do not depend on how many others there are.
+    x, y, z = (vectors[..., i, None] * axes[:, i] for i in range(3))
+    return x + y + z
+
+
 def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
     """The body of a site, and the site's position (3,) and axes (3, 3) in the body's axes."""
     return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])

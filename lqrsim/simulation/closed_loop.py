@@ -325,6 +325,7 @@ class ClosedLoop:
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
+            obstacle_geoms=plant.obstacle_geoms,
             controller_run=self.controller_run,
         )
 

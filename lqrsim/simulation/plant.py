@@ -273,6 +273,12 @@ class Plant:
             found[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
         return found
 
+    @property
+    def obstacle_geoms(self) -> npt.NDArray[np.int64]:
+        """Ids of the geoms of the obstacles in `world`, (obstacles,)."""
+        ids = {name: geom for geom, name in self._scenery()}
+        return np.array([ids[name] for name in self.world.names], dtype=np.int64)
+
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation; `set_const` must follow.
 
@@ -280,11 +286,8 @@ class Plant:
           simulations: K of them.
           displaced: (K, obstacles, 3), in metres along the world's axes.
         """
-        places, drawn = simulations.expand("geom_pos"), mujoco.MjData(self.model)
-        mujoco.mj_kinematics(self.model, drawn)
-        for number, name in enumerate(self.world.names):
-            geom = self.model.geom(name)
-            places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
+        geoms = self.obstacle_geoms
+        simulations.expand("geom_pos")[:, geoms] += mjcf_joints.in_axes_of_bodies(self.model, geoms, displaced)
 
     def _scenery(self) -> list[tuple[int, str]]:
         """The ids and names of the scene's obstacles."""
