@@ -17,7 +17,7 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
-from lqrsim.view import gl, video_metadata
+from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, Overlay
 from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
@@ -84,6 +84,39 @@ def test_pictures_have_the_obstacles_where_they_were_in_the_trial(kind: str, see
             mujoco.mj_kinematics(model, data)
             near = min(mujoco.mj_geomDistance(model, data, cart, geom, 9.0, None) for geom in solid)
             np.testing.assert_allclose(near, run.clearance[k, knot], rtol=0, atol=1e-6)
+
+
+@draws
+@pytest.mark.parametrize(
+    ("kind", "size", "area"),
+    [
+        ("sphere", (0.2, 0, 0), np.pi * 0.04),
+        ("cylinder", (0.1, 0.3, 0), np.pi * 0.01),  # upright, seen from above
+        ("box", (0.2, 0.1, 0.05), 0.08),
+        ("capsule", (0.1, 0.2, 0), np.pi * 0.01),
+    ],
+)
+def test_obstacles_that_move_are_drawn_where_they_are(
+    kind: str, size: tuple[float, float, float], area: float, drive_solution: ls.Solution, tmp_path: Path
+) -> None:
+    """By the pixels that they change in an orthographic picture, also after saving and loading."""
+    begin, velocity = np.array([1.4, -2.4, 0.4]), np.array([-0.02, 0.03, 0.0])
+    moving = ls.World([ls.Obstacle("it", kind, begin, np.eye(3), np.array(size), velocity)])
+    plant = ls.scenarios.differential_drive().plant()
+    run = ls.simulate(plant, drive_solution, moving=moving, contacts=False)
+    run = ls.load(ls.save(run, tmp_path / "run.npz"), ls.Rollout)
+    camera = cameras.top(run)
+    options: dict = {"camera": "top", "overlays": (), "size": (640, 480), "quality": "draft"}
+    for time in (0.0, 5.0):
+        both = [
+            pixels(render_still(one, tmp_path / "still.png", time=time, **options))
+            for one in (run, dataclasses.replace(run, moving=None))
+        ]
+        rows, columns = np.nonzero(np.abs(both[0] - both[1]).max(axis=2) > 3)
+        seen = np.array([columns.mean(), rows.mean()]) + 0.5
+        wanted = camera.project(begin + time * velocity, (640, 480))
+        np.testing.assert_allclose(seen, wanted, atol=1.0)
+        assert abs(len(rows) * (camera.height / 480) ** 2 / area - 1) < 0.1
 
 
 @draws

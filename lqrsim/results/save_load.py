@@ -43,6 +43,7 @@ VERSIONS = dict(FORMATS.values())
 LATER = {
     (Certificate, "contacts"),
     (FailureCertificate, "keep"),
+    (Rollout, "moving"),
     (Rollout, "obstacle_geoms"),
     (Solution, "problem_parts"),
 }
