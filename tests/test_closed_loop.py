@@ -492,3 +492,20 @@ def test_what_a_choice_of_obstacles_leaves_out_still_carries_other_bodies(tmp_pa
     assert run.states[0, :, 2].max() > 0.9  # through the shelf
     crate = plant.model.joint(plant.model.body("crate").jntadr[0]).qposadr[0] + 2
     np.testing.assert_allclose(run.frames[0, :, crate], -0.7, atol=0.01)
+
+
+@pytest.mark.parametrize("impulse", [2.0, 3.0])
+@pytest.mark.parametrize("attributes", ["", 'condim="1"', 'solref="0.002 1"'])
+def test_a_pair_of_the_mjcf_is_no_wall_without_contacts(attributes, impulse, tmp_path):
+    """The robot passes through, at the same time and to the same depth, as where contype and conaffinity collide."""
+    runs = []
+    for pair in ("", f'<contact><pair geom1="quadrotor_sphere" geom2="shelf" {attributes}/></contact>'):
+        path = tmp_path / "room.xml"
+        path.write_text(f"""<mujoco><include file="quadrotor.xml"/><worldbody>
+          <geom name="shelf" type="box" size=".5 .5 .1" pos="0 0 .9"/></worldbody>{pair}</mujoco>""")
+        plant, push = Plant(Quadrotor(), load_scene(path)), Push((0.0, 0.0, impulse), at=0.0)
+        runs.append(simulate(plant, hover(), disturbances=[push], contacts=False))
+    assert runs[0].outcome == ("collided",)
+    assert runs[0].obstacles == runs[1].obstacles
+    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(runs[1].collided_at, runs[0].collided_at, atol=plant.timestep)

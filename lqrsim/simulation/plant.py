@@ -187,10 +187,14 @@ class Plant:
     def enclosed(self) -> bool:
         """Whether all colliding parts of the robot are within its radius, so that no part touches an obstacle earlier.
 
-        For balls and geoms this is not known.
+        For balls and geoms this is not known. A `<pair>` with an obstacle collides whatever their contype, so that its
+        contacts have to be sensed, too.
         """
         if not self.obstacles or "radius" not in self.robot.shape:
             return not self.obstacles
+        geoms = [self.model.geom(name).id for name in self.obstacles]
+        if np.isin([self.model.pair_geom1, self.model.pair_geom2], geoms).any():
+            return False
         return len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9)
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
