@@ -24,7 +24,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
-from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.campaign import run_campaign, run_resolved
 from lqrsim.stress.campaign_files import Damaged, unpack
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.specification import Campaign, Cell
@@ -524,6 +524,35 @@ def test_another_campaign_is_refused(reference: Results, changes: dict[str, obje
         run_campaign(replace(CAMPAIGN, **changes), reference.folder)  # pyright: ignore[reportArgumentType]
     assert says in str(refused.value)
     assert files(reference.folder) == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda one: replace(one, goal_radius=0.1),
+        lambda one: replace(one, robot=replace(one.robot, radius=0.25)),
+        lambda one: replace(one, robot=replace(one.robot, drag=0.3)),
+        lambda one: replace(one, robot=replace(one.robot, max_force=1.5)),
+        lambda one: replace(one, scene=ls.load_scene("cage", obstacles=["wall_east"])),
+    ],
+    ids=["goal", "radius", "drag", "limits", "obstacles"],
+)
+def test_a_scenario_whose_runs_differ_is_refused(
+    reference: Results, quadrotor: ls.Scenario, change: Callable[[ls.Scenario], ls.Scenario]
+) -> None:
+    """A function may return another scenario each time. Here the MJCF, the problem and the plans are the same."""
+    other, strong = change(quadrotor), (ls.disturbances.MeanWind((3.0, 0.0, 0.0)), ControlNoise(0.5))
+    options = {"workers": 0, "batch": 1, "solution": None, "scheduler": None, "progress": None}
+    run_resolved(CAMPAIGN, quadrotor, reference.folder, **options)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="robot, MJCF, choice of obstacles, simulator or goal radius"):
+        run_resolved(CAMPAIGN, other, reference.folder, **options)  # pyright: ignore[reportArgumentType]
+    plan, near = reference.solution("smooth"), (quadrotor.near_enough(), other.near_enough())
+    one, two = (
+        ls.simulate(scenario.plant(), plan, disturbances=strong, frames=False, **radius)
+        for scenario, radius in zip((quadrotor, other), near, strict=True)
+    )
+    same = one.goal_radius == two.goal_radius and np.array_equal(one.clearance, two.clearance)
+    assert not (same and np.array_equal(one.applied, two.applied))
 
 
 def test_code_of_ones_own_that_has_changed_is_refused(own: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -21,9 +22,9 @@ from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenes.scene import load_scene
+from lqrsim.scenes.scene import load_scene, scene_from_xml
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise
+from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.run_settings import RunSettings
 
@@ -446,3 +447,65 @@ def test_a_saved_policy_runs_as_the_one_that_was_saved(
     loaded = save_load.load(save_load.save(drive_solution, tmp_path / "solution.npz"), Solution)
     runs = [simulate(differential_drive.plant(), solution) for solution in (drive_solution, loaded)]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)
+
+
+OUT_OF_THE_ARENA = track(DifferentialDrive(), (0.9, -2.5, np.pi), np.full((60, 2), 0.45), 1 / 6, feedback=False)
+
+
+@pytest.mark.parametrize("chosen", [False, True], ids=["none", "one"])
+@pytest.mark.parametrize(
+    ("robot", "name", "one", "plan", "pushed"),
+    [
+        (Quadrotor(), "cage", "wall_south", hover(), (3.0, 0.5, 0.2)),
+        (DifferentialDrive(), "arena", "pillar_4", OUT_OF_THE_ARENA, (0.0, 5.0, 0.0)),
+    ],
+    ids=["cage", "arena"],
+)
+def test_the_robot_passes_through_what_a_choice_of_obstacles_leaves_out(robot, name, one, plan, pushed, chosen):
+    """As through nothing: the same runs as where these geoms are deleted. It still stands on its floor."""
+    choice, whole = (one,) if chosen else False, load_scene(name)
+    root = ElementTree.fromstring(whole.xml)
+    for parent in list(root.iter()):
+        for geom in parent.findall("geom"):
+            if geom.get("name") in {*whole.world.names} - {"floor", *(choice or ())}:
+                parent.remove(geom)
+    bare = scene_from_xml(ElementTree.tostring(root, encoding="unicode"), name, obstacles=choice)
+    push = Push(pushed, at=0.5)
+    run, wanted = (
+        simulate(Plant(robot, scene), plan, disturbances=[push]) for scene in (load_scene(name, obstacles=choice), bare)
+    )
+    np.testing.assert_allclose(run.states, wanted.states, rtol=0, atol=1e-9)
+    assert Plant(robot, whole).clearance(run.states).min() < -0.1  # it went through something
+    assert run.outcome == wanted.outcome
+    assert (run.collided_at == wanted.collided_at).all()
+
+
+def test_what_a_choice_of_obstacles_leaves_out_still_carries_other_bodies(tmp_path):
+    path = tmp_path / "room.xml"
+    path.write_text("""<mujoco><include file="quadrotor.xml"/><worldbody>
+      <geom name="table" type="box" size=".3 .3 .1" pos="0 0 -.9"/>
+      <geom name="shelf" type="box" size=".1 .1 .1" pos="0 0 .9"/>
+      <body name="crate" pos="0 0 -.7"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>
+    </worldbody><contact><pair geom1="quadrotor_sphere" geom2="shelf"/></contact></mujoco>""")
+    plant, plan = Plant(Quadrotor(), load_scene(path, obstacles=False)), hover()
+    run = simulate(plant, plan, disturbances=[Push((0.0, 0.0, 3.0), at=0.0)])
+    assert run.states[0, :, 2].max() > 0.9  # through the shelf
+    crate = plant.model.joint(plant.model.body("crate").jntadr[0]).qposadr[0] + 2
+    np.testing.assert_allclose(run.frames[0, :, crate], -0.7, atol=0.01)
+
+
+@pytest.mark.parametrize("impulse", [2.0, 3.0])
+@pytest.mark.parametrize("attributes", ["", 'condim="1"', 'solref="0.002 1"'])
+def test_a_pair_of_the_mjcf_is_no_wall_without_contacts(attributes, impulse, tmp_path):
+    """The robot passes through, at the same time and to the same depth, as where contype and conaffinity collide."""
+    runs = []
+    for pair in ("", f'<contact><pair geom1="quadrotor_sphere" geom2="shelf" {attributes}/></contact>'):
+        path = tmp_path / "room.xml"
+        path.write_text(f"""<mujoco><include file="quadrotor.xml"/><worldbody>
+          <geom name="shelf" type="box" size=".5 .5 .1" pos="0 0 .9"/></worldbody>{pair}</mujoco>""")
+        plant, push = Plant(Quadrotor(), load_scene(path)), Push((0.0, 0.0, impulse), at=0.0)
+        runs.append(simulate(plant, hover(), disturbances=[push], contacts=False))
+    assert runs[0].outcome == ("collided",)
+    assert runs[0].obstacles == runs[1].obstacles
+    np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(runs[1].collided_at, runs[0].collided_at, atol=plant.timestep)

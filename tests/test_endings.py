@@ -622,6 +622,19 @@ def test_what_runs_violate_is_named_though_they_reach_the_goal(
         replace(problem, steps=problem.steps + 1).violations(run)
 
 
+@pytest.mark.parametrize("lows", [(0.3, 0.1), (0.1, 0.3), (0.1, 0.3, 0.2)])
+def test_of_constraints_with_the_same_name_the_largest_violation_counts(
+    lows: tuple[float, ...], quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
+) -> None:
+    """Formulas are named after their functions, and functions may have the same name."""
+    run = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.3)], trials=3, seed=4)
+    constraints = [ls.SymbolicConstraint(lambda x, u, p, low=low: [low - x[3] ** 2]) for low in lows]
+    (found,) = replace(quadrotor.problem, constraints=constraints).violations(run).values()
+    by = np.where(run.counts[:, 1:], run.states[:, 1:, 3] ** 2 - min(lows), 0.0)
+    np.testing.assert_allclose(found[:, 0], by.max(axis=1), rtol=1e-12)
+    np.testing.assert_array_equal(found[:, 1], run.times[1 + by.argmax(axis=1)])
+
+
 def test_a_scenario_without_disturbances_is_told_of_presets() -> None:
     bare = replace(ls.scenarios.quadrotor(), disturbances=())
     with pytest.raises(ls.InputError, match=r"scenario quadrotor.* states none, want .* such as --sweep light"):

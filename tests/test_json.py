@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import past_a_crate
 import pytest
+from tracking import weave
 
 import lqrsim as ls
 from lqrsim.cli import _parse, main
@@ -100,6 +101,52 @@ def test_solve_and_simulate(printed: Any, tmp_path: Path) -> None:
     assert rollout.collision_chance is not None
     assert run["collision_chance"] == rollout.collision_chance.max()
     assert found["tube_leaves_out"] == ""
+
+
+BOUNDED = """
+import dataclasses
+
+import lqrsim as ls
+
+
+def bounded() -> ls.Scenario:
+    drive = ls.scenarios.differential_drive()
+    bounds = ls.StateBounds({"x": (-0.2, 0.3), "y": (-9.0, 2.0)})
+    return dataclasses.replace(drive, problem=dataclasses.replace(drive.problem, constraints=[bounds]))
+"""
+
+
+def test_violations_are_those_of_the_problem(printed: Any, drive_solution: ls.Solution, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(BOUNDED)
+    plan, own = ls.save(drive_solution, tmp_path / "plan.npz"), f"{tmp_path / 'own.py'}:bounded"
+    found = printed(
+        "simulate", str(plan), "--scenario", own, "--trials", "3", "--first-trial", "5", "--force-noise", "1"
+    )
+    rollout = ls.load(found["wrote"][0], ls.Rollout)
+    worst = {}
+    for name, by in {
+        "x": rollout.states[..., 0] - 0.3,
+        "-x": -0.2 - rollout.states[..., 0],
+        "y": rollout.states[..., 1] - 2,
+    }.items():
+        by = np.where(rollout.counts, by, 0.0)[:, 1:]
+        if (by > 1e-6).any():
+            k, t = np.unravel_index(by.argmax(), by.shape)
+            worst[name] = ((by > 1e-6).any(axis=1).sum(), 5 + k, by.max(), rollout.times[1 + t])
+    shown = [(one["trials"], one["trial"], one["most"], one["time"]) for one in found["violations"]]
+    np.testing.assert_allclose(sorted(shown), sorted(worst.values()), rtol=1e-12)
+    assert len(shown) > 1
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["packaged", "constrained"])
+def test_a_plan_of_another_horizon_is_run(own: bool, printed: Any, tmp_path: Path) -> None:
+    """Its costs and violations are those of no problem that is known."""
+    (tmp_path / "own.py").write_text(BOUNDED)
+    plan = ls.save(weave(60), tmp_path / "plan.npz")
+    scenario = f"{tmp_path / 'own.py'}:bounded" if own else "differential_drive"
+    found = printed("simulate", str(plan), "--scenario", scenario)
+    assert found["violations"] is None
+    assert [one["cost"] for one in found["run"]["trials"]] == [None]
 
 
 def test_not_converged_and_bad_input(printed: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

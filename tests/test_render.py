@@ -13,10 +13,11 @@ import pytest
 from funnels_by_hand import funnel_by_hand
 from PIL import Image, ImageSequence
 from sampling import rarely
+from tracking import hover, track
 
 import lqrsim as ls
-from lqrsim.disturbances import ControlNoise, Push
-from lqrsim.view import gl, video_metadata
+from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push
+from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, Overlay
 from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
@@ -51,6 +52,71 @@ def pixels(path: Path) -> np.ndarray:
 def decode(path: Path) -> list[np.ndarray]:
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+
+
+LOFT = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><light pos="0 0 3"/>
+  <body pos="0 0 .3" euler="20 40 60"><geom name="beam" type="box" size=".1 .2 .3" pos=".6 .1 0"/></body>
+  <geom name="cone" type="ellipsoid" size=".2 .1 .1" pos="-.5 .4 .1" euler="0 0 30"/>
+  <body name="cart"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+    <joint name="turn" axis="0 0 1"/><geom name="cart" type="box" size=".1 .05 .05" mass="1"/></body>
+</worldbody><actuator><motor joint="x"/><motor joint="y"/><motor joint="turn"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("kind", ["quadrotor", "mjcf"])
+def test_pictures_have_the_obstacles_where_they_were_in_the_trial(kind: str, seed: int, tmp_path: Path) -> None:
+    """MuJoCo's distances in the model that is drawn are the recorded clearance, also after saving and loading."""
+    if kind == "mjcf":
+        (tmp_path / "loft.xml").write_text(LOFT)
+        robot = ls.MjcfRobot(tmp_path / "loft.xml")
+        plant, own, plan = ls.Plant(robot, robot.scene), "cart", track(robot, np.zeros(6), np.full((20, 3), 0.3), 0.02)
+    else:
+        plant, own, plan = ls.scenarios.quadrotor().plant(), "quadrotor_sphere", hover(20)
+    run = ls.simulate(plant, plan, disturbances=[DisplacedObstacles(0.1)], trials=3, seed=seed, contacts=False)
+    run = ls.load(ls.save(run, tmp_path / "run.npz"), ls.Rollout)
+    assert run.obstacle_geoms is not None
+    for k in range(3):
+        model = RecordedTrial(run, k).model
+        data, cart = mujoco.MjData(model), model.geom(own).id
+        solid = [geom for geom in run.obstacle_geoms if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE.value]
+        for knot, row in enumerate(np.abs(run.frame_times - run.times[:, None]).argmin(axis=1)):
+            data.qpos[:] = run.frames[k, row]
+            mujoco.mj_kinematics(model, data)
+            near = min(mujoco.mj_geomDistance(model, data, cart, geom, 9.0, None) for geom in solid)
+            np.testing.assert_allclose(near, run.clearance[k, knot], rtol=0, atol=1e-6)
+
+
+@draws
+@pytest.mark.parametrize(
+    ("kind", "size", "area"),
+    [
+        ("sphere", (0.2, 0, 0), np.pi * 0.04),
+        ("cylinder", (0.1, 0.3, 0), np.pi * 0.01),  # upright, seen from above
+        ("box", (0.2, 0.1, 0.05), 0.08),
+        ("capsule", (0.1, 0.2, 0), np.pi * 0.01),
+    ],
+)
+def test_obstacles_that_move_are_drawn_where_they_are(
+    kind: str, size: tuple[float, float, float], area: float, drive_solution: ls.Solution, tmp_path: Path
+) -> None:
+    """By the pixels that they change in an orthographic picture, also after saving and loading."""
+    begin, velocity = np.array([1.4, -2.4, 0.4]), np.array([-0.02, 0.03, 0.0])
+    moving = ls.World([ls.Obstacle("it", kind, begin, np.eye(3), np.array(size), velocity)])
+    plant = ls.scenarios.differential_drive().plant()
+    run = ls.simulate(plant, drive_solution, moving=moving, contacts=False)
+    run = ls.load(ls.save(run, tmp_path / "run.npz"), ls.Rollout)
+    camera = cameras.top(run)
+    options: dict = {"camera": "top", "overlays": (), "size": (640, 480), "quality": "draft"}
+    for time in (0.0, 5.0):
+        both = [
+            pixels(render_still(one, tmp_path / "still.png", time=time, **options))
+            for one in (run, dataclasses.replace(run, moving=None))
+        ]
+        rows, columns = np.nonzero(np.abs(both[0] - both[1]).max(axis=2) > 3)
+        seen = np.array([columns.mean(), rows.mean()]) + 0.5
+        wanted = camera.project(begin + time * velocity, (640, 480))
+        np.testing.assert_allclose(seen, wanted, atol=1.0)
+        assert abs(len(rows) * (camera.height / 480) ** 2 / area - 1) < 0.1
 
 
 @draws

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lqrsim.errors import InputError
+from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenes.scene import MODELS, load_scene, names, scene_from_xml
 
 # method.md, section 4, in metres
@@ -162,6 +163,51 @@ def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tm
     scene = load_scene(path)
     assert scene.world.names == ("rock",)
     assert mujoco.MjModel.from_xml_string(scene.xml).body("quadrotor").mass[0] == 0.5
+
+
+HAND = """<mujoco model="hand">{asset}<worldbody><body name="hand" pos=".5 0 0">
+  <joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
+</body></worldbody><actuator><position name="grip" joint="grip" kp="3"/></actuator></mujoco>"""
+TETRA = "v 0 0 0\nv {0} 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.parametrize("where", ["hand.xml", "parts/hand.xml", "/hand.xml"], ids=["beside", "below", "absolute"])
+@pytest.mark.parametrize("meshed", [False, True], ids=["plain", "meshed"])
+def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monkeypatch):
+    """As MuJoCo finds it by the path of the file, wherever the process runs, and whatever lies there."""
+    asset = '<asset><mesh name="claw" file="claw.obj"/></asset>' if meshed else ""
+    geom = '<geom name="claw" type="mesh" mesh="claw" mass="1"/>' if meshed else ""
+    for folder, size, length in ((tmp_path / "robot", 0.1, 0.1), (tmp_path / "elsewhere", 0.2, 0.3)):
+        for own in (folder, folder / "parts"):
+            own.mkdir(parents=True, exist_ok=True)
+            (own / "hand.xml").write_text(HAND.format(asset=asset, geom=geom, size=size))
+            (own / "claw.obj").write_text(TETRA.format(length))
+    path = tmp_path / "robot" / "arm.xml"
+    name = str(tmp_path / "robot" / "hand.xml") if where.startswith("/") else where
+    path.write_text(f"""<mujoco><asset><model name="hand" file="{name}"/></asset><worldbody><body name="arm">
+      <joint name="turn"/><geom size=".1"/><frame pos="0 0 .2"><attach model="hand" body="hand" prefix="left_"/></frame>
+    </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    model, wanted = MjcfRobot(path).scene.model, mujoco.MjModel.from_xml_path(str(path))
+    assert model.nq == 2
+    for field in ("body_mass", "body_inertia", "body_pos", "geom_size", "jnt_range", "actuator_gainprm", "site_pos"):
+        np.testing.assert_array_equal(getattr(model, field), getattr(wanted, field), err_msg=field)
+
+
+@pytest.mark.parametrize("unnamed", ["body", "joint", "geom", "position"])
+def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
+    """A state or control without a name of its own could not be told from another."""
+    hand = HAND.format(asset="", geom='<body name="tip"><geom name="nail" size=".1"/></body>', size=0.1)
+    name = {"body": ' name="tip"', "joint": ' name="grip"', "geom": ' name="nail"', "position": ' name="grip"'}[unnamed]
+    hand = hand.replace(f"<{unnamed}{name}", f"<{unnamed}").replace(' joint="grip"', ' site="tip"')
+    (tmp_path / "hand.xml").write_text(hand)
+    path = tmp_path / "arm.xml"
+    path.write_text("""<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody><body name="arm">
+      <joint name="turn"/><geom size=".1"/><attach model="hand" body="hand" prefix="left_"/>
+    </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
+    kind = "actuator" if unnamed == "position" else unnamed
+    with pytest.raises(InputError, match=f"attached model whose {kind} .* has no name"):
+        MjcfRobot(path)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -19,6 +19,8 @@ from lqrsim.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from lqrsim.problem.problem import Problem
+    from lqrsim.results.rollout import Rollout
     from lqrsim.scenarios.packaged import Scenario
     from lqrsim.simulation.disturbances import Disturbance
     from lqrsim.solvers.initial_guess import StartLike
@@ -244,13 +246,14 @@ class Simulate:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
-        for name, found in scenario.problem.violations(rollout).items():
-            worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
-            by, when = found[worst].tolist()
+        violations = _violations(scenario.problem, rollout)
+        for one in violations or ():
             console.say(
-                f"{count} of {rollout.trials} trials violate a constraint, {name}, by up to {by:.3g} (trial"
-                f" {rollout.first_trial + worst} at {when:.2f} s); outcomes do not count this"
+                f"{one['trials']} of {rollout.trials} trials violate a constraint, {one['constraint']}, by up to"
+                f" {one['most']:.3g} (trial {one['trial']} at {one['time']:.2f} s); outcomes do not count this"
             )
+        if violations is None and scenario.problem.constraints:
+            console.say("whether trials violate constraints is not checked: the scenario has another horizon")
         tube, remark = tube_under(scenario.problem, solution, plant, disturbances, controller)
         if remark:
             console.say(remark)
@@ -258,7 +261,8 @@ class Simulate:
         console.wrote(save_load.save(rollout, folder / "rollout.npz"))
         console.say(rollout.tally())
         if console.wants_result():
-            console.result(run=as_json.of_rollout(rollout, scenario.problem), tube_leaves_out=remark)
+            run = as_json.of_rollout(rollout, scenario.problem)
+            console.result(run=run, violations=violations, tube_leaves_out=remark)
         return 0
 
     def _single_disturbances(self) -> "list[Disturbance]":
@@ -276,3 +280,16 @@ class Simulate:
             *impulse, at = self.push
             disturbances.append(Push(impulse, at=at))
         return disturbances
+
+
+def _violations(problem: "Problem", rollout: "Rollout") -> list[dict[str, Any]] | None:
+    """For each constraint that trials violate, how many do, and the worst; None for a problem of another horizon."""
+    if (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
+        return None
+    listed = list[dict[str, Any]]()
+    for name, found in problem.violations(rollout).items():
+        worst, count = int(found[:, 0].argmax()), int((found[:, 0] > 0).sum())
+        by, when = found[worst].tolist()
+        where = {"trial": rollout.first_trial + worst, "time": when}
+        listed.append({"constraint": name, "trials": count, "most": by, **where})
+    return listed

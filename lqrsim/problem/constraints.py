@@ -31,7 +31,7 @@ from lqrsim.errors import (
     numbers_of,
 )
 from lqrsim.kernels import bound_by_knot, state_bound
-from lqrsim.problem.costs import OfFunction, ProblemPart, rows_ahead
+from lqrsim.problem.costs import OfFunction, ProblemPart, bound_at, rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
@@ -311,7 +311,7 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
         if isinstance(constraint, StateBounds):
             term = constraint._bind_to_goal(dynamics, goals, steps)
         else:
-            term = constraint._bind_at(dynamics, times)
+            term = bound_at(constraint, dynamics, times)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
 

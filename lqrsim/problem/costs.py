@@ -126,7 +126,7 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
 
     @property
     def moving(self) -> bool:
-        """Whether the term changes with time; see `_bind_at`."""
+        """Whether the term changes with time; see `bound_at`."""
         return self.by_knot
 
     def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
@@ -158,8 +158,17 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         return brief(value)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> _BoundTerm:
-        """Bind the term to a system and the times (T+1,) in s of a problem's knots."""
+        """Bind the term to a system and the times (T+1,) in s of a problem's knots; for others this is `bound_at`."""
         return self.bind(dynamics)
+
+
+def bound_at(part: ProblemPart[_BoundTerm], dynamics: Dynamics, times: Array) -> _BoundTerm:
+    """A cost or constraint for a system and the times (T+1,) in s of a problem's knots.
+
+    Raises:
+      InputError: it does not fit the system.
+    """
+    return part._bind_at(dynamics, times)
 
 
 class OfFunction:

@@ -25,7 +25,16 @@ from lqrsim.errors import (
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
-from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, in_system, terms_of
+from lqrsim.problem.costs import (
+    ControlCost,
+    Cost,
+    CostTerm,
+    ObstacleCost,
+    QuadraticCost,
+    bound_at,
+    in_system,
+    terms_of,
+)
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
@@ -184,7 +193,7 @@ class Problem:
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
         return tuple(
-            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
+            check_kind(f"{type(cost).__name__}.bind", bound_at(cost, self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
         )
 
@@ -472,7 +481,8 @@ class Problem:
 
         Returns:
           Name of a constraint -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in
-          seconds; zeros for a trial without one. Only constraints that some trial violates.
+          seconds; zeros for a trial without one. Only constraints that some trial violates. If several have the same
+          name, the largest violation of all of them.
 
         Raises:
           InputError: the runs have other states, controls or steps.
@@ -488,7 +498,8 @@ class Problem:
             if not isinstance(constraint, KeepsClear):
                 runs = rollout.states, rollout.applied, rollout.counts
                 for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
-                    found[name] = np.stack([by, rollout.times[knots]], axis=1)
+                    own = np.stack([by, rollout.times[knots]], axis=1)
+                    found[name] = np.where(by[:, None] > found[name][:, :1], own, found[name]) if name in found else own
         return found
 
     @property

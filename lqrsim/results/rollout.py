@@ -57,6 +57,42 @@ class BallRecord:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class MovingObstacles:
+    """The obstacles of a run that MuJoCo does not have, for pictures.
+
+    O obstacles, with axes and sizes as in an `Obstacle`.
+
+    Attributes:
+      names: names of the obstacles.
+      kinds: their kinds, such as "sphere".
+      positions: (O, 3) at the beginning of the run, in metres.
+      rotations: (O, 3, 3) with their axes as columns.
+      sizes: (O, 3) in metres.
+      velocities: (O, 3) in m/s.
+    """
+
+    names: Annotated[tuple[Line, ...], "O"]
+    kinds: Annotated[tuple[Line, ...], "O"]
+    positions: Annotated[Array, "O 3", Bounds()]
+    rotations: Annotated[Array, "O 3 3", Bounds()]
+    sizes: Annotated[Array, "O 3"]
+    velocities: Annotated[Array, "O 3", Bounds()]
+
+    __repr__ = repr_of
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def at(self, time: float) -> Array:
+        """Their positions (O, 3) in metres.
+
+        Args:
+          time: seconds from the beginning of the run.
+        """
+        return self.positions + time * self.velocities
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rollout:
     """Closed-loop runs of one controller in MuJoCo, with all data for drawing them.
 
@@ -105,6 +141,8 @@ class Rollout:
         in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
       collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
       balls: positions of the robot's balls, if it has balls and frames were recorded; else None.
+      obstacle_geoms: (obstacles,) numbers of the geoms of `model` that are displaced by `displaced`; None if unknown.
+      moving: further obstacles, which moved; None without any.
       controller_run: the controller's run (`ControllerRun`) with its records: the estimates of an `OffsetFree`, the log
         of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
@@ -143,6 +181,8 @@ class Rollout:
     tube: Annotated[Array, "T+1 p p", Bounds()] | None = None
     collision_chance: Annotated[Array, "T+1", Bounds(at_least=0.0, at_most=1.0)] | None = None
     balls: BallRecord | None = None
+    obstacle_geoms: Annotated[npt.NDArray[np.int64], "obstacles", Bounds(at_least=0)] | None = None
+    moving: MovingObstacles | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -39,7 +39,13 @@ FORMATS: dict[type, tuple[str, int]] = {
 }
 VERSIONS = dict(FORMATS.values())
 # Fields that older files of the same version lack.
-LATER = {(Certificate, "contacts"), (FailureCertificate, "keep"), (Solution, "problem_parts")}
+LATER = {
+    (Certificate, "contacts"),
+    (FailureCertificate, "keep"),
+    (Rollout, "moving"),
+    (Rollout, "obstacle_geoms"),
+    (Solution, "problem_parts"),
+}
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:

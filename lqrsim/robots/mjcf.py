@@ -93,8 +93,8 @@ class MjcfRobot(Robot):
       geoms: its colliding geoms. balls: an outline of it, or None.
 
     Raises:
-      InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
-        describe: deformable parts, delays, plugins with states.
+      InputError: no such file, body or state; nothing moves, or has an actuator; an attached model has elements without
+        a name; or the MJCF has what states do not describe: deformable parts, delays, plugins with states.
     """
 
     def __init__(
@@ -114,6 +114,7 @@ class MjcfRobot(Robot):
         seen = mjcf_joints.lit(xml, model)
         if seen != xml:
             xml, model = seen, checked_model(seen, self.name)
+        mjcf_joints.check_attached(xml, model, who)
         number = mjcf_joints.body_of(model, body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         default = in_the_way(model, candidates, number, floors=check_flag(f"{who}: floors", floors))

@@ -111,6 +111,19 @@ def named(xml: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+def check_attached(xml: str, model: mujoco.MjModel, what: str) -> None:
+    """Raises InputError if a model that the MJCF attaches has elements without a name, which its text cannot name."""
+    if "<attach" not in xml:
+        return
+    for kind, count in (("body", model.nbody), ("joint", model.njnt), ("geom", model.ngeom), ("actuator", model.nu)):
+        for number in range(count):
+            if not getattr(model, kind)(number).name:
+                raise InputError(
+                    f"{what}: got an attached model whose {kind} {number}, counted from 0, has no name, want names of"
+                    " its bodies, joints, geoms and actuators in its own file"
+                )
+
+
 def lit(xml: str, model: mujoco.MjModel) -> str:
     """An MJCF with a light named overview added if it has none.
 
@@ -370,6 +383,14 @@ def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array)
     """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
     data = placed(model, qpos)
     return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
+
+
+def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vectors: Array) -> Array:
+    """Vectors (..., k, 3) along the world's axes, each in the axes of the body of its geom (k,), at rest."""
+    axes = placed(model).xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
+    # By elements, so that the bits of one do not depend on how many others there are.
+    x, y, z = (vectors[..., i, None] * axes[:, i] for i in range(3))
+    return x + y + z
 
 
 def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:

@@ -123,7 +123,8 @@ def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True
       name_or_path: a name in models/, or the path of an MJCF file.
       obstacles: the geoms fixed to the world that are obstacles: all that can collide; none, with False; names of
         geoms, or of bodies for all of their geoms; or a function that says whether a geom, as from
-        `model.geom(number)`, is an obstacle.
+        `model.geom(number)`, is an obstacle. In runs the robot passes through geoms that are left out, except ground
+        and what it stands on; an `MjcfRobot` does not, because its plans have their contacts.
 
     Raises:
       InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
@@ -384,7 +385,7 @@ def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
 
 
 def _flatten(path: Path) -> str:
-    """The MJCF at `path` as one text: with includes in place, and files of meshes and textures by their full path.
+    """The MJCF at `path` as one text: with includes in place, and other files by their full path.
 
     MuJoCo can also write a model as text, but with six digits, which gives another model.
     """
@@ -424,8 +425,10 @@ def _flatten(path: Path) -> str:
     root = read(path)
     if root.tag != "mujoco":
         raise InputError(f"scene: got {path.name} with <{root.tag}> at its root, want <mujoco>")
-    if any("file" in asset.attrib for asset in root.iterfind("asset/*")):
-        folder = path.parent.resolve()
+    folder = path.parent.resolve()
+    for model in root.iterfind("asset/model[@file]"):  # for <attach>; MuJoCo has no setting for their folder
+        model.set("file", str(folder / model.attrib["file"]))
+    if any(key.startswith("file") for element in root.iter() for key in element.attrib):
         settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
         common = settings.get("assetdir", "")
         root.append(

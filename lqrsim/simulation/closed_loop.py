@@ -16,7 +16,7 @@ from lqrsim.control.controllers import ControllerLike, ControllerRun
 from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
-from lqrsim.results.rollout import MOVED, Rollout
+from lqrsim.results.rollout import MOVED, MovingObstacles, Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
@@ -79,7 +79,8 @@ def simulate(
         moves through them. This takes a quarter less time, is bit-identical until the collision, and has the same
         outcome. In simulators other than MuJoCo the robot always moves through obstacles.
       moving: further obstacles, which move at their velocity, and are in their places at the time 0 of the plan. MuJoCo
-        does not have them: the robot passes through them, but touching one is a collision, and `clearance` counts them.
+        does not have them: the robot passes through them, but touching one is a collision, `clearance` counts them, and
+        `render` draws them.
       threads: number of MuJoCo's threads; by default one per processor.
       generators: (trial, number of the disturbance) -> its random generator, instead of the generators of the seed.
       progress: called after each control period with the number of finished periods and the number of all periods.
@@ -325,8 +326,24 @@ class ClosedLoop:
             first_trial=settings.first_trial,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
+            obstacle_geoms=plant.obstacle_geoms,
+            moving=_record_of(settings.moving, settings.knot * plan.dt),
             controller_run=self.controller_run,
         )
+
+
+def _record_of(moving: World | None, begun: float) -> MovingObstacles | None:
+    """The obstacles that move, where they are at the time at which the run begins, in s."""
+    if moving is None or not len(moving):
+        return None
+    each = moving.moved(begun).obstacles
+    positions, rotations, sizes, velocities = (
+        np.array([getattr(one, field) for one in each]) for field in ("position", "rotation", "size", "velocity")
+    )
+    return MovingObstacles(
+        names=moving.names, kinds=tuple(one.kind for one in each), positions=positions, rotations=rotations,
+        sizes=sizes, velocities=velocities,
+    )  # fmt: skip
 
 
 def _checked_commands(given: Any, shape: tuple[int, int]) -> Array:

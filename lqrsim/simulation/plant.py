@@ -20,7 +20,7 @@ from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
-from lqrsim.scenes.scene import Scene, free_name
+from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
@@ -84,7 +84,8 @@ class Plant:
         jointed = (int(scene.model.joint(name).bodyid[0]) for name in robot.joints)
         self.bodies = _attached(scene.model, [self.body, *jointed])
         mounts = mounting_pairs(scene.model, [geom for geom, one in self._scenery() if one in self.obstacles])
-        self._mounts = mounts[np.isin(scene.model.geom_bodyid[mounts[:, 0]], self.bodies)]
+        apart = np.concatenate([mounts, _left_out(robot, scene, self.body)])
+        self._apart = apart[np.isin(scene.model.geom_bodyid[apart[:, 0]], self.bodies)]
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
@@ -186,10 +187,14 @@ class Plant:
     def enclosed(self) -> bool:
         """Whether all colliding parts of the robot are within its radius, so that no part touches an obstacle earlier.
 
-        For balls and geoms this is not known.
+        For balls and geoms this is not known. A `<pair>` with an obstacle collides whatever their contype, so that its
+        contacts have to be sensed, too.
         """
         if not self.obstacles or "radius" not in self.robot.shape:
             return not self.obstacles
+        geoms = [self.model.geom(name).id for name in self.obstacles]
+        if np.isin([self.model.pair_geom1, self.model.pair_geom2], geoms).any():
+            return False
         return len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9)
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
@@ -272,6 +277,12 @@ class Plant:
             found[k, 0] = data.xpos[number] + data.xmat[number].reshape(3, 3) @ place
         return found
 
+    @property
+    def obstacle_geoms(self) -> npt.NDArray[np.int64]:
+        """Ids of the geoms of the obstacles in `world`, (obstacles,)."""
+        ids = {name: geom for geom, name in self._scenery()}
+        return np.array([ids[name] for name in self.world.names], dtype=np.int64)
+
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation; `set_const` must follow.
 
@@ -279,10 +290,8 @@ class Plant:
           simulations: K of them.
           displaced: (K, obstacles, 3), in metres along the world's axes.
         """
-        places, drawn = simulations.expand("geom_pos"), mjcf_joints.placed(self.model)
-        for number, name in enumerate(self.world.names):
-            geom = self.model.geom(name)
-            places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
+        geoms = self.obstacle_geoms
+        simulations.expand("geom_pos")[:, geoms] += mjcf_joints.in_axes_of_bodies(self.model, geoms, displaced)
 
     def _scenery(self) -> list[tuple[int, str]]:
         """The ids and names of the scene's obstacles."""
@@ -303,7 +312,7 @@ class Plant:
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, name in self._scenery():
             geoms[geom].name = name
-        _separate(geoms, self._mounts, self.scene.model)
+        _separate(spec, geoms, self._apart, self.scene.model)
         taken = {sensor.name for sensor in spec.sensors}
         for name in self.obstacles:
             if not contacts:
@@ -374,25 +383,42 @@ def _near(robot: Robot, scene: Scene) -> World:
     return World([one for geom, one in zip(scene.geoms, scene.world.obstacles, strict=True) if geom in ids])
 
 
-def _separate(geoms: Mapping[int, mujoco.MjsGeom], mounts: Pairs, model: mujoco.MjModel) -> None:
-    """Let no contact arise between obstacles and the geoms that they carry, by a bit of each obstacle's own.
+def _left_out(robot: Robot, scene: Scene, body: int) -> Pairs:
+    """The pairs of a moving geom and a geom that is no obstacle because a choice of obstacles leaves it out.
+
+    Ground and what the robot stands on are not among them. Nor are any for a robot whose own steps are MuJoCo's.
+    """
+    left = [] if robot.geoms is not None else sorted({*obstacle_geoms(scene.model)} - {*scene.geoms})
+    return touching_pairs(scene.model, touchable(scene.model, left, body, floors=True))
+
+
+def _separate(spec: mujoco.MjSpec, geoms: Mapping[int, mujoco.MjsGeom], apart: Pairs, model: mujoco.MjModel) -> None:
+    """Let no contact arise between the geoms of these pairs, by bits of their own for the fixed ones.
 
     Args:
-      geoms: by id. mounts: pairs of a robot's geom and the obstacle that carries it.
+      geoms: those of the spec, by id. apart: pairs of a robot's geom and a geom that is fixed to the world.
 
     Raises:
       InputError: all bits are taken.
     """
     used = int(np.bitwise_or.reduce(model.geom_contype | model.geom_conaffinity, initial=0))
     free = [1 << bit for bit in range(31) if not used >> bit & 1]
-    for obstacle in np.unique(mounts[:, 1]).tolist():
-        if not free:
-            raise InputError("obstacles: got an MJCF that uses all bits of contype and conaffinity, want a free one")
-        bit, carried = free.pop(), mounts[mounts[:, 1] == obstacle, 0]
-        others = touching_pairs(model, [obstacle])[:, 0]
-        for other in np.setdiff1d(others, carried).tolist():
-            geoms[other].conaffinity |= bit
-        geoms[obstacle].contype, geoms[obstacle].conaffinity = bit, 0
+    of_others = dict[tuple[int, ...], int]()  # the geoms that a fixed one still touches, and the bit for such
+    for fixed in np.unique(apart[:, 1]).tolist():
+        others = np.setdiff1d(touching_pairs(model, [fixed])[:, 0], apart[apart[:, 1] == fixed, 0])
+        if (same := tuple(others.tolist())) not in of_others:
+            if not free:
+                raise InputError(
+                    "obstacles: got an MJCF that uses all bits of contype and conaffinity, want a free one"
+                )
+            of_others[same] = free.pop()
+            for other in same:
+                geoms[other].conaffinity |= of_others[same]
+        geoms[fixed].contype, geoms[fixed].conaffinity = of_others[same], 0
+    names = {frozenset((geoms[one].name, geoms[other].name)) for one, other in apart.tolist()}
+    for pair in list(spec.pairs):
+        if frozenset((pair.geomname1, pair.geomname2)) in names:
+            spec.delete(pair)
 
 
 def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:

@@ -19,7 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_kind, check_path, check_progress, check_text, excerpt
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_kind,
+    check_path,
+    check_progress,
+    check_text,
+    excerpt,
+    without_addresses,
+)
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
@@ -219,9 +228,7 @@ def _write_or_check_manifest(
     """Solve for the policies, store them, and write the manifest; or check an existing manifest."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
-        "model": sha256(
-            scenario.scene.xml if scenario.simulator is None else f"{scenario.simulator} {scenario.scene.xml}"
-        ),
+        "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
         "start": solving.digest_of_start(scenario),
         "solution": None if given is None else digest_of_solution(given),
@@ -254,7 +261,10 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
         value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
             raise InputError(f"{field}: got {excerpt(value)}, want {excerpt(was)}, as in {folder}, or another folder")
-    for field, what in (("model", "MJCF or simulator"), ("problem", "problem"), ("start", "start")):
+    for field, what in (
+        ("model", "robot, MJCF, choice of obstacles, simulator or goal radius"), ("problem", "problem"),
+        ("start", "start"),
+    ):  # fmt: skip
         if specification[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} other than the one {folder} was begun with, want another folder")
     if specification["solution"] != manifest["solution"]:
@@ -264,6 +274,25 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
     for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
             raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")
+
+
+def _digest_of_runs(scenario: Scenario) -> str:
+    """Hash of everything in a scenario that runs depend on, besides its problem, its start and the disturbances."""
+    scene, robot, plant = scenario.scene, scenario.robot, scenario.plant()
+    dynamics = robot.dynamics
+    states, controls = dynamics.state_coordinates, dynamics.control_coordinates
+    # Maps are code: their values at zero and at each unit vector stand for them.
+    apart = [[*np.zeros((1, len(space))), *np.eye(len(space))] for space in (states, controls)]
+    maps = [np.concatenate(robot.configuration(row)) for row in apart[0]], [robot.actuation(row) for row in apart[1]]
+    balls = (
+        [] if robot.balls is None else [robot.balls.radii, *(robot.balls.centres(dynamics, row) for row in apart[0])]
+    )
+    names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.fixed
+    numbers = robot.drag, robot.radius, plant.timestep, robot.activations, scene.geoms, dynamics.parameters
+    told = names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator))
+    rules = states.rules, controls.rules
+    arrays = (np.asarray(one, dtype=np.float64) for one in (*maps[0], *maps[1], *balls))
+    return sha256(scene.xml, repr(told), *rules, *(part for array in arrays for part in (f"{array.shape}", array)))
 
 
 def _code(campaign: Campaign) -> dict[str, str | None]:

@@ -162,8 +162,15 @@ COST_TUBE = (0.47, 0.30, 0.78)
 FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; not green, as the mark is
 SLIM = 0.65  # relative width of lines within a tube, which is often hardly wider than the lines
 SEGMENTS = 120  # largest number of segments of a line
+MOVING = (0.20, 0.38, 0.62, 0.5)  # obstacles that move, as those of the packaged scenes
 DOTS = 30  # number of latest measured states that are drawn
 END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
+
+
+_DRAWN = {
+    "sphere": Geom.mjGEOM_SPHERE, "capsule": Geom.mjGEOM_CAPSULE, "cylinder": Geom.mjGEOM_CYLINDER,
+    "box": Geom.mjGEOM_BOX,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -249,6 +256,7 @@ class Overlays:
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Append the geoms of a moment to the scene; `data` is posed at that time."""
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
+        self._draw_moving(pen, time)
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         for tube, colour, height in self._tubes():
             for centre, sizes, rotation in zip(*tube.in_world, strict=True):
@@ -274,6 +282,16 @@ class Overlays:
                     pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, 0.35))
                 else:
                     pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
+
+    def _draw_moving(self, pen: "_Pen", time: float) -> None:
+        """Append the obstacles that move, except planes, which have no thickness."""
+        moving, longest = self.recorded.rollout.moving, 10 * self.recorded.model.stat.extent
+        if moving is None:
+            return
+        each = zip(moving.kinds, moving.at(time), moving.sizes, moving.rotations, strict=True)
+        for kind, position, size, rotation in each:
+            if kind in _DRAWN:
+                pen.add(_DRAWN[kind], position, np.minimum(size, longest), MOVING, rotation)
 
     def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Append the arrow of the disturbing force, for the camera that is set in the scene.

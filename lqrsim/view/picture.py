@@ -67,7 +67,9 @@ class SceneRenderer:
         self.recorded, self.overlays, self.views = recorded, overlays, views
         self.window, self.context, self.model = window, context, recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
-        self.scene = mujoco.MjvScene(self.model, maxgeom=1000 + (MOST_ROBOTS + 1) * self.model.ngeom)
+        moving = recorded.rollout.moving
+        most = 1000 + (MOST_ROBOTS + 1) * self.model.ngeom + (0 if moving is None else len(moving.names))
+        self.scene = mujoco.MjvScene(self.model, maxgeom=most)
         self.visual_options = mujoco.MjvOption(), mujoco.MjvPerturb()
         self.pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
         # A plane is transparent from behind anyway, and hides nothing from the front.

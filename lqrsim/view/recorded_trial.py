@@ -5,6 +5,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.results.rollout import BallRecord, Rollout
+from lqrsim.scenes.mjcf_joints import in_axes_of_bodies
 from lqrsim.scenes.scene import model_from_xml
 
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
@@ -121,7 +122,11 @@ def _recent_mean(forces: Array, dt: float) -> Array:
 
 
 def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
-    """Compile the model that was run. Raises InputError if there is no such trial, or the robot has no place."""
+    """Compile the model that was run, with the obstacles where they were in the trial.
+
+    Raises:
+      InputError: there is no such trial, the robot has no place, or the model lacks a part that was recorded.
+    """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
@@ -141,6 +146,10 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         raise InputError(
             f"rollout.frames: got {rollout.frames.shape[-1]} numbers a frame, want {model.nq}, as the model has"
         )
+    if (geoms := rollout.obstacle_geoms) is not None:
+        if (geoms >= model.ngeom).any():
+            raise InputError(f"rollout.obstacle_geoms: got {geoms.max()}, want numbers below {model.ngeom}")
+        model.geom_pos[geoms] += in_axes_of_bodies(model, geoms, rollout.displaced[trial])
     return model
 
 
