@@ -620,6 +620,19 @@ def test_what_runs_violate_is_named_though_they_reach_the_goal(
         replace(problem, steps=problem.steps + 1).violations(run)
 
 
+@pytest.mark.parametrize("places", [(0.2, -0.3), (-0.3, 0.2), (0.1, 0.2, -0.1)])
+def test_of_constraints_of_one_function_the_worst_violation_is_told(
+    places: tuple[float, ...], differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    plant = differential_drive.plant()
+    run = ls.simulate(plant, drive_solution, disturbances=ls.disturbances.preset("light", plant), trials=3, seed=0)
+    bounds = [ls.SymbolicConstraint(lambda x, u, p: x[0] - p.place, parameters={"place": place}) for place in places]
+    (found,) = replace(differential_drive.problem, constraints=bounds).violations(run).values()
+    missed = np.where(run.counts[:, 1:], max(places) - run.states[:, 1:, 0], 0.0)
+    np.testing.assert_allclose(found[:, 0], missed.max(axis=1), rtol=1e-12)
+    np.testing.assert_array_equal(found[:, 1], run.times[1 + missed.argmax(axis=1)])
+
+
 def test_a_scenario_without_disturbances_is_told_of_presets() -> None:
     bare = replace(ls.scenarios.quadrotor(), disturbances=())
     with pytest.raises(ls.InputError, match=r"scenario quadrotor.* states none, want .* such as --sweep light"):

@@ -471,7 +471,8 @@ class Problem:
 
         Returns:
           Name of a constraint -> (K, 2): the largest violation of each trial, in the constraint's unit, and its time in
-          seconds; zeros for a trial without one. Only constraints that some trial violates.
+          seconds; zeros for a trial without one. Only constraints that some trial violates; of several with one name,
+          as of one function with other parameters, each trial's worst.
 
         Raises:
           InputError: the runs have other states, controls or steps.
@@ -487,7 +488,9 @@ class Problem:
             if not isinstance(constraint, KeepsClear):
                 runs = rollout.states, rollout.applied, rollout.counts
                 for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
-                    found[name] = np.stack([by, rollout.times[knots]], axis=1)
+                    here = np.stack([by, rollout.times[knots]], axis=1)
+                    known = found.setdefault(name, here)  # constraints of one function have one name
+                    found[name] = np.where(here[:, :1] > known[:, :1], here, known)
         return found
 
     @property
