@@ -131,7 +131,7 @@ def test_names_of_the_system_may_be_those_of_the_duration(kind: str) -> None:
     """The least time is 2 sqrt(way / push), whatever the names."""
     name = "stated_duration" if kind in ("a parameter", "both") else "push"
     states = {"x": "m", "duration" if kind in ("a state", "both") else "v": "m/s"}
-    known = {"disturbances" if kind == "a disturbance" else "parameters": {name: 0.5}}
+    known: dict[str, Any] = {"disturbances" if kind == "a disturbance" else "parameters": {name: 0.5}}
     dynamics = ls.Dynamics(
         lambda x, u, p: [x[1], getattr(p, name) * u[0]], states=states, controls={"u": ""}, control_limits=(-1, 1),
         **known,
