@@ -537,6 +537,16 @@ def ends(of: ls.Problem, solution: ls.Solution) -> None:
     )
 
 
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_a_callback_hears_of_the_iterations_of_all_starts_that_are_run_to_their_end(far: float) -> None:
+    """Motions along paths, by which other starts are put in order, are not among them."""
+    told: list[Iteration] = []
+    solution = ls.smooth(problem(ls.GoalState(x=far, v=0.0), goal=(far, 0.0), limit=0.5), callback=told.append)
+    assert solution.status is Status.INFEASIBLE
+    assert len(solution.candidates) > 3
+    assert len(told) == sum(one.iterations for one in solution.candidates)
+
+
 def test_the_time_limit_and_the_limit_of_iterations_end_it_with_the_best_plan() -> None:
     of, before = weighed(UNITS), np.inf
     for most in (1, 3, 6, 9):
