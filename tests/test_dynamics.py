@@ -55,6 +55,41 @@ def test_the_compiled_step_is_the_plain_one(robot: ls.Robot, request: pytest.Fix
         np.testing.assert_allclose(jacobian, np.hstack([a, b]), rtol=0, atol=1e-12)
 
 
+def _jumping(x, u, p):
+    from sympy import Derivative, Mod, Sum, Symbol, ceiling, floor, frac, pi, sin
+
+    k = Symbol("k")
+    return [
+        (x.a + pi) % (2 * pi) - pi, Mod(x.b, p.period) * u.u, floor(2 * x.a) * x.b, x.c // p.period + x.a**2,
+        ceiling(x.c) + frac(x.d) * x.a, Sum(x.d**k, (k, 1, 3)) + Derivative(sin(x.a), x.a),
+    ]  # fmt: skip
+
+
+def test_remainders_and_jumps_are_those_of_numpy_and_their_derivatives_those_beside_the_jumps() -> None:
+    """To rounding, in Python and compiled; central differences of step 1e-6 are good to 1e-6, but across a jump."""
+    names, period = "abcdef", 0.7
+    dynamics = ls.Dynamics(_jumping, states=dict.fromkeys(names, ""), controls={"u": ""}, parameters={"period": period})
+
+    def rate(x: Array, u: Array) -> Array:
+        a, b, c, d, *_ = x
+        return np.array([
+            np.mod(a + np.pi, 2 * np.pi) - np.pi, np.mod(b, period) * u[0], np.floor(2 * a) * b, c // period + a**2,
+            np.ceil(c) + (d - np.floor(d)) * a, d + d**2 + d**3 + np.cos(a),
+        ])  # fmt: skip
+
+    rng, h = np.random.default_rng(0), 1e-6
+    for _ in range(20):
+        x, u = 3 * rng.normal(size=6), rng.normal(size=1)
+        np.testing.assert_allclose(dynamics.rate(x, u), rate(x, u), rtol=0, atol=1e-12 * (1 + abs(x[3]) ** 3))
+        fx, fu = dynamics.rate_jacobian(x, u)
+        slopes = [(rate(x + h * unit, u) - rate(x - h * unit, u)) / (2 * h) for unit in np.eye(6)]
+        np.testing.assert_allclose(fx, np.transpose(slopes), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(fu[:, 0], (rate(x, u + h) - rate(x, u - h)) / (2 * h), rtol=1e-5, atol=1e-5)
+        compiled = np.empty(6)
+        dynamics.compiled.advance(x, u, dynamics.data, 0.1, compiled)
+        np.testing.assert_allclose(compiled, dynamics.step(x, u, 0.1), rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_the_step_is_of_order_four(robot: ls.Robot) -> None:
     """Against SciPy's integrator at 1e-12: halving the step divides the error of one step by 2^5, here by 28 to 36."""
@@ -236,7 +271,7 @@ FIELDS = {
         (lambda x, u, p: [x[1], x[0] / (u[0] - u[0])], {}, "as entry 1, want a finite real expression"),
         (lambda x, u, p: [x[1], x[0] > 0], {}, "got x0 > 0 as entry 1, want an expression"),
         (lambda x, u, p: [x[1], x[0] * (-1) ** 0.5], {}, "as entry 1, want a finite real expression"),
-        (_tangled, {}, r"_tangled\(x, u, p\): got a formula that cannot be compiled .*besselj.*elementary functions"),
+        (_tangled, {}, r"_tangled\(x, u, p\): got a formula that cannot be compiled \(besselj\), want elementary"),
         (_piece, {}, r"_piece\(x, u, p\): got Piecewise.* in entry 1, want its last case to be \(expression, True\)"),
         (_pendulum, {"parameters": {"_k": 1.0}}, "got the name '_k', want a Python name without a leading underscore"),
         (_pendulum, {"parameters": {1: 1.0}}, "parameters: got the name 1, want a Python name"),

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampling import examples
+from scipy.optimize import linprog
 
 import lqrsim as ls
 import lqrsim.gym
@@ -95,6 +96,49 @@ def test_a_cost_that_is_zero_where_the_goal_is_met_is_no_worse_than_zero(weight:
     assert solution.status is Status.CONVERGED
     assert solution.trajectory.horizon == pytest.approx(2 * np.sqrt(way), rel=1e-9)
     np.testing.assert_allclose(np.abs(solution.trajectory.controls), 1.0, rtol=0, atol=1e-6)
+
+
+def _least_at_a_price(way: float, seconds: float, steps: int, price: float) -> float:
+    """The least price of what the goal is missed by, x and v, in that time: a linear program, by SciPy."""
+    dt, left = seconds / steps, steps - 0.5 - np.arange(steps)
+    ends = np.stack([left * dt**2, np.full(steps, dt)])  # of x and of v, by the push of each step
+    ways = np.hstack([ends, np.eye(2), -np.eye(2)])
+    found = linprog(
+        np.r_[np.zeros(steps), np.full(4, price)], A_eq=ways, b_eq=[way, 0.0],
+        bounds=[(-1, 1)] * steps + [(0, None)] * 4,
+    )  # fmt: skip
+    assert found.success
+    return float(found.fun)
+
+
+@pytest.mark.parametrize("way", [1.0, 9.0])
+@pytest.mark.parametrize("price", [0.05, 0.6, 50.0])
+def test_a_goal_at_a_price_is_weighed_against_time(way: float, price: float) -> None:
+    """With at most 4 s; a way of 9 m takes 6."""
+    steps, low, high = 12, 1.5, 4.0
+    free = problem(way=way, steps=steps, duration=(low, high), weight=1e-8)
+    solution = ls.smooth(free, elastic=price)
+    assert solution.status is Status.CONVERGED, solution.detail
+    seconds, end = solution.trajectory.horizon, solution.trajectory.states[-1]
+    paid = seconds + price * (abs(end[0] - way) + abs(end[1]))
+    assert low <= seconds <= high
+    assert paid == pytest.approx(seconds + _least_at_a_price(way, seconds, steps, price), abs=1e-5)
+    assert paid <= min(one + _least_at_a_price(way, one, steps, price) for one in np.linspace(low, high, 26)) + 1e-5
+
+
+@pytest.mark.parametrize("kind", ["a state", "a parameter", "both", "a disturbance"])
+def test_names_of_the_system_may_be_those_of_the_duration(kind: str) -> None:
+    """The least time is 2 sqrt(way / push), whatever the names."""
+    name = "stated_duration" if kind in ("a parameter", "both") else "push"
+    states = {"x": "m", "duration" if kind in ("a state", "both") else "v": "m/s"}
+    known: dict[str, Any] = {"disturbances" if kind == "a disturbance" else "parameters": {name: 0.5}}
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[1], getattr(p, name) * u[0]], states=states, controls={"u": ""}, control_limits=(-1, 1),
+        **known,
+    )  # fmt: skip
+    solution = ls.smooth(dataclasses.replace(problem(), dynamics=dynamics.disturbed))
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(2 * np.sqrt(2), rel=1e-6)
 
 
 @pytest.mark.parametrize("price", [5.0, 20.0])

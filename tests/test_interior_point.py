@@ -304,6 +304,36 @@ def test_a_plan_that_is_given_and_keeps_the_constraints_is_not_left_behind(numbe
         assert solution.status in (Status.CONVERGED, Status.MAX_ITERATIONS)
 
 
+@pytest.mark.parametrize("weight", [100.0, 1e3, 1e5])
+@pytest.mark.parametrize("bound", [0.2, 0.9])
+def test_the_optimum_is_told_as_such_where_it_is_given(weight: float, bound: float) -> None:
+    """A speed of more than the bound would be cheaper, so the force is the same at each step, by a closed form.
+
+    The solver's plan ends a thousandth of the tolerance inside, which costs more than this plan by the multiplier.
+    """
+    of = problem(ls.StateBounds(v=(-np.inf, bound)), goal=(0.0, 1.0), final=[0.0, weight], steps=10)
+    controls = np.full((10, 1), bound / (10 * DT))
+    plan = ls.Trajectory(Shooting(problem(steps=10)).points(controls.ravel())[:, :2], controls, DT)
+    solution = solved(of, start=plan)
+    np.testing.assert_allclose(solution.trajectory.controls, controls, rtol=0, atol=1e-7)
+    assert solution.multipliers[0].values.sum() == pytest.approx(weight * (1 - bound) - controls[0, 0] / DT, rel=1e-5)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_plan_that_costs_nothing_is_the_optimum_though_it_touches_its_bounds(number: int) -> None:
+    rng = np.random.default_rng(number)
+    controls = 0.3 * rng.normal(size=(15, 1))
+    states = Shooting(problem()).points(controls.ravel())[:, :2]
+    bounds = ls.StateBounds(v=(states[:, 1].min(), states[:, 1].max()))
+    of = replace(
+        problem(bounds),
+        stage_cost=ls.QuadraticCost([1.0, 1.0], about=states) + ls.ControlCost([1.0], about=controls),
+        final_cost=ls.QuadraticCost([10.0, 10.0], about=states[-1]),
+    )
+    for start in (None, controls, ls.Trajectory(states, controls, DT)):
+        assert solved(of, start=start).cost < 1e-15
+
+
 # Rows that are many, and mostly far from acting.
 
 
@@ -505,6 +535,16 @@ def ends(of: ls.Problem, solution: ls.Solution) -> None:
     assert solution.violation == pytest.approx(
         max(np.abs(shooting.rows(z, True)).max(initial=0.0), -shooting.rows(z, False).min(initial=0.0)), abs=1e-12
     )
+
+
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_a_callback_hears_of_the_iterations_of_all_starts_that_are_run_to_their_end(far: float) -> None:
+    """Motions along paths, by which other starts are put in order, are not among them."""
+    told: list[Iteration] = []
+    solution = ls.smooth(problem(ls.GoalState(x=far, v=0.0), goal=(far, 0.0), limit=0.5), callback=told.append)
+    assert solution.status is Status.INFEASIBLE
+    assert len(solution.candidates) > 3
+    assert len(told) == sum(one.iterations for one in solution.candidates)
 
 
 def test_the_time_limit_and_the_limit_of_iterations_end_it_with_the_best_plan() -> None:

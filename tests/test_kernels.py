@@ -702,8 +702,8 @@ class TestRareEnds:
         box = np.array([1.0, -2.0]), np.full(2, -1.0), np.full(2, 1.0), np.zeros(2)
         assert np.isnan(replay(of_certificate, SIZES, "box_decrease", -np.eye(2), *box))
         stage = QuadraticStage(np.zeros((5, 5)), np.zeros(5))
-        assert replay(of_certificate, SIZES, "start_decrease", stage, zero, np.zeros(3)) == 0
-        assert replay(of_certificate, SIZES, "start_decrease", stage, -eye, np.ones(3)) == 3e300
+        assert replay(of_certificate, SIZES, "start_decrease", stage, zero, 0.0, np.zeros(3)) == 0
+        assert replay(of_certificate, SIZES, "start_decrease", stage, -eye, 0.0, np.ones(3)) == 3e300
         assert replay(source_of(linear_algebra), SIZES, "finite", eye.copy(), 3, 3)
         for V, Q, size, good in (
             (eye, np.diag([1.0, 2.0, 3.0]), np.ones(3), True), (1e6 * eye, np.ones((3, 3)), np.ones(3), True),

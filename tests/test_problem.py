@@ -29,6 +29,41 @@ def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
             _ = other + a  # pyright: ignore[reportOperatorIssue]
 
 
+def _two(**fields: Any) -> ls.Dynamics:
+    return ls.Dynamics(_double, states={"x": "", "y": ""}, controls={"u": ""}, **fields)
+
+
+def _double(x: Any, u: Any, p: Any) -> list[Any]:
+    return [x[1], u[0]]
+
+
+def test_digests_are_of_everything_that_differs() -> None:
+    """Terms that move to another part, what wraps, where the robot is, and its actuators' range."""
+    costs = [ls.QuadraticCost([1.0, weight], about=[0.5, 0.0]) for weight in (1.0, 2.0, 3.0, 4.0)]
+    effort, limits = ls.ControlCost([1.0]), {"control_limits": (-1.0, 1.0)}
+    made: list[dict[str, Any]] = [
+        # Three costs, in this order, of three parts: where one part ends and the next begins.
+        *(
+            {
+                "initial": sum(costs[:i]),
+                "stage_cost": sum([*costs[i:j], effort, *costs[j:k]]),
+                "final_cost": sum(costs[k:]),
+            }
+            for i in (1, 2) for j in range(i, 4) for k in range(j, 4)
+        ),
+        {"initial": ls.QuadraticCost([0.0, 0.0], about=[1.0, 2.0])},
+        {"initial": ls.FixedState([1.0, 2.0])},
+        {"dynamics": _two(angles=("x",))}, {"dynamics": _two(angles=("y",))}, {"dynamics": _two(angles=("x", "y"))},
+        {"dynamics": _two(position=("x", "y"))}, {"dynamics": _two(position=("x", "y"), offset=1.0)},
+        limits, {"dynamics": _two(**limits)}, {"dynamics": _two(control_limits=(-2.0, 2.0)), **limits},
+    ]  # fmt: skip
+    known = {"dynamics": _two(), "dt": 0.1, "steps": 5, "stage_cost": effort, "final_cost": costs[0]}
+    problems = [ls.Problem(**{"initial": costs[1], **known, **one}) for one in made]
+    assert len({one.digest for one in problems}) == len(problems)
+    for one in problems:
+        assert dataclasses.replace(one).digest == one.digest
+
+
 @given(seed=st.integers(0, 2**32 - 1), m=st.integers(1, 4), count=st.integers(0, 4))
 @settings(max_examples=examples(30), deadline=None)
 def test_the_nominal_control_is_where_all_control_costs_together_are_least(seed: int, m: int, count: int) -> None:
@@ -378,7 +413,16 @@ def test_numbers_by_name_or_unit_are_those_in_order(
             "got 'spee', want one of: x, y, speed.*did you mean speed",
         ),
         (lambda: {"initial": ls.FixedState({"x": 1.0}, x=2.0)}, "FixedState: got 'x' twice"),
-        (lambda: {"initial": ls.FixedState()}, "FixedState: got nothing, want a number by name of a state"),
+        (lambda: {"initial": ls.FixedState()}, "FixedState: got no numbers, want one at least, as FixedState"),
+        (lambda: {"initial": ls.FixedState({})}, "FixedState: got no numbers, want one at least, as FixedState"),
+        (
+            lambda: {"final_cost": ls.QuadraticCost([1.0] * 4)},
+            "QuadraticCost: about: got none, want the state at which",
+        ),
+        (
+            lambda: {"control_limits": {"force": (1.0, 1.0)}},
+            "control_limits: got 1 to 1 for force, want the first below the second; a control that cannot change is",
+        ),
         (
             lambda: {"final_cost": ls.QuadraticCost({"kg": 1.0}, about={})},
             "got 'kg', want one of: x, y, speed, m",

@@ -120,6 +120,26 @@ class TestPlans:
         np.testing.assert_allclose(solution.trajectory.states, states, rtol=0, atol=1e-5 * scale)
         np.testing.assert_allclose(solution.trajectory.controls, controls, rtol=0, atol=1e-5 * scale)
 
+    @settings(max_examples=examples(40))
+    @given(
+        seed=st.integers(0, 2**31), steps=st.integers(1, 25), size=st.sampled_from([(2, 1), (3, 2)]),
+        soft=st.booleans(), off=st.sampled_from([0.0, 0.1, 1.0]),
+    )  # fmt: skip
+    def test_what_can_be_followed_is_followed(
+        self, seed: int, steps: int, size: tuple[int, int], soft: bool, off: float
+    ) -> None:
+        """The optimum costs nothing: what is left are squares of rounding errors, which no step lowers."""
+        numbers, rng = Numbers.drawn(seed, steps, *size), np.random.default_rng(seed)
+        states, controls, _ = numbers.least()
+        of = dataclasses.replace(numbers, states=states, controls=controls).problem()
+        if soft:
+            of = dataclasses.replace(of, initial=ls.QuadraticCost(np.ones(size[0]), about=states[0]))
+        solution = ls.smooth(of, start=controls + off * rng.normal(size=controls.shape) if off else None)
+        assert solution.status is ls.Status.CONVERGED, solution.detail
+        scale = 1 + np.abs(states).max() + np.abs(controls).max()
+        assert solution.cost < 1e-20 * scale**2 * (1 + np.abs(numbers.end_weight).max())
+        np.testing.assert_allclose(solution.trajectory.controls, controls, rtol=0, atol=1e-9 * scale)
+
     @pytest.mark.parametrize("rows", [7, 8])
     def test_the_same_row_at_each_knot_is_no_row(self, rows: int) -> None:
         """To the last bit, though another kernel computes it."""

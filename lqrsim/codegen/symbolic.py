@@ -171,8 +171,34 @@ def trace(
             last: Any = piecewise.args[-1]
             if last[1] != sympy.true:
                 raise InputError(f"{called}: got {piecewise} in entry {i}, want its last case to be (expression, True)")
-        expressions.append(expression)
+        expressions.append(_worked_out(expression))
     return expressions, x, u
+
+
+@functools.cache
+def _floor() -> Any:
+    """SymPy's floor with a derivative: zero, as it is everywhere but at the jumps."""
+    import sympy
+
+    class floor(sympy.Function):
+        def fdiff(self, argindex: int = 1) -> Any:
+            return sympy.Integer(0)
+
+    return floor
+
+
+def _worked_out(expression: Any) -> Any:
+    """The expression with its sums, integrals and derivatives worked out, and remainders and jumps by `_floor`."""
+    import sympy
+
+    if expression.has(sympy.Sum, sympy.Product, sympy.Integral, sympy.Derivative):
+        expression = expression.doit()
+    if not expression.has(sympy.Mod, sympy.frac, sympy.ceiling, sympy.floor):
+        return expression
+    expression = expression.replace(sympy.Mod, lambda a, b: a - b * sympy.floor(a / b))
+    expression = expression.replace(sympy.frac, lambda a: a - sympy.floor(a))
+    expression = expression.replace(sympy.ceiling, lambda a: -sympy.floor(-a))
+    return expression.replace(sympy.floor, _floor())
 
 
 def write_function(
@@ -196,7 +222,7 @@ def write_function(
     class Printer(PythonCodePrinter):
         def _print_Function(self, expr: Any) -> str:
             head = expr.func.__name__
-            if head.partition("_d")[0] in RATIOS:
+            if head.partition("_d")[0] in RATIOS or isinstance(expr, _floor()):
                 return f"{head}({self._print(expr.args[0])})"
             return super()._print_Function(expr)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -230,8 +256,9 @@ def write_function(
         for target, value in zip(assignments, reduced, strict=True):
             sign = "+=" if target.endswith("+") else "="
             lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
-    except PrintMethodNotImplementedError as error:
-        raise InputError(f"{of}: got a formula that cannot be compiled ({error}), want elementary functions") from None
+    except (PrintMethodNotImplementedError, ValueError, RecursionError) as error:
+        why = " ".join(str(error).partition("Set the printer option")[0].rpartition("'>: ")[2].split())
+        raise InputError(f"{of}: got a formula that cannot be compiled ({why}), want elementary functions") from None
     if returns is not None:
         lines.append(f"    return {returns}")
     return "\n".join(lines) + "\n"

@@ -12,6 +12,10 @@ from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, copy, copy_m
 from lqrsim.kernels.model_functions import augment_cost, cost_alone, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
 
+# A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
+# that an optimal cost of zero leaves.
+SQUARES = 1e-28
+
 
 def certify(settings, own, plan, policy, to_go, model, found):
     """Write cost, residuals and predicted decrease of a plan and its policy.
@@ -63,7 +67,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
                 costate if own else to_go.gradient[t + 1],
             )
             cost += noise_quadratic(x, u, t, model.noise, ahead, False, stage)
-        scale += scale_of(x, u, stage)
+        terms = scale_of(x, u, stage)
+        scale += terms
         for i in range(N):
             difference = abs(states[t + 1, i] - arrived[i])
             if not difference <= residual[i]:  # a NaN stays
@@ -72,13 +77,16 @@ def certify(settings, own, plan, policy, to_go, model, found):
             room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
             limits = max(limits, room.low[i], -room.high[i])
         off_policy = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, off_policy)
-        decrease += predicted_decrease(step, stage, policy.gain[t], hessians[t + 1], room, costate)
+        terms += curved_terms(states[t + 1], hessians[t + 1])
+        decrease += predicted_decrease(step, stage, policy.gain[t], hessians[t + 1], room, SQUARES * terms, costate)
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
-        scale += scale_of(states[0], none, stage)
-        decrease += start_decrease(stage, hessians[0], costate)
+        terms = scale_of(states[0], none, stage)
+        scale += terms
+        terms += curved_terms(states[0], hessians[0])
+        decrease += start_decrease(stage, hessians[0], SQUARES * terms, costate)
     worst = 0.0
     for i in range(N):
         if not residual[i] <= worst * size[i]:
@@ -99,6 +107,15 @@ def scale_of(x, u, stage):
     return scale
 
 
+def curved_terms(x, S):
+    """The quadratic part of a cost-to-go at x (N,) with the sizes of its terms."""
+    terms = 0.0
+    for i in range(N):
+        for j in range(N):
+            terms += 0.5 * abs(x[i] * S[i, j] * x[j])
+    return terms
+
+
 def policy_residual(x, u, gain, offset, limits, worst):
     """The relative difference of a control from the policy's within its limits, if above `worst`; else `worst`."""
     for i in range(M):
@@ -112,11 +129,12 @@ def policy_residual(x, u, gain, offset, limits, worst):
     return worst
 
 
-def predicted_decrease(step, stage, gain, S, room, costate):
+def predicted_decrease(step, stage, gain, S, room, rounding, costate):
     """The decrease `1/2 e' E^-1 e` that the controls of a step predict, within the room that their limits leave.
 
     Args:
       step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. room: Limits of changes.
+      rounding: a decrease up to this is none.
       costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
@@ -143,7 +161,8 @@ def predicted_decrease(step, stage, gain, S, room, costate):
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
     copy(before, N, costate)
-    return box_decrease(factor, slope, room.low, room.high, moved)
+    decrease = box_decrease(factor, slope, room.low, room.high, moved)
+    return 0.0 if decrease <= rounding else decrease
 
 
 def singular_semidefinite(matrix):
@@ -157,8 +176,11 @@ def singular_semidefinite(matrix):
     return cholesky(block, M)
 
 
-def start_decrease(stage, S, costate):
-    """The predicted decrease of a soft start, its cost quadratised in `stage`; add its gradient to the costate (N,)."""
+def start_decrease(stage, S, rounding, costate):
+    """The predicted decrease of a soft start, its cost quadratised in `stage`; add its gradient to the costate (N,).
+
+    A decrease up to `rounding` is none.
+    """
     factor, direction = stack(N, N), stack(N)
     for i in range(N):
         costate[i] += stage.gradient[i]
@@ -171,7 +193,7 @@ def start_decrease(stage, S, costate):
     cholesky_solve(factor, N, direction)
     for i in range(N):
         decrease += 0.5 * costate[i] * direction[i] if good else abs(costate[i]) * 1e300
-    return decrease
+    return 0.0 if decrease <= rounding else decrease
 
 
 def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):

@@ -21,6 +21,9 @@ from lqrsim.kernels.model_functions import (
 from lqrsim.kernels.passes import end_model
 from lqrsim.kernels.records import Limits, ModelOrder, NextStep, QuadraticStage
 
+# A predicted decrease below this, relative to the squares that cancel in it, consists of squares of rounding errors.
+SQUARES = 1e-28
+
 
 def rollout(steps, x0, policy, model, plan):
     """Run the policy from x0 (N,) under the true dynamics; write the trajectory, and return its true cost."""
@@ -66,7 +69,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
 
     Returns:
       The step at which it failed, or -1; whether all numbers there were finite; and the decrease of cost that the model
-      predicts.
+      predicts, without what is only rounding: of an optimal cost of zero nothing else is left.
     """
     share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), zeros(M), zeros(N)
@@ -93,6 +96,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
             if share > 0:
                 beyond = NextStep(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
             ahead += noise_quadratic(x, u, t, model.noise, beyond, False, stage)
+        squares = squares_at(arrived, N, 0, curve) + squares_at(x, N, 0, hessian) + squares_at(u, M, N, hessian)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += order.damping
@@ -100,7 +104,8 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
         decrease, good = minimize_within(stage, no_change, room, policy.gain[at], policy.offset[at], curve, slope)
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
-        predicted += decrease
+        if not decrease <= SQUARES * squares:  # a NaN stays
+            predicted += decrease
         constant = ahead - predicted
         for i in range(N):
             gradient_at_origin = slope[i]
@@ -139,7 +144,15 @@ def initial_step(x0, model, share, to_go, direction):
     decrease = 0.0
     for i in range(N):
         decrease -= 0.5 * slope[i] * direction[i]
-    return decrease
+    return 0.0 if decrease <= SQUARES * (squares_at(x0, N, 0, hessian) + squares_at(x0, N, 0, S)) else decrease
+
+
+def squares_at(z, size, first, hessian):
+    """The squares of z (size,), weighted with the diagonal of a Hessian from an index on, without cancellation."""
+    total = 0.0
+    for i in range(size):
+        total += 0.5 * abs(hessian[first + i, first + i]) * z[i] * z[i]
+    return total
 
 
 def largest_gap(steps, x_hats, states):

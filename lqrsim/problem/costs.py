@@ -420,7 +420,10 @@ class QuadraticCost(_SquareCost):
 
     controls = False
 
-    def __init__(self, weight: PerKnot, *, about: PerKnot, longer: bool = False) -> None:
+    def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
+        if about is None:  # zero is no state that one would expect, unlike a control
+            want = "the state at which the cost is zero, such as [0.0, 1.0] or {'x': 1.0}"
+            raise InputError(f"{self.name}: about: got none, want {want}")
         super().__init__(weight, about, longer)
 
 

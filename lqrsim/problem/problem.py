@@ -63,6 +63,9 @@ class FixedState:
     state: PerEntry
 
     def __init__(self, state: PerEntry | None = None, /, **named: float) -> None:
+        if not named and (state is None or (isinstance(state, Mapping) and not state)):
+            want = "one at least, as FixedState(x=0.0), or one per state, as FixedState([0.0, 0.0])"
+            raise InputError(f"FixedState: got no numbers, want {want}")
         if state is None or named or isinstance(state, Mapping):
             found = by_name("FixedState", state, named, "a number", check_number)
         else:
@@ -415,23 +418,27 @@ class Problem:
     @property
     def digest(self) -> str:
         """Hash of everything that defines the problem: structure and numbers."""
+        space = self.dynamics.state_coordinates
         parts: list[str | Array] = [self.dynamics.step_source.digest, f" {self.dt!r} {self.steps}"]
         parts.append(repr(self.dynamics.parameters))
         parts.append(repr((self.control_coordinates.low, self.control_coordinates.high)))
+        # What wraps, where the robot is, and what actuators can do: starts, errors and policies depend on them.
+        parts += [
+            f"{space.rules} {space.position} {space.plane} {space.offset}",
+            self.dynamics.control_coordinates.rules,
+        ]
         if self.dynamics.fixed:
             parts.append(self.dynamics.fixed)
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             parts.append(self.initial.numbers)
-        for name in ("initial", "stage_cost", "final_cost"):
-            for term in self.terms(name):
+        for name, terms in (*self._terms.items(), ("constraints", self.constraint_terms)):
+            parts.append(f"{name} {len(terms)}")  # the same terms may be of another part
+            for term in terms:
                 parts += [term.code.digest, term.data]
                 functions += term.functions
-        for term in self.constraint_terms:
-            parts += [term.code.digest, term.data]
-            functions += term.functions
-            if term.equality or term.final_only:
-                parts.append(repr((term.equality, term.final_only)))
+                if isinstance(term, ConstraintTerm) and (term.equality or term.final_only):
+                    parts.append(repr((term.equality, term.final_only)))
         if self._noise_term is not None:
             parts += [self._noise_term.code.digest, self._noise_term.data, repr(self.risk)]
             functions += self._noise_term.functions

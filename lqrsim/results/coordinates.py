@@ -312,8 +312,9 @@ class Coordinates:
         low, high = self._ranges("control_limits", limits)
         for name, lowest, highest in zip(self.names, low, high, strict=True):
             if not lowest < highest:
+                fixed = "; a control that cannot change is a parameter of the dynamics" if lowest == highest else ""
                 raise InputError(
-                    f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second"
+                    f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second{fixed}"
                 )
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 

@@ -6,14 +6,14 @@ once. With the duration found, the problem is an ordinary one, and the plan is a
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.constraints import Constraint, GoalState, StateBounds, SymbolicConstraint
@@ -28,7 +28,8 @@ from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
-STATE, STATED = "duration", "stated_duration"  # the added state, and the parameter to which it is relative
+# The added state, and the parameter to which it is relative; with underscores after them if the system has such names.
+STATE, STATED = "duration", "stated_duration"
 MOST = 300  # largest number of iterations
 # Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
@@ -66,7 +67,7 @@ def solve_for_duration(
         with stop.reporting("smooth", attentive):
             ordinary, found = find_duration(
                 problem, begin.trajectory, tolerance=settings.final(problem),
-                violation=settings.violation_tolerance(problem), most=budget.left, budget=budget,
+                violation=settings.violation_tolerance(problem), most=budget.left, budget=budget, price=settings.price,
             )  # fmt: skip
         if found.solved and (best is None or found.measures.cost < best[1].measures.cost):
             best = ordinary, found
@@ -82,9 +83,9 @@ def solve_for_duration(
             # The search may only have ended far from the constraints: go on from a plan of that duration.
             start = Trajectory(found.plan.states, found.plan.controls, ordinary.dt)
             begin = solved(ordinary, replace(settings, start=start, starts=None))
-            least = min(_rank_with_time(one, problem.time_weight) for one in fixed)
+            least = min(_rank_with_time(one, problem, settings.price) for one in fixed)
             fixed.append(begin)
-            missed, cost = _rank_with_time(begin, problem.time_weight)
+            missed, cost = _rank_with_time(begin, problem, settings.price)
             if not begin.success or not (missed, cost + FELL * abs(cost)) < least:
                 break
         else:
@@ -98,7 +99,7 @@ def solve_for_duration(
         )  # fmt: skip
         chosen = solved(ordinary, replace(settings, start=guess, starts=None))  # its log begins with the search's
         return stop.finish(_described(chosen, problem, total))
-    chosen = min(fixed, key=lambda one: _rank_with_time(one, problem.time_weight))
+    chosen = min(fixed, key=lambda one: _rank_with_time(one, problem, settings.price))
     status, remedy = Status.STALLED, "state another dt" if chosen.success else "state a dt that allows enough time"
     if stop.due:
         status, remedy = Status.TIME_LIMIT, "raise time_limit"
@@ -126,19 +127,32 @@ def _described(solution: Solution, problem: Problem, total: int) -> Solution:
     )
 
 
-def _rank_with_time(solution: Solution, time_weight: float) -> tuple[float, float]:
-    """Sort key, best first: the violation of a failed plan, then the cost including the cost of time."""
-    missed = 0.0 if solution.success else solution.violation
-    return missed, solution.cost + time_weight * solution.trajectory.horizon
+def _rank_with_time(solution: Solution, problem: Problem, price: float) -> tuple[float, float]:
+    """Sort key, best first: the violation of a failed plan, then the cost with the prices of time and violations."""
+    missed, plan = 0.0 if solution.success else solution.violation, solution.trajectory
+    paid = 0.0
+    if np.isfinite(price):
+        stages = Stages(settled(problem, plan.horizon))
+        paid = _paid(stages, Motion(in_c_order(plan.states), in_c_order(plan.controls)), price)
+    return missed, solution.cost + problem.time_weight * plan.horizon + paid
+
+
+def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
+    """The price of all violations of a plan, at a price of each row (R,)."""
+    prices = stages.of_each(np.where(np.isfinite(price) & (stages.owners >= 0), price, 0.0))
+    numbers = stages.values(plan)[stages.live]
+    missed = np.where(stages.of_each(stages.equality), np.abs(numbers), np.maximum(-numbers, 0.0))
+    return float((prices * missed).sum())
 
 
 def find_duration(
     problem: Problem, begin: Trajectory, *, tolerance: float, violation: float, most: int, budget: Budget,
+    price: float,
 ) -> tuple[Problem, Found]:  # fmt: skip
     """Find the best duration near a plan's duration. Return the problem with it, and the optimum or the last plan.
 
     `violation` is the tolerance of the constraints, `most` the number of iterations, up to `MOST`; they join the log of
-    the budget, which may end the search earlier.
+    the budget, which may end the search earlier. `price` is that of violations, which the cost of the result includes.
     """
     assert problem.duration is not None
     n = len(problem.dynamics.state_coordinates)
@@ -155,13 +169,17 @@ def find_duration(
     states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
-        point = InteriorPoint(freed, plan, stages=stages)
+        # The bounds of the duration hold at any price.
+        prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
+        point = InteriorPoint(freed, plan, price=prices, stages=stages)
         found = point.run(tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch)
+        cost = found.measures.cost + _paid(stages, found.plan, prices)
     # Remove everything that belongs to the duration.
     rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
     found = replace(
         found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
         gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1],
+        measures=found.measures._replace(cost=cost),
         sizes=found.sizes._replace(rows=rows),
     )  # fmt: skip
     duration = float(np.clip(point.point.plan.states[0, n], *problem.duration))
@@ -206,20 +224,29 @@ def _scaled(dynamics: Dynamics, stated: float) -> Dynamics:
     """The dynamics with the duration as last state; at the stated duration they are unchanged."""
     space, controls, n = dynamics.state_coordinates, dynamics.control_coordinates, len(dynamics.state_coordinates)
     names = space.names
+    state, parameter = _unused(STATE, names), _unused(STATED, (*dynamics.parameters, *dynamics.disturbances))
 
     def f(x: Any, u: Any, p: Any) -> list[Any]:
-        share = x[n] / getattr(p, STATED)
+        share = x[n] / getattr(p, parameter)
         return [*(share * rate for rate in dynamics.f(x[:n], u, p)), 0]
 
     return Dynamics(
-        f, states=dict(zip(names, space.units, strict=True)) | {STATE: "s"},
+        f, states=dict(zip(names, space.units, strict=True)) | {state: "s"},
         controls=dict(zip(controls.names, controls.units, strict=True)),
-        parameters=dict(dynamics.parameters) | {STATED: stated}, disturbances=dynamics.disturbances,
+        parameters=dict(dynamics.parameters) | {parameter: stated},
+        disturbances={name: one for name, one in dynamics.disturbances.items() if name not in dynamics.parameters},
         position=tuple(names[i] for i in space.position), plane=space.plane, offset=space.offset,
         angles=tuple(names[i] for i in space.angles),
         rotation_vectors=tuple(names[i : i + 3] for i in space.rotation_vectors),
         control_limits=(controls.low, controls.high),
     )  # fmt: skip
+
+
+def _unused(name: str, names: Collection[str]) -> str:
+    """A name that is not among others: with underscores after it if it is."""
+    while name in names:
+        name += "_"
+    return name
 
 
 def _longer_cost(cost: Cost, n: int) -> Cost:

@@ -138,10 +138,10 @@ class Rows:
         whether its row is an inequality without a price.
     """
 
-    def __init__(self, stages: Stages, sizes: Sizes, scale: float, price: float) -> None:
+    def __init__(self, stages: Stages, sizes: Sizes, scale: float, price: float | Array) -> None:
         self.size, self.equality = stages.of_each(sizes.rows), stages.of_each(stages.equality)
         self.limit = stages.of_each(stages.owners == -1)
-        self.highest = np.where(self.limit, np.inf, price)
+        self.highest = stages.of_each(np.where(stages.owners == -1, np.inf, price))
         self.elastic = bool(np.isfinite(self.highest).any())
         lowest = np.where(self.equality, -self.highest, 0.0)
         self.regularised = np.where(np.isfinite(lowest), 0.0, REGULARISATION * self.size**2 / scale)
@@ -216,7 +216,7 @@ class InteriorPoint:
       barrier: initial barrier parameter of each row, as a fraction of the cost divided by the number of rows.
       room: the least initial slack: relative to a row's size, or to a control's range.
       price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
-        hold.
+        hold. Or a price for each row, (R,).
       multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
       stages: stages of the same problem, to be reused.
 
@@ -232,7 +232,7 @@ class InteriorPoint:
         *,
         barrier: float = 1.0,
         room: float = 0.02,
-        price: float = np.inf,
+        price: float | Array = np.inf,
         multipliers: tuple[Array, ...] = (),
         stages: Stages | None = None,
     ) -> None:

@@ -140,7 +140,7 @@ class InteriorRun:
                 lagrangian.update(growth=1.0)
                 result = self._newton(lagrangian)
         detail = ""
-        if self._run.settings.elastic is not None and result.violation > 0:
+        if self._run.settings.elastic is not None and result.violation > self.allowed:
             detail = f"elastic: {lagrangian.worst()}"
         result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
         if result.success and lagrangian.kept:

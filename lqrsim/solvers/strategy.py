@@ -267,6 +267,7 @@ class Search:
             if self._budget.stop.due:
                 break
             run = self._another(resolve(prior, problem))
+            run.budget.report_to(None)  # it is not run to its end
             run.smooth(FOLLOW)
             states, controls = (part.copy() for part in run.work.arrays.last)
             if np.isfinite(states).all():

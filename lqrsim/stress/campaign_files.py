@@ -153,7 +153,7 @@ def _digest(table: Table, about: Mapping[str, Any]) -> str:
     return sha256(*parts)
 
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 7, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 8, "manifest.json"
 GIVEN = "solution.npz"  # the solution that was given instead of solving; the manifest has its hash
 _LARGEST = 1 << 26  # bytes, largest manifest
 

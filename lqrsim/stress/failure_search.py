@@ -486,7 +486,7 @@ def write_json(
     asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
         "format": f"lqrsim {name}",
-        "version": 2,
+        "version": 3,
         "asked": asked,
         "disturbances": disturbances_as_json(problem.disturbances),
         "model": sha256(problem.resolved.scene.xml),
