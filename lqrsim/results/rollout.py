@@ -378,12 +378,16 @@ class Rollout:
         )
 
     def _worst(self, k: int) -> str:
-        """The state with the largest error from the plan in a trial, for a robot without a position; else empty."""
+        """The state with the largest error from the plan in a trial, for a robot without a position; else empty.
+
+        Also empty for a trial without error.
+        """
         if self.state_coordinates.position:
             return ""
         knot = int(np.argmax(np.where(self.counts[k], self.tracking_error[k], -1.0)))
         off = self.state_coordinates.difference(self.states[k, knot], self.plan.states[knot])
-        return f" ({worst_of(self.state_coordinates, off, scale_of(self.plan.states))} at {self.times[knot]:.2f} s)"
+        worst = worst_of(self.state_coordinates, off, scale_of(self.plan.states))
+        return f" ({worst} at {self.times[knot]:.2f} s)" if worst else ""
 
     __str__ = summary
 
