@@ -471,6 +471,22 @@ def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution,
     assert loaded.summary() == rollout.summary()
 
 
+@pytest.mark.parametrize("trials", [1, 2, 10, 11, 25])
+def test_a_summary_counts_the_outcomes_and_lists_the_first_trials(cage: Plant, trials: int) -> None:
+    rollout = ls.simulate(cage, short(0.0), disturbances=[ForceNoise(5.0)], trials=trials, seed=3)
+    text = str(rollout)
+    listed = [int(one) for one in re.findall(r"^  trial (\d+): ", text, re.MULTILINE)]
+    assert listed == list(range(min(trials, 10)))
+    assert re.findall(r"^  and (\d+) more$", text, re.MULTILINE) == ([str(trials - 10)] if trials > 10 else [])
+    counts = re.findall(r"^  (\d+) trials: (.*)$", text, re.MULTILINE)
+    assert bool(counts) == (trials > 1)
+    for total, each in counts:
+        found = {outcome: int(number) for number, outcome in (one.split(" ", 1) for one in each.split(", "))}
+        assert int(total) == trials
+        assert found == {one: rollout.outcome.count(one) for one in set(rollout.outcome)}
+        assert trials < 10 or len(found) > 1  # this noise is between what it survives and what it does not
+
+
 # The first event ends a trial.
 
 

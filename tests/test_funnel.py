@@ -35,6 +35,7 @@ from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress import funnels
 from lqrsim.stress.funnels import points_of
 from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
+from lqrsim.stress.statistics import rate as rate_of
 
 ice: Any = pytest.fixture(scope="module")(lambda tmp_path_factory: plant(tmp_path_factory.mktemp("ice")))
 PLAN = solution()
@@ -146,6 +147,18 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
     assert read.summary() == found.summary()
     with pytest.raises(InputError, match="want a 'lqrsim funnel'"):
         ls.load(ls.save(PLAN, tmp_path / "solution.npz"), ls.types.Funnel)
+
+
+@pytest.mark.parametrize("trials", [3, 40, 5000])
+def test_a_check_is_shown_by_its_counts_and_not_by_its_trials(trials: int) -> None:
+    successes = np.arange(trials) % 3 > 0
+    reached = rate_of(int(successes.sum()), trials)
+    check = ls.stress.FunnelCheck(4, 0.25, reached, successes)
+    assert str(check).startswith(f"knot 4, level 0.25: {sum(successes.tolist())} of {trials} new trials succeed, ")
+    assert f"{reached.low:.3g}, {reached.high:.3g}" in str(check)
+    for text in (str(check), repr((check,))):
+        assert "True" not in text
+        assert len(text) < 200
 
 
 @pytest.mark.parametrize(
