@@ -328,11 +328,14 @@ def _planes(space: Coordinates) -> list[tuple[int, int]]:
 
 
 def _begin_projection(
-    axes: Axes, space: Coordinates, world: World, plan: Array, radius: float, plane: tuple[int, int], title: str,
+    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: tuple[int, int], title: str,
     legend: str,
 ) -> Array:  # fmt: skip
-    """Draw the obstacles and the title of a projection; returns its axes (2, d). The legend explains flat obstacles."""
-    figure_parts.draw_obstacles(axes, space, world, plan, radius, plane)
+    """Draw the obstacles around places (k, d), and the title of a projection; returns its axes (2, d).
+
+    The legend explains flat obstacles.
+    """
+    figure_parts.draw_obstacles(axes, space, world, places, radius, plane)
     side = f"{title}, from {'above' if plane == (0, 1) else 'the side'}"
     in_plane = f"{title} ({legend})" if legend else title
     axes.set_title(in_plane if len(space.position) == 2 else side)
@@ -454,12 +457,13 @@ def _shadow(
     """The projection, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
-    onto = _begin_projection(axes, space, world, plan, radius, plane, "funnel", "pale grey: within a radius")
+    held, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
+    reach = np.sqrt(np.diagonal(covariances[held], axis1=1, axis2=2))
+    shown = np.vstack([plan, plan[held] - reach, plan[held] + reach])  # the certified outlines are seen as a whole
+    onto = _begin_projection(axes, space, world, shown, radius, plane, "funnel", "pale grey: within a radius")
     every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
-    last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)
-    held = funnel.knots[funnel.levels > 0]
     outlines = every.outlines()[held]
     axes.add_collection(
         PolyCollection(
