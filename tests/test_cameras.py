@@ -12,6 +12,7 @@ import pytest
 from sampling import rarely
 
 import lqrsim as ls
+from lqrsim.results.rollout import BallRecord
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
 from lqrsim.view.overlays import MARK_RGB, draw_mark, mark_radius
@@ -84,6 +85,26 @@ def test_fixed_cameras_see_the_whole_run(aspect: float, rollout: ls.Rollout) -> 
             pixels = camera.project(places, size)
             assert (pixels > margin).all()
             assert (pixels < np.array(size) - margin).all()
+
+
+@pytest.mark.parametrize("aspect", [0.75, 16 / 9])
+@pytest.mark.parametrize("seed", range(3))
+def test_fixed_cameras_see_all_balls_of_a_robot(aspect: float, seed: int, rollout: ls.Rollout) -> None:
+    """As of a forklift, whose fork is far ahead of its position; also where a trial ends early."""
+    rng = np.random.default_rng(seed)
+    turned, radii = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.uniform(0.1, 0.4, 3)
+    about = 5 * rollout.radius * np.array([[1.0, 0, 0], [0, 0, 0], [-0.5, 0.2, 0]]) @ turned
+    planned = rollout.in_world(rollout.planned_places)[:, None] + about
+    driven = np.stack([rollout.in_world(rollout.places(k))[:, None] + about for k in range(rollout.trials)])
+    driven[0, 40:] = np.nan
+    balls = BallRecord(planned=planned, driven=driven, radii=radii, anchors=np.full((3, 4), np.nan))
+    long, size = dataclasses.replace(rollout, balls=balls), (round(1000 * aspect), 1000)
+    for camera in (cameras.top(long, aspect), cameras.side(long, aspect)):
+        for centres in (planned, *driven):
+            pixels, margin = camera.project(centres, size), radii[:, None] / camera.height * 1000
+            shown = np.isfinite(centres).all(axis=2)
+            assert (pixels - margin)[shown].min() > -1e-6
+            assert (pixels + margin - np.array(size))[shown].max() < 1e-6
 
 
 def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
