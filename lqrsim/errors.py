@@ -160,13 +160,15 @@ def check_number(
         and (below is None or number < below)
     )
     if not good:
-        wants = ["a finite number"]
-        wants += [f"> {above:g}"] if above is not None else []
-        wants += [f">= {at_least:g}"] if at_least is not None else []
-        wants += [f"<= {at_most:g}"] if at_most is not None else []
-        wants += [f"< {below:g}"] if below is not None else []
-        raise InputError(f"{field}: got {excerpt(value)}, want {' '.join(wants)}")
+        bounds = ((">", above), (">=", at_least), ("<=", at_most), ("<", below))
+        wants = " and ".join(f"{sign} {_short(bound)}" for sign, bound in bounds if bound is not None)
+        raise InputError(f"{field}: got {excerpt(value)}, want {f'a finite number {wants}'.strip()}")
     return number
+
+
+def _short(bound: float) -> str:
+    """A bound as text, with all its digits if it has more than six: a number just beyond 1/3 must not look good."""
+    return text if float(text := f"{bound:g}") == bound else repr(float(bound))
 
 
 def keep_positive(record: object, *names: str, who: str = "") -> None:

@@ -12,9 +12,11 @@ import pytest
 from sampling import rarely
 
 import lqrsim as ls
+from lqrsim.results.rollout import BallRecord
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
 from lqrsim.view.overlays import MARK_RGB, draw_mark, mark_radius
+from lqrsim.view.recorded_trial import RecordedTrial, drawn_size
 from lqrsim.view.render import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
 
@@ -86,6 +88,26 @@ def test_fixed_cameras_see_the_whole_run(aspect: float, rollout: ls.Rollout) -> 
             assert (pixels < np.array(size) - margin).all()
 
 
+@pytest.mark.parametrize("aspect", [0.75, 16 / 9])
+@pytest.mark.parametrize("seed", range(3))
+def test_fixed_cameras_see_all_balls_of_a_robot(aspect: float, seed: int, rollout: ls.Rollout) -> None:
+    """As of a forklift, whose fork is far ahead of its position; also where a trial ends early."""
+    rng = np.random.default_rng(seed)
+    turned, radii = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.uniform(0.1, 0.4, 3)
+    about = 5 * rollout.radius * np.array([[1.0, 0, 0], [0, 0, 0], [-0.5, 0.2, 0]]) @ turned
+    planned = rollout.in_world(rollout.planned_places)[:, None] + about
+    driven = np.stack([rollout.in_world(rollout.places(k))[:, None] + about for k in range(rollout.trials)])
+    driven[0, 40:] = np.nan
+    balls = BallRecord(planned=planned, driven=driven, radii=radii, anchors=np.full((3, 4), np.nan))
+    long, size = dataclasses.replace(rollout, balls=balls), (round(1000 * aspect), 1000)
+    for camera in (cameras.top(long, aspect), cameras.side(long, aspect)):
+        for centres in (planned, *driven):
+            pixels, margin = camera.project(centres, size), radii[:, None] / camera.height * 1000
+            shown = np.isfinite(centres).all(axis=2)
+            assert (pixels - margin)[shown].min() > -1e-6
+            assert (pixels + margin - np.array(size))[shown].max() < 1e-6
+
+
 def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
     states = rollout.states.copy()
     states[0, 40:] = np.nan
@@ -93,12 +115,13 @@ def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
 
 
 def metadata(rollout: ls.Rollout) -> VideoMetadata:
+    mark = mark_radius(RecordedTrial(rollout, 0))
     panes = (
         Pane(0, 0, 320, 240, camera=cameras.top(rollout)),
         Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
         Pane(0, 240, 640, 240),
     )
-    return VideoMetadata((digest(rollout),), (mark_radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
+    return VideoMetadata((digest(rollout),), (mark,), Fraction(30000, 1001), 0.5, 3, panes)
 
 
 def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
@@ -158,7 +181,7 @@ def test_digest_tells_runs_apart(rollout: ls.Rollout) -> None:
 def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: ls.Rollout) -> None:
     """In its colour to the last bit, in light and shade, before the sky and behind beams."""
     gl.bind()
-    camera, size = getattr(cameras, kind)(rollout), (640, 480)
+    camera, size, mark = getattr(cameras, kind)(rollout), (640, 480), mark_radius(RecordedTrial(rollout, 0))
     model = mujoco.MjModel.from_xml_string(rollout.model)
     model.vis.quality.offsamples = 0
     data = mujoco.MjData(model)
@@ -168,9 +191,47 @@ def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: l
             mujoco.mj_forward(model, data)
             renderer.update_scene(data)
             centre = data.body(rollout.body).xpos
-            draw_mark(renderer.scene, camera, centre, mark_radius(rollout))
+            draw_mark(renderer.scene, camera, centre, mark)
             camera.place(renderer.scene, size[0] / size[1])
             rows, columns = np.nonzero((renderer.render() == 255 * np.array(MARK_RGB)).all(axis=2))
-            assert len(rows) == pytest.approx(np.pi * (mark_radius(rollout) * size[1] / camera.height) ** 2, rel=0.15)
+            assert len(rows) == pytest.approx(np.pi * (mark * size[1] / camera.height) ** 2, rel=0.15)
             seen = np.array([columns.mean(), rows.mean()]) + 0.5
             np.testing.assert_allclose(seen, camera.project(centre, size), rtol=0, atol=0.3)
+
+
+ARMED = """<mujoco><option timestep="0.01"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 0.1"/>
+  <geom name="post" type="cylinder" size="0.1 0.5" pos="4 3 0.5"/>
+  <body name="base" pos="0 0 0.2">
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+    <geom type="{kind}" size="{sizes}" mass="5" euler="{turn}"/>
+    <body name="arm" pos="0 0 0.1"><joint name="turn" axis="0 0 1"/>
+      <geom type="capsule" fromto="0 0 0.05 {reach} 0 0.05" size="0.02" mass="0.1"/></body>
+  </body></worldbody>
+  <actuator><motor joint="x"/><motor joint="y"/><motor joint="turn"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("kind", "sizes"), [("cylinder", "0.2 0.1"), ("box", "0.2 0.15 0.1"), ("sphere", "0.2")])
+@pytest.mark.parametrize("reach", [0.6, 1.5])
+@pytest.mark.parametrize("turn", ["0 0 0", "0 0 90"])
+def test_what_stands_for_a_robot_is_as_wide_as_its_base_and_not_as_its_arms_reach(
+    kind: str, sizes: str, reach: float, turn: str, rollout: ls.Rollout
+) -> None:
+    xml = ARMED.format(kind=kind, sizes=sizes, reach=reach, turn=turn)
+    model = mujoco.MjModel.from_xml_string(xml)
+    run = dataclasses.replace(rollout, radius=reach + 0.02)
+    assert drawn_size(model, run, model.body("base").id) == pytest.approx(0.2, rel=1e-6)
+    # A radius that is the base's own is what is drawn.
+    whole = dataclasses.replace(rollout, radius=0.25)
+    assert drawn_size(model, whole, model.body("base").id) == 0.25
+
+
+def test_marks_and_planned_places_of_packaged_robots_have_their_radius(rollout: ls.Rollout) -> None:
+    recorded = RecordedTrial(rollout, 0)
+    assert mark_radius(recorded) == 0.25 * rollout.radius
+    assert recorded.planned_balls(0.0)[1].tolist() == [rollout.radius]
+    # Of a robot whose radius were a reach, both would be as small as its body.
+    armed = RecordedTrial(dataclasses.replace(rollout, radius=1.5), 0)
+    ((radius,), mark) = armed.planned_balls(0.0)[1], mark_radius(armed)
+    assert mark == 0.25 * radius
+    assert radius == pytest.approx(rollout.radius, rel=0.2)

@@ -180,6 +180,49 @@ def test_lines_of_trials_name_the_worst_state_of_a_robot_without_a_position(
         assert f" from the goal (angle {off[k, -1, 0]:+.3g} rad); " in line
 
 
+@settings(max_examples=examples(30))
+@given(st.data())
+def test_the_state_that_a_summary_names_is_one_that_the_goal_weighs(data: st.DataObject) -> None:
+    """Against the largest of the differences that count, by NumPy; a state at its goal is not said to be off."""
+    number = st.floats(-3, 3, allow_nan=False).map(lambda one: round(one, 2))
+    size = data.draw(st.integers(1, 5))
+    names = tuple(f"s{i}" for i in range(size))
+    space = ls.types.Coordinates(names=names, units=("mol/L",) * size)
+    plan = np.array(data.draw(st.lists(st.lists(number, min_size=size, max_size=size), min_size=2, max_size=4)))
+    weighed = data.draw(st.sets(st.integers(0, size - 1), min_size=1))
+    off = {i: data.draw(st.sampled_from([0.0, -0.25, 0.5, 1.0])) for i in weighed}
+    goal = np.full(size, np.nan)
+    for i, one in off.items():
+        goal[i] = plan[-1, i] - one
+    target = Target(space, goal, plan)
+    exact = {i: plan[-1, i] - goal[i] for i in weighed}
+    relative = {i: abs(one) / max(np.ptp(plan[:, i]), 1.0) for i, one in exact.items()}
+    line, said = target.of_plan(None)[0], target.worst(plan[-1])
+    assert "+0 " not in line
+    if not any(exact.values()):
+        assert said == ""
+        assert line == f"the plan ends 0 {OF_RANGE} from the goal"
+        return
+    named = int(said.split()[0][1:])
+    assert named in weighed
+    assert relative[named] == max(relative.values())
+    assert said == f"s{named} {exact[named]:+.3g} mol/L"
+    assert line.endswith(f": {said} off")
+
+
+@pytest.mark.parametrize("weighed", range(3))
+def test_entries_of_a_rotation_vector_that_do_not_count_are_not_named(weighed: int) -> None:
+    """The nearest vector of the same rotation, a turn less about the axis, is farther off in the other two entries."""
+    space = ls.types.Coordinates(names=("rx", "ry", "rz"), units=("rad",) * 3, rotation_vectors=(0,))
+    end = np.roll([3.0, 2.0, 1.0], weighed)
+    goal = np.where(np.arange(3) == weighed, -3.0, np.nan)
+    target = Target(space, goal, np.stack([np.zeros(3), end]))
+    less = end * (1 - 2 * np.pi / np.linalg.norm(end))
+    name, off, _ = target.worst(end).split()
+    assert name == space.names[weighed]
+    assert float(off) == pytest.approx(less[weighed] + 3.0, rel=1e-2)
+
+
 @dataclass(frozen=True)
 class Handed(Arm):
     """The same with a ball, which goes over the middle of the post."""
@@ -427,6 +470,22 @@ def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution,
     assert loaded.obstacles == rollout.obstacles
     np.testing.assert_array_equal(loaded.goal, half.goal)
     assert loaded.summary() == rollout.summary()
+
+
+@pytest.mark.parametrize("trials", [1, 2, 10, 11, 25])
+def test_a_summary_counts_the_outcomes_and_lists_the_first_trials(cage: Plant, trials: int) -> None:
+    rollout = ls.simulate(cage, short(0.0), disturbances=[ForceNoise(5.0)], trials=trials, seed=3)
+    text = str(rollout)
+    listed = [int(one) for one in re.findall(r"^  trial (\d+): ", text, re.MULTILINE)]
+    assert listed == list(range(min(trials, 10)))
+    assert re.findall(r"^  and (\d+) more$", text, re.MULTILINE) == ([str(trials - 10)] if trials > 10 else [])
+    counts = re.findall(r"^  (\d+) trials: (.*)$", text, re.MULTILINE)
+    assert bool(counts) == (trials > 1)
+    for total, each in counts:
+        found = {outcome: int(number) for number, outcome in (one.split(" ", 1) for one in each.split(", "))}
+        assert int(total) == trials
+        assert found == {one: rollout.outcome.count(one) for one in set(rollout.outcome)}
+        assert trials < 10 or len(found) > 1  # this noise is between what it survives and what it does not
 
 
 # The first event ends a trial.

@@ -209,7 +209,10 @@ def skewed(tube: np.ndarray) -> np.ndarray:
         ({"tube": lambda a: a + np.inf}, r"tube\[0, 0, 0\]: got inf"),
         ({"tube": skewed}, r"tube: got .* at \[7, 0, 1\] and .* at \[7, 1, 0\], want a symmetric matrix"),
         ({"tube": lambda a: -a}, "tube: got .* at knot 0, want no negative variance"),
-        ({"collision_chance": lambda a: a + 0.5}, r"collision_chance\[76\]: got .*, want a finite number >= 0 <= 1"),
+        (
+            {"collision_chance": lambda a: a + 0.5},
+            r"collision_chance\[76\]: got .*, want a finite number >= 0 and <= 1",
+        ),
         ({"collision_chance": lambda a: a[1:]}, r"collision_chance: got shape \(150,\), want \(T\+1\)"),
         ({"collision_chance": lambda a: a * np.nan}, r"collision_chance\[0\]: got nan"),
     ],

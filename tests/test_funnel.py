@@ -10,6 +10,7 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from pucks import RADIUS, STEPS, Puck, left, plant, solution
 from sampling import examples, rarely
 from scipy import stats
@@ -35,6 +36,8 @@ from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.stress import funnels
 from lqrsim.stress.funnels import points_of
 from lqrsim.stress.levels import NEAR, FoundLevel, find_level, lowest_rate, smallest_test
+from lqrsim.stress.statistics import rate as rate_of
+from lqrsim.view import plots
 
 ice: Any = pytest.fixture(scope="module")(lambda tmp_path_factory: plant(tmp_path_factory.mktemp("ice")))
 PLAN = solution()
@@ -146,6 +149,18 @@ def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
     assert read.summary() == found.summary()
     with pytest.raises(InputError, match="want a 'lqrsim funnel'"):
         ls.load(ls.save(PLAN, tmp_path / "solution.npz"), ls.types.Funnel)
+
+
+@pytest.mark.parametrize("trials", [3, 40, 5000])
+def test_a_check_is_shown_by_its_counts_and_not_by_its_trials(trials: int) -> None:
+    successes = np.arange(trials) % 3 > 0
+    reached = rate_of(int(successes.sum()), trials)
+    check = ls.stress.FunnelCheck(4, 0.25, reached, successes)
+    assert str(check).startswith(f"knot 4, level 0.25: {sum(successes.tolist())} of {trials} new trials succeed, ")
+    assert f"{reached.low:.3g}, {reached.high:.3g}" in str(check)
+    for text in (str(check), repr((check,))):
+        assert "True" not in text
+        assert len(text) < 200
 
 
 @pytest.mark.parametrize(
@@ -373,6 +388,25 @@ def test_its_picture(funnel: ls.types.Funnel, tmp_path: Path) -> None:
     some = replace(funnel, states=("x", "y"), shape=funnel.shape[:, :2, :2])
     with pytest.raises(InputError, match="want the position among them"):
         ls.view.plot_funnel(some, tmp_path / "funnel.png", **options)
+
+
+@pytest.mark.parametrize("level", [0.1, 1.0, 3.0])
+@pytest.mark.parametrize("knot", [0, 140])
+def test_its_picture_shows_all_places_from_which_runs_are_certified(
+    funnel: ls.types.Funnel, level: float, knot: int
+) -> None:
+    """States on its boundary are within the axes, from above and from the side."""
+    one = replace(funnel, knots=np.array([knot]), levels=np.array([level]))
+    rng = np.random.default_rng(1)
+    points = rng.standard_normal((3000, 12)) * rng.choice([0.1, 1.0], (3000, 12))
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    places = one.states_at(knot, points, level)[:, :3]
+    for plane in ((0, 1), (0, 2)):
+        axes = Figure().add_subplot()
+        plots._shadow(axes, one, one.position_covariance, ls.World(), 0.3, plane)
+        for i, (low, high) in zip(plane, (axes.get_xlim(), axes.get_ylim()), strict=True):
+            assert low < places[:, i].min()
+            assert places[:, i].max() < high
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The pictures that the pages show: they are there, small, and made by the commands beside them."""
 
+import dataclasses
 import inspect
 import re
 import shlex
@@ -14,6 +15,7 @@ from PIL import Image, ImageSequence
 
 import lqrsim as ls
 from lqrsim.commands import Command
+from lqrsim.commands.viewing import Render
 from lqrsim.view import gl
 
 ROOT = Path(__file__).parent.parent
@@ -64,6 +66,17 @@ def test_the_gallery_names_the_calls_behind_its_commands() -> None:
     for name, call in calls.items():
         (stated,) = re.findall(rf"`{re.escape(name)}\((.*?)\)`", text)
         assert set(re.findall(r"(\w+)=", stated)) <= set(inspect.signature(call).parameters)
+
+
+def test_the_gallery_says_how_arguments_of_the_calls_differ_from_options() -> None:
+    options = {field.name for field in dataclasses.fields(Render)} - {"rollouts", "out"}
+    still, video = (set(inspect.signature(one).parameters) for one in (ls.view.render_still, ls.render))
+    text = " ".join(GALLERY.read_text(encoding="utf-8").split())
+    renamed = dict(re.findall(r"`--(\w+)` is `(\w+)=`", text))
+    assert {renamed.get(name, name) for name in options} == (still | video) - {"runs", "path", "progress"}
+    for name, only in (("render", video - still), ("render_still", still - video)):
+        (stated,) = re.findall(rf"only `{name}` has (.*?)[;.]", text, re.IGNORECASE)
+        assert set(re.findall(r"`(\w+)=`", stated)) == only - {"progress"}
 
 
 def test_the_gallery_has_every_picture_with_the_commands_that_make_it(pictures: Mapping[str, tuple[str, ...]]) -> None:

@@ -1,5 +1,6 @@
 """Distances of robots from MJCFs: those of MuJoCo's bindings, with their derivatives; and what is an obstacle."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sampling import examples, rarely
+from tracking import track
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
@@ -108,6 +110,70 @@ def test_obstacles_that_are_elsewhere(seed: int) -> None:
     travel = robot.geoms.travel(states[:, :-1], states[:, 1:])
     still = robot.geoms.clearances(robot.dynamics, robot.scene.world, states)
     assert (np.abs(np.diff(still, axis=1)) <= travel[..., None] + 1e-6).all()
+
+
+@pytest.mark.parametrize("other", ["plane", "sphere", "capsule", "cylinder", "box"])
+@settings(max_examples=examples(2), deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_obstacles_that_move_and_are_in_no_mjcf(other: str, seed: int) -> None:
+    """Copies of the MJCF's own obstacles have the distances of these, displaced by as much as they have moved."""
+    robot, rng = arm("capsule", other, seed), np.random.default_rng(seed)
+    n = len(robot.dynamics.state_coordinates)
+    moves, times = rng.normal(0, 0.3, (2, 3)), np.array([0.0, 0.4, 1.1])
+    own = robot.scene.world.obstacles
+    world = ls.World([replace(one, name=f"{i} & <its> copy", velocity=moves[i]) for i, one in enumerate(own)])
+    shape = robot.among(world)
+    states = robot.at() + rng.normal(0, 0.2, (3, n))
+    gone = times[:, None, None] * moves
+    found = shape.clearance(shape.places(states), gone)
+    each = np.array([by_bindings(robot, state, away) for state, away in zip(states, gone, strict=True)])
+    np.testing.assert_allclose(found, each.min(axis=1), rtol=0, atol=2e-6)
+    nearest = [shape.nearest(shape.places(state), away) for state, away in zip(states, gone, strict=True)]
+    np.testing.assert_array_equal(nearest, each.argmin(axis=1))
+    assert shape.world.names == world.names
+
+
+SLED = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+  <geom name="wall" type="box" size="0.1 1 1" pos="9 0 0"/>
+  <body name="sled"><joint name="x" type="slide" axis="1 0 0"/>
+    <geom name="front" type="box" size="0.2 0.2 0.2" mass="1"/></body></worldbody>
+  <actuator><motor name="push" joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "reach"),
+    [("sphere", [0.3, 0, 0], 0.3), ("box", [0.25, 0.5, 0.5], 0.25), ("cylinder", [0.2, np.inf, 0], 0.2),
+     ("capsule", [0.2, 0.4, 0], 0.2)],
+)  # fmt: skip
+@pytest.mark.parametrize("speed", [1.0, 2.5])
+def test_a_robot_from_an_mjcf_meets_what_comes_toward_it(
+    kind: str, size: list[float], reach: float, speed: float
+) -> None:
+    """It stands still: the gap divided by the speed is when they touch."""
+    robot = ls.MjcfRobot(scene_from_xml(SLED, "sled"))
+    plan = track(robot, np.zeros(2), np.zeros((20, 1)), 0.05, feedback=False)
+    coming = ls.Obstacle(
+        "coming", kind, np.array([1.5, 0, 0]), np.eye(3), np.array(size), velocity=np.array([-speed, 0, 0])
+    )
+    run = ls.simulate(ls.Plant(robot, robot.scene), plan, moving=ls.World([coming]))
+    gap = 1.5 - reach - 0.2
+    knots = run.times
+    if gap / speed < 1.0:
+        assert (run.outcome, run.obstacles) == (("collided",), ("coming",))
+        assert run.collided_at[0] == pytest.approx(gap / speed, abs=0.02)  # of the finest step, 2 % of its size
+    else:
+        assert run.collided_at[0] == np.inf
+    before = knots < min(gap / speed, run.collided_at[0])
+    np.testing.assert_allclose(run.clearance[0, before], (gap - speed * knots)[before], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("wall", "sphere"), ("front", "sphere"), ("new", "mesh")])
+def test_obstacles_that_cannot_move_about_a_robot_from_an_mjcf_are_refused(name: str, kind: str) -> None:
+    robot = ls.MjcfRobot(scene_from_xml(SLED, "sled"))
+    plan = track(robot, np.zeros(2), np.zeros((2, 1)), 0.05, feedback=False)
+    world = ls.World([ls.Obstacle(name, kind, np.array([1.5, 0, 0]), np.eye(3), np.full(3, 0.1))])
+    with pytest.raises(InputError, match=f"^moving: got {name}, "):
+        ls.simulate(ls.Plant(robot, robot.scene), plan, moving=world)
 
 
 @pytest.mark.parametrize("own", ["capsule", "mesh"])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import lqrsim as ls
@@ -15,6 +16,7 @@ from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.figure_parts import draw_projected, draw_tube
 from lqrsim.view.plots import draw_policy, strength
+from lqrsim.view.style import MARGIN
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario, tube: Tube | None = None) -> Figure:
@@ -220,6 +222,46 @@ def test_solutions_without_a_cost_to_come_have_no_tube(differential_drive: ls.Sc
     with pytest.raises(ls.InputError, match="solution: got no cost-to-go"):
         ls.view.plot_policy(replace(solution, cost_to_go=None), tmp_path / "policy.png", world=ls.World([]), radius=0.1)
     assert not list(tmp_path.iterdir())
+
+
+def tank(states: int) -> ls.Problem:
+    """Tanks in a row that drain into one another: a system without a position."""
+    names = tuple(f"level_{i}" for i in range(states))
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [u[0] - x[0], *(x[i - 1] - x[i] for i in range(1, states))],
+        states=dict.fromkeys(names, "m3"), controls={"inflow": "m3/s"},
+    )  # fmt: skip
+    return ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=12, initial=ls.FixedState(np.zeros(states)),
+        stage_cost=ls.ControlCost([1.0]), final_cost=ls.QuadraticCost(np.full(states, 50.0), about=np.ones(states)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("states", [1, 3])
+def test_a_system_without_a_position_needs_no_world_and_no_radius(states: int, tmp_path: Path) -> None:
+    solution = ls.smooth(tank(states))
+    path = ls.view.plot_policy(solution, tmp_path / "policy.svg")
+    assert all(f"level {i}" in path.read_text() for i in range(states))
+
+
+@pytest.mark.parametrize("world", [True, False])
+def test_without_a_radius_no_place_is_grey_and_the_plan_is_within_the_axes(
+    world: bool, drive_solution: ls.Solution, differential_drive: ls.Scenario
+) -> None:
+    seen = differential_drive.scene.world if world else ls.World()
+    figures = {radius: Figure() for radius in (0.0, 0.17)}
+    for radius, figure in figures.items():
+        draw_policy(figure, drive_solution, seen, radius)
+        axes = figure.axes[0]
+        assert ("grey" in axes.get_title()) == (radius > 0)
+        (low, high), plan = np.array([axes.get_xlim(), axes.get_ylim()]).T, drive_solution.trajectory.states[:, :2]
+        assert (low < plan.min(axis=0)).all()
+        assert (plan.max(axis=0) < high).all()
+    greys = [
+        [to_hex(tuple(colour)) for one in figure.axes[0].collections for colour in np.atleast_2d(one.get_facecolor())]
+        for figure in figures.values()
+    ]
+    assert [MARGIN in colours for colours in greys] == [False, world]
 
 
 def test_obstacles_cast_the_shadow_of_their_shape() -> None:

@@ -506,7 +506,7 @@ def test_bad_input_gets_one_line(options: dict, message: str, drive: ls.Rollout,
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"time": 26.0}, "time: got 26.0, want a finite number >= 0 <= 25"),
+        ({"time": 26.0}, "time: got 26.0, want a finite number >= 0 and <= 25"),
         ({"every": 0}, "every: got 0, want a finite number >= 0.5"),
         ({"path": "still.jpg"}, "want a name that ends in .png"),
     ],

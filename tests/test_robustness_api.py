@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from sampling import examples
 
 import lqrsim as ls
@@ -213,6 +215,16 @@ class TestChecks:
     @pytest.mark.parametrize("value", ["1", True, [1.0], np.array([1.0]), 1j, 10**400, math.nan, math.inf, Raising()])
     def test_what_is_no_number(self, value: Any) -> None:
         assert "want a finite number" in refusal(lambda: check_number("dt", value))
+
+    @given(st.floats(-1e9, 1e9), st.floats(0, 1e9), st.booleans())
+    def test_a_refused_number_is_outside_the_bounds_as_they_are_stated(self, low: float, more: float, up: bool) -> None:
+        """A bound that is printed with fewer digits than it has may seem to be kept."""
+        high = low + more
+        value = np.nextafter(high, math.inf) if up else np.nextafter(low, -math.inf)
+        said = refusal(lambda: check_number("std", value, at_least=low, at_most=high))
+        stated = re.fullmatch(r"std: got .*, want a finite number >= (\S+) and <= (\S+)", said)
+        assert stated is not None
+        assert not float(stated[1]) <= value <= float(stated[2])
 
     @pytest.mark.parametrize("value", [1.0, "1", True, 0, -1, 10**20, 10**400, 2**31, np.float64(3), None])
     def test_what_is_no_count(self, value: Any) -> None:

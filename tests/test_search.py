@@ -55,6 +55,15 @@ class TestCandidates:
         # What goes on was better than what was dropped at that time; of the two that were dropped later, cost fell.
         assert max(one.cost for one in four) < min(one.cost for one in three)
 
+    @pytest.mark.parametrize("costs", [(np.inf,), (np.inf, np.inf, np.inf), (np.inf, 7.5, 9.25), (7.5, 7.5)])
+    def test_a_summary_states_the_cost_of_dropped_starts_if_it_is_finite(self, drive_solution, costs) -> None:
+        (best,) = [one for one in drive_solution.candidates if one.status is not None]
+        dropped = [replace(best, start=f"other {i}", status=None, cost=cost) for i, cost in enumerate(costs)]
+        text = replace(drive_solution, candidates=(best, *dropped)).summary()
+        said = "at costs of 7.5 or more" if min(costs) < np.inf else "without a finite cost"
+        assert f"; {len(costs)} were dropped {said}" in text
+        assert " inf" not in text
+
     def test_the_same_bits_however_they_are_run(self, differential_drive, drive_solution) -> None:
         problem = differential_drive.problem
         others = [ls.smooth(problem, threads=1), ls.smooth(problem, threads=2, starts=7)]

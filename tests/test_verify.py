@@ -16,7 +16,7 @@ from sampling import examples, rarely
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.verify import checks
-from lqrsim.verify.checks import check_plan
+from lqrsim.verify.checks import check_plan, run_beside
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video_metadata import VideoMetadata
@@ -290,6 +290,18 @@ def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None
     without = dataclasses.replace(case.run, frames=case.run.frames[:, :0], frame_times=case.run.frame_times[:0])
     with pytest.raises(ls.InputError, match="want what simulate"):
         ls.verify_run(without)
+
+
+def test_a_video_without_its_run_beside_it_asks_for_the_runs_file(case: Case, tmp_path: Path) -> None:
+    path = tmp_path / "alone.mp4"
+    path.write_bytes(Path(case.video).read_bytes())
+    for beside in (None, case.other):
+        if beside is not None:
+            ls.save(beside, tmp_path / "other.npz")
+        with pytest.raises(ls.InputError) as caught:
+            run_beside(path)
+        said = str(caught.value)
+        assert said == f"run: no file in {tmp_path} has the run that alone.mp4 shows, want its file, --run RUN.npz"
 
 
 # -- The command, and its parts

@@ -58,7 +58,8 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         if remark:
             console.say(remark)
         if solution.cost_to_go is not None:
-            world, radius = scenario.scene.world, scenario.robot.radius
+            world, robot = scenario.scene.world, scenario.robot
+            radius = robot.shape.get("radius", 0.0)
             console.wrote(plot_policy(solution, folder / "policy.png", world=world, radius=radius, tube=tube))
         if not solution.success:
             failures.append(f"{reference}: the plan did not converge ({solution.status.name})")

@@ -140,7 +140,8 @@ class Solve:
             tube, remark = tube_under(ran.problem, solution, ran.plant(), ran.disturbances)
             if remark:
                 console.say(remark)
-            world, radius = scenario.scene.world, scenario.robot.radius
+            world, robot = scenario.scene.world, scenario.robot
+            radius = robot.shape.get("radius", 0.0)
             console.wrote(plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
         return 0 if solution.success else 1
 

@@ -494,8 +494,9 @@ class ObstacleCost(KeepsClear, Cost):
       radius: radius of the robot at its position, in metres.
       balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
       geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances. The sum is then
-        over bodies and obstacles; pairs farther apart than 16 / sharpness cost nothing. Give exactly one of `radius`,
-        `balls` and `geoms`.
+        over bodies and obstacles. Pairs farther apart than D = 16 / sharpness cost nothing; for the others, the
+        exponential's tangent at D, `exp(-16) * (1 + sharpness * (D - distance))`, is taken off. Give exactly one of
+        `radius`, `balls` and `geoms`.
       sharpness: sharpness in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """

@@ -34,7 +34,12 @@ def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
 
 
 def worst_of(space: Coordinates, off: Array, scale: Array) -> str:
-    """The state with the largest of the differences (n,), relative to their scale (n,), as text: "elbow -0.1 rad"."""
+    """The state with the largest of the differences (n,), relative to their scale (n,), as text: "elbow -0.1 rad".
+
+    Empty if none differs.
+    """
+    if not off.any():
+        return ""
     worst = int(np.argmax(np.abs(off) / scale))
     return f"{space.names[worst]} {off[worst]:+.3g} {space.units[worst]}".rstrip()
 
@@ -174,14 +179,18 @@ class Target:
         return lines
 
     def worst(self, state: Array) -> str:
-        """The state that is farthest from a target without a position, and by how much; empty for one with a position.
+        """The state that counts and is farthest from the target, and by how much.
+
+        Empty for a target with a position, and for a state that is at the target.
 
         Args:
           state: (n,), finite.
         """
         if self.places:
             return ""
-        off = self.space.difference(state, np.where(np.isfinite(self.state), self.state, state))
+        counts = np.isfinite(self.state)
+        # As in `distance`: a rotation vector whose entries count in part may be off in the others.
+        off = np.where(counts, self.space.difference(state, np.where(counts, self.state, state)), 0.0)
         return worst_of(self.space, off, scale_of(self.plan))
 
 

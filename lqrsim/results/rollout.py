@@ -1,5 +1,6 @@
 """Runs of a controller: a `Rollout`. NumPy only."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,9 +13,10 @@ from lqrsim.errors import Array, InputError, check_count, check_symmetric, excer
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
-from lqrsim.results.goal import Target, endings, scale_of, tracking_error, tracking_unit, worst_of
+from lqrsim.results.goal import OUTCOMES, Target, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
+LISTED = 10  # largest number of trials in a summary, as in a notebook
 MOVED = "goal moved during the run"  # among the disturbances of a run
 
 
@@ -383,14 +385,21 @@ class Rollout:
         return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
 
     def summary(self) -> str:
-        """Disturbances, the end of the plan, and for each trial outcome, tracking error, clearance and saturation."""
+        """Disturbances, the end of the plan, and the number of each outcome; then for each of the first trials outcome,
+        tracking error, clearance and saturation.
+        """
         what = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
         if MOVED in self.disturbances:
             lines.append("  trials are to reach the goal where it was last; the plan was made for another")
         else:
             lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
-        return "\n".join([*lines, *(f"  {self._line(k)}" for k in range(self.trials))])
+        if self.trials > 1:
+            counted = Counter(self.outcome)
+            each = ", ".join(f"{counted[one]} {one}" for one in OUTCOMES if counted[one])
+            lines.append(f"  {self.trials} trials: {each}")
+        lines += [f"  {self._line(k)}" for k in range(min(self.trials, LISTED))]
+        return "\n".join([*lines, f"  and {self.trials - LISTED} more"] if self.trials > LISTED else lines)
 
     def _line(self, k: int) -> str:
         outcome, counts, name = self.outcome[k], self.counts[k], f"trial {self.first_trial + k}"
@@ -418,12 +427,16 @@ class Rollout:
         )
 
     def _worst(self, k: int) -> str:
-        """The state with the largest error from the plan in a trial, for a robot without a position; else empty."""
+        """The state with the largest error from the plan in a trial, for a robot without a position; else empty.
+
+        Also empty for a trial without error.
+        """
         if self.state_coordinates.position:
             return ""
         knot = int(np.argmax(np.where(self.counts[k], self.tracking_error[k], -1.0)))
         off = self.state_coordinates.difference(self.states[k, knot], self.plan.states[knot])
-        return f" ({worst_of(self.state_coordinates, off, scale_of(self.plan.states))} at {self.times[knot]:.2f} s)"
+        worst = worst_of(self.state_coordinates, off, scale_of(self.plan.states))
+        return f" ({worst} at {self.times[knot]:.2f} s)" if worst else ""
 
     __str__ = summary
 

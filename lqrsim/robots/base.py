@@ -9,9 +9,10 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_number, keep, vectors_of
 
 if TYPE_CHECKING:
-    from lqrsim.problem.collision_shape import CollisionGeoms
+    from lqrsim.problem.collision_shape import CollisionGeoms, ShapeInWorld
     from lqrsim.problem.collision_spheres import CollisionSpheres
     from lqrsim.problem.dynamics import Dynamics
+    from lqrsim.scenes.world import World
 
 
 class Robot(abc.ABC):
@@ -52,6 +53,19 @@ class Robot(abc.ABC):
         if self.geoms is not None:
             return {"geoms": self.geoms}
         return {"balls": self.balls} if self.balls is not None else {"radius": self.radius}
+
+    def among(self, world: "World") -> "ShapeInWorld":
+        """The collision shape among other obstacles than those of the scene, which move at their velocity.
+
+        Args:
+          world: the obstacles, where they are at the time 0 of a run.
+
+        Raises:
+          InputError: the shape has no distance to one of them.
+        """
+        from lqrsim.problem.collision_shape import shape_in
+
+        return shape_in(self.dynamics, world, **self.shape)
 
     @property
     @abc.abstractmethod

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.problem.clearance import Clearance
+from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
@@ -30,10 +32,10 @@ from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
-from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs
+from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, with_obstacles
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
-from lqrsim.scenes.world import KINDS, OTHER_KINDS
+from lqrsim.scenes.world import KINDS, OTHER_KINDS, World
 
 _AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
@@ -153,6 +155,25 @@ class MjcfRobot(Robot):
         many = not place and len(found.radii) > 0 if outline is None else check_flag(f"{who}: outline", outline)
         self.balls = MjcfBalls(found, self._balls_at) if many else None
         self.geoms: MjcfGeoms = MjcfGeoms(self.scene)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def among(self, world: World) -> ShapeInWorld:
+        """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them.
+
+        Args:
+          world: the obstacles, where they are at the time 0 of a run.
+
+        Raises:
+          InputError: an obstacle is a mesh or the like, or has the name of a geom.
+        """
+        if not len(world):
+            return shape_in(self.dynamics, world, geoms=self.geoms)
+        copy = Scene(self.name, with_obstacles(self.scene.xml, world), self.scene.model, World(), ())
+        stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
+        other = MjcfRobot(copy, **stated)
+        # Their places in the compiled model, which differ in the last bits.
+        each = zip(other.scene.world.obstacles, world.obstacles, strict=True)
+        there = World([replace(own, velocity=one.velocity) for own, one in each])
+        return shape_in(other.dynamics, there, geoms=other.geoms)
 
     def _states(self) -> Iterator[tuple[str, str]]:
         """Names and units: positions, velocities, states of actuators."""

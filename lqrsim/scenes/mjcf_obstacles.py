@@ -1,22 +1,49 @@
 """The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError
 from lqrsim.scenes.mjcf_joints import placed
+from lqrsim.scenes.world import KINDS, World
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 
+_LONG = 1e3  # m, half length of a geom that stands for an infinite one
 _NEAR = 1e-3  # m; a geom nearer to another touches it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 _LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
 _POSITIONS = 64  # random positions of joints in which a geom must touch what carries it
+
+
+def with_obstacles(xml: str, world: World) -> str:
+    """The MJCF with these obstacles as further geoms, fixed to the world, which nothing touches.
+
+    Raises:
+      InputError: an obstacle is of a kind of which MuJoCo needs more than its size, or has the name of a geom.
+    """
+    root = ElementTree.fromstring(xml)
+    taken = {one.get("name") for one in root.iter("geom")}
+    section = ElementTree.SubElement(root, "worldbody")
+    for one in world.obstacles:
+        if one.kind not in KINDS:
+            raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(KINDS)}")
+        if one.name in taken:
+            raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
+        turn = np.zeros(4)
+        mujoco.mju_mat2Quat(turn, one.rotation.ravel())
+        size = np.minimum([0.0, 0.0, 1.0] if one.kind == "plane" else one.size, _LONG)
+        numbers = {"size": size, "pos": one.position, "quat": turn}
+        texts = {key: " ".join(repr(number) for number in values.tolist()) for key, values in numbers.items()}
+        own = {"name": one.name, "type": one.kind, "contype": "0", "conaffinity": "0"}
+        ElementTree.SubElement(section, "geom", own | texts)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:

@@ -21,7 +21,7 @@ from lqrsim.errors import (
     check_seed,
     check_text,
 )
-from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
+from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
 from lqrsim.results.goal import Target
@@ -139,17 +139,15 @@ def _passing(plant: Plant, moving: World | None, time: float) -> ShapeInWorld | 
     """The robot's shape among obstacles that MuJoCo does not have, at this time in s.
 
     Raises:
-      InputError: there is no World, or the robot's distances are those of MuJoCo's geoms.
+      InputError: there is no World, or the robot has no distance to one of its obstacles.
     """
     if moving is None:
         return None
     check_kind("moving", moving, World, "a World of the obstacles, such as ls.World([ls.Obstacle(..., velocity=...)])")
     robot = plant.robot
-    if "geoms" in robot.shape:
-        raise InputError(f"moving: got obstacles for {robot.name}, whose geoms are its shape, want a radius or balls")
     if twice := sorted({*moving.names} & {*plant.obstacles, *plant.world.names}):
         raise InputError(f"moving: got {twice[0]}, which is an obstacle of the scene, want another name")
-    return shape_in(robot.dynamics, moving.moved(time), **robot.shape)
+    return robot.among(moving.moved(time))
 
 
 def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:

@@ -1,7 +1,7 @@
 """Funnels: the region around a plan from which a policy reaches the goal. `levels.py` searches for a level."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -219,13 +219,18 @@ class FunnelCheck:
     knot: int
     level: float
     reached: Estimate
-    successes: npt.NDArray[np.bool_]
+    successes: npt.NDArray[np.bool_] = field(repr=False)
 
     def __post_init__(self) -> None:
         check_count("FunnelCheck: knot", self.knot, at_least=0)
         check_number("FunnelCheck: level", self.level, at_least=0.0)
         check_kind("FunnelCheck: reached", self.reached, Estimate, "an Estimate")
         keep(self, successes=check_array("FunnelCheck: successes", self.successes, (None,)) != 0)
+
+    def __str__(self) -> str:
+        trials, sure = len(self.successes), f"{self.reached.confidence:g}"
+        rate = f"{self.successes.sum()} of {trials} new trials succeed, {self.reached:.3g} at confidence {sure}"
+        return f"knot {self.knot}, level {self.level:.3g}: {rate}"
 
 
 def check_funnel(

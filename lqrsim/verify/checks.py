@@ -374,7 +374,7 @@ def run_beside(path: str | os.PathLike[str]) -> Path:
         with contextlib.suppress(InputError):  # the file is a solution, or damaged
             if video_metadata.digest(save_load.load(found, Rollout)) in metadata.runs:
                 return found
-    raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
+    raise InputError(f"run: no file in {folder} has the run that {Path(path).name} shows, want its file, --run RUN.npz")
 
 
 def verify_video(

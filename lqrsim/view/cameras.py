@@ -113,15 +113,22 @@ def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect:
 def _bounds(rollout: Rollout, around: Array | None = None) -> tuple[Array, Array]:
     """The lowest and highest corner (3,) of the run with a margin; robots seen from above are at height zero.
 
-    A robot without a position counts with all of its balls. The points `around` (k, 3) need no margin.
+    A robot of several balls counts with all of them. The points `around` (k, 3) need no margin.
     """
     places = np.vstack([rollout.planned_places, *(rollout.places(trial) for trial in range(rollout.trials))])
     if rollout.balls is not None and not rollout.state_coordinates.position:
         places = np.vstack([rollout.balls.planned.reshape(-1, 3), rollout.balls.driven.reshape(-1, 3)])
     low, high = (rollout.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
-    margin = rollout.radius + 0.05 * float((high - low).max())
+    beyond = 0.05 * float((high - low).max())
+    margin = rollout.radius + beyond
     corners = np.vstack([low - margin, high + margin, *([] if around is None else [around])])
-    return corners.min(axis=0), corners.max(axis=0)
+    if rollout.balls is not None:  # they may reach farther than the radius
+        each, radii = (
+            np.vstack([rollout.balls.planned[None], rollout.balls.driven]),
+            beyond + rollout.balls.radii[:, None],
+        )
+        corners = np.vstack([corners, *(part.reshape(-1, 3) for part in (each - radii, each + radii))])
+    return np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
 
 
 def _right(span: Array, aspect: float) -> Array:

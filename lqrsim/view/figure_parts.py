@@ -20,6 +20,7 @@ from lqrsim.view.style import MARGIN, PLAN, SOLID
 EDGE = "#5b6470"
 OUTLINES = 24  # number of ellipses whose outlines are drawn
 BEADS = 0.2  # mean half axis, relative to the distance between neighbours, below which outlines look like beads
+EMPTY = 0.08  # margin around what is drawn of a robot without a radius, relative to its extent
 LEAST = 1e-6  # smallest chance that is drawn
 
 
@@ -30,11 +31,12 @@ def draw_obstacles(
 
     A planar robot has its own plane. A robot in space is seen along the third axis; `plane` has the two others.
     """
+    margin = 1.5 * radius if radius > 0 else EMPTY * float(np.ptp(places, axis=0).max())
     if len(space.position) == 2:
         flat = world.seen_by(space.plane, space.offset)
-        draw_in_plane(axes, flat, *bounds(places, flat, 1.5 * radius), radius, plane=space.plane)
+        draw_in_plane(axes, flat, *bounds(places, flat, margin), radius, plane=space.plane)
     else:
-        draw_projected(axes, world, *bounds(places, world, 1.5 * radius), *plane)
+        draw_projected(axes, world, *bounds(places, world, margin), *plane)
 
 
 def draw_plan(axes: Axes, path: Array, *, linewidth: float = 0.9) -> None:

@@ -10,7 +10,6 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view.cameras import Camera
 from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
@@ -376,9 +375,9 @@ def decorate(
     return geom
 
 
-def mark_radius(rollout: Rollout) -> float:
+def mark_radius(recorded: RecordedTrial) -> float:
     """Radius of the mark of a robot, in metres."""
-    return 0.25 * rollout.radius
+    return 0.25 * recorded.size
 
 
 def draw_mark(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -> None:

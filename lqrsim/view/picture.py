@@ -103,7 +103,7 @@ class SceneRenderer:
                 common = scene.ngeom
                 self.overlays.draw_force(scene, data, time)
                 if view.camera is not None:
-                    radius = mark_radius(self.recorded.rollout)
+                    radius = mark_radius(self.recorded)
                     draw_mark(scene, view.camera, self.recorded.place_in(data), radius)
                 mujoco.mjr_render(where, scene, self.context)
                 scene.ngeom = common
@@ -314,7 +314,8 @@ class Picture:
     @property
     def markers(self) -> tuple[float, ...]:
         """Radii in metres of the robots' marks in calibrated panes."""
-        return tuple(mark_radius(run) for run in self.runs)
+        sizes = {id(part.recorded.rollout): mark_radius(part.recorded) for part in self.parts}
+        return tuple(sizes[id(run)] for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also at earlier times.

@@ -232,21 +232,27 @@ FLAT = 0.05  # a curve whose range is a smaller part of the largest one's in its
 
 
 def plot_policy(
-    solution: Solution, path: str | os.PathLike[str], *, world: World, radius: float, tube: Tube | None = None
+    solution: Solution,
+    path: str | os.PathLike[str],
+    *,
+    world: World | None = None,
+    radius: float = 0.0,
+    tube: Tube | None = None,
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
 
     With a tube it shows the predicted region of 2 standard deviations about the plan, up to where it is too wide to be
     shown, and the chance of collision at each step. Without a tube it shows the positions whose total cost is near its
     least, which does not depend on disturbances; solutions of `ilqr` have no total cost, and show the plan alone. A
-    robot in space is seen from above and from the side. For a robot without a position, the plan's states are shown
-    instead.
+    robot in space is seen from above and from the side. For a system without a position, which need not be a robot,
+    the plan's states are shown instead, without `world` and `radius`.
 
     Args:
       solution: a solution with a policy.
       path: FILE.png, .pdf or .svg.
-      world: the obstacles, such as `scene.world`.
-      radius: radius of the robot, in metres.
+      world: the obstacles, such as `scene.world`; none by default.
+      radius: radius in metres of a robot in the plane that is one ball about its position; places closer to an obstacle
+        are grey. 0 leaves the grey out, which would be wrong for a robot of several balls.
       tube: tube of the solution, from `predict_tube`.
 
     Raises:
@@ -254,6 +260,7 @@ def plot_policy(
         written.
     """
     check_kind("solution", solution, Solution, "a Solution")
+    world = World() if world is None else world
     check_kind("world", world, World, "a World, such as scene.world")
     radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
@@ -304,7 +311,8 @@ def _tube(
     """The tube, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = solution.policy.state_coordinates
     plan = solution.trajectory.states[:, list(space.position)]
-    onto = _begin_projection(axes, space, world, plan, radius, plane, "tube", "grey: closer than the robot's radius")
+    legend = "grey: closer than the robot's radius" if radius > 0 else ""
+    onto = _begin_projection(axes, space, world, plan, radius, plane, "tube", legend)
     if tube is not None:
         ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
         figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
@@ -320,13 +328,17 @@ def _planes(space: Coordinates) -> list[tuple[int, int]]:
 
 
 def _begin_projection(
-    axes: Axes, space: Coordinates, world: World, plan: Array, radius: float, plane: tuple[int, int], title: str,
+    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: tuple[int, int], title: str,
     legend: str,
 ) -> Array:  # fmt: skip
-    """Draw the obstacles and the title of a projection; returns its axes (2, d). The legend explains flat obstacles."""
-    figure_parts.draw_obstacles(axes, space, world, plan, radius, plane)
+    """Draw the obstacles around places (k, d), and the title of a projection; returns its axes (2, d).
+
+    The legend explains flat obstacles.
+    """
+    figure_parts.draw_obstacles(axes, space, world, places, radius, plane)
     side = f"{title}, from {'above' if plane == (0, 1) else 'the side'}"
-    axes.set_title(f"{title} ({legend})" if len(space.position) == 2 else side)
+    in_plane = f"{title} ({legend})" if legend else title
+    axes.set_title(in_plane if len(space.position) == 2 else side)
     return np.eye(len(space.position))[list(plane)]
 
 
@@ -445,12 +457,13 @@ def _shadow(
     """The projection, the plan and the obstacles, seen along the axis that is not in `plane`."""
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
-    onto = _begin_projection(axes, space, world, plan, radius, plane, "funnel", "pale grey: within a radius")
+    held, last = funnel.knots[funnel.levels > 0], int(funnel.knots[-1]) + 1
+    reach = np.sqrt(np.diagonal(covariances[held], axis1=1, axis2=2))
+    shown = np.vstack([plan, plan[held] - reach, plan[held] + reach])  # the certified outlines are seen as a whole
+    onto = _begin_projection(axes, space, world, shown, radius, plane, "funnel", "pale grey: within a radius")
     every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # gives the outlines at the level
-    last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
     figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)
-    held = funnel.knots[funnel.levels > 0]
     outlines = every.outlines()[held]
     axes.add_collection(
         PolyCollection(

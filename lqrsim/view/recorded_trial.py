@@ -8,6 +8,7 @@ from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.mjcf_joints import in_axes_of_bodies
 from lqrsim.scenes.scene import model_from_xml
 
+ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
 
 
@@ -19,6 +20,7 @@ class RecordedTrial:
       robot: number of the robot's body in the model.
       planar: whether the robot is seen from above, with its overlays on the floor.
       floor: height of the ground below the robot in the first frame, in metres.
+      size: radius in metres of what stands for the robot at its position; see `drawn_size`.
       end: end of the plan, in seconds.
       times: (k,) times of the finite states.
       states, measured: (k, n).
@@ -42,6 +44,7 @@ class RecordedTrial:
         self.end = float(rollout.times[-1])
         self.planar = rollout.state_coordinates.from_above
         self.robot = robot_body(self.model, rollout.body)
+        self.size = drawn_size(self.model, rollout, self.robot)
         data = mujoco.MjData(self.model)
         self.pose(data, 0.0)
         self.floor = floor_below(self.model, data, self.robot)
@@ -77,7 +80,7 @@ class RecordedTrial:
         """Planned places (B, 3) and radii (B,) of the robot's balls; without balls, of the robot as a single ball."""
         run = self.rollout
         if run.balls is None:
-            return self.planned(time)[None], np.array([run.radius])
+            return self.planned(time)[None], np.array([self.size])
         planned = run.balls.planned
         flat = self._interpolated(planned.reshape(len(planned), -1), run.times, time)
         return flat.reshape(-1, 3), run.balls.radii
@@ -180,6 +183,21 @@ def robot_body(model: mujoco.MjModel, name: str) -> int:
     if number < 0:
         raise InputError(f"rollout.body: got {name!r}, want the name of a body of the model")
     return number
+
+
+def drawn_size(model: mujoco.MjModel, rollout: Rollout, robot: int) -> float:
+    """The radius in metres of what stands for a robot at its position in a picture, so that it does not hide the robot.
+
+    The radius of a robot with arms is their reach. If it is more than ARMS times the half width of the robot's own
+    body, along the axes in which it is seen, the half width is taken.
+    """
+    axes, reach, rotation = (2 if rollout.state_coordinates.from_above else 3), 0.0, np.zeros(9)
+    for geom in np.flatnonzero(model.geom_bodyid == robot) if rollout.state_coordinates.position else ():
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        turn, (middle, half) = rotation.reshape(3, 3), model.geom_aabb[geom].reshape(2, 3)
+        extent = np.abs(model.geom_pos[geom] + turn @ middle) + np.abs(turn) @ half
+        reach = max(reach, float(extent[:axes].max()))
+    return reach if 0 < ARMS * reach < rollout.radius else rollout.radius
 
 
 def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
