@@ -102,6 +102,13 @@ def interruptible() -> Iterator[None]:
         signal.signal(number, _raise_interrupt)
     try:
         yield
+    except ImportError as error:
+        # A module in C++ that is interrupted while it is imported raises an ImportError instead.
+        cause = error
+        while (cause := cause.__cause__) is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise cause from None
+        raise
     finally:
         for number in ours:
             signal.signal(number, _end_at_once)

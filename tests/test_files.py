@@ -7,6 +7,7 @@ import io
 import json
 import os
 import pickle
+import socket
 import time
 import tracemalloc
 import warnings
@@ -73,15 +74,24 @@ def test_a_link_is_written_through(drive_solution: ls.Solution, tmp_path: Path) 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no pipes in folders")
 def test_only_regular_files_are_written_to(drive_solution: ls.Solution, tmp_path: Path) -> None:
-    """A pipe would be replaced by a file, and whoever reads from it would wait for ever."""
-    pipe, folder = tmp_path / "pipe.npz", tmp_path / "folder.npz"
+    """A pipe would be replaced by a file, and whoever reads from it would wait for ever; a link to one likewise."""
+    pipe, folder, listener = (tmp_path / f"{name}.npz" for name in ("pipe", "folder", "listener"))
+    link, loop, ring = (tmp_path / f"{name}.npz" for name in ("link", "loop", "ring"))
     os.mkfifo(pipe)
     folder.mkdir()
-    for path, what in ((pipe, "neither a file nor a folder"), (folder, "a folder")):
+    with socket.socket(socket.AF_UNIX) as opened:
+        opened.bind(os.path.relpath(listener))  # a path of at most some 100 characters
+    for one, to in ((link, pipe), (loop, ring), (ring, loop)):
+        one.symlink_to(to)
+    odd, itself = "neither a file nor a folder", "a link to itself"
+    kinds = ((pipe, odd), (folder, "a folder"), (listener, odd), (link, odd), (loop, itself), (ring, itself))
+    before = [path.lstat() for path, _ in kinds]
+    for path, what in kinds:
         with pytest.raises(ls.InputError, match=f"output: got .*, which is {what}, want the name of a regular file"):
             ls.save(drive_solution, path)
-    assert pipe.is_fifo()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.npz", "pipe.npz"]
+    after = [path.lstat() for path, _ in kinds]
+    assert [(one.st_ino, one.st_mode) for one in after] == [(one.st_ino, one.st_mode) for one in before]
+    assert len(list(tmp_path.iterdir())) == len(kinds)
 
 
 def test_so_do_the_solutions_of_ilqr_and_failed_ones(tmp_path: Path, differential_drive: ls.Scenario) -> None:

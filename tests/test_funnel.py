@@ -9,6 +9,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from pucks import RADIUS, STEPS, Puck, left, plant, solution
@@ -195,6 +196,14 @@ def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:
         ls.funnel(**({"plant": ice, "solution": PLAN} | wrong))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("strength", [5.0, 1e-9])
+def test_a_funnel_is_not_checked_under_disturbances_that_change_the_start(ice: ls.Plant, strength: float) -> None:
+    found = funnel_by_hand(PLAN, np.eye(4), knots=(0,), levels=(0.1,))
+    given = [ForceNoise(0.1), InitialStateError(strength)]
+    with pytest.raises(InputError, match="got InitialStateError, which changes the start of a run"):
+        ls.stress.check_funnel(found, ice, PLAN, disturbances=given)
 
 
 @hypothesis.given(st.integers(0, 2**32 - 1), st.booleans())

@@ -74,6 +74,42 @@ def test_a_signal_while_it_starts_is_one_line(module: str, number: int) -> None:
     assert (process.returncode, error) == (128 + number, STOPPED)
 
 
+WITHIN = """
+import os, signal, sys
+from lqrsim.cli import main
+
+module, number = sys.argv.pop(1), int(sys.argv.pop(1))
+
+
+def told(event, about):
+    if event == "import" and about[0] == module:
+        os.kill(os.getpid(), number)
+
+
+sys.addaudithook(told)
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+@pytest.mark.parametrize(
+    ("module", "number"),
+    [
+        ("mujoco._enums", signal.SIGTERM),
+        *rarely(
+            ("mujoco._structs", signal.SIGINT), ("mujoco._specs", signal.SIGTERM), ("mujoco.glfw", signal.SIGINT),
+            ("numpy", signal.SIGTERM),
+        ),
+    ],
+)  # fmt: skip
+def test_a_signal_while_a_command_imports_is_one_line(module: str, number: int, tmp_path: Path) -> None:
+    """MuJoCo's modules import each other from C++, which makes an ImportError of the interrupt."""
+    command = ["solve", "quadrotor", "--out", tmp_path]
+    with start(sys.executable, "-c", WITHIN, module, str(int(number)), *command) as process:
+        _, error = process.communicate(timeout=600)
+    assert (process.returncode, error) == (128 + number, STOPPED)
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Path:
     folder = tmp_path_factory.mktemp("flown")

@@ -251,8 +251,9 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     # The target of a link is replaced, not the link.
     target = Path(os.path.realpath(check_path("output", path)))
-    if target.exists() and not target.is_file():
-        what = "a folder" if target.is_dir() else "neither a file nor a folder"
+    looped = target.is_symlink()  # after all links have been followed
+    if looped or (target.exists() and not target.is_file()):
+        what = "a folder" if target.is_dir() else "a link to itself" if looped else "neither a file nor a folder"
         raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a regular file")
     # A random name, so that two writers do not collide. It is known before the file exists, so that Ctrl-C at any
     # moment removes the file. The suffix stays, because writers choose the format by it.
