@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from parking import cases, descent, judge, outcomes
 from parking.cases import Case, Plan
-from parking.task import problem_of
+from parking.task import Shape, Task, problem_of
 from sampling import rarely
 
 import lqrsim as ls
@@ -51,6 +51,25 @@ def test_where_all_starts_are_stuck_at_one_obstacle_a_motion_around_it_is_found(
     """The least violation behind a post is stationary, and all controls that do not steer around it lead there."""
     found = outcomes.look(1709, time_limit=None)
     assert (found.verdict, found.status) == ("right", "CONVERGED"), found.said
+
+
+@pytest.mark.parametrize(
+    ("gap", "weight", "steps"), [(6.0, 20.0, 20), *rarely((6.0, 1.0, 20), (5.0, 500.0, 20), (5.0, 5000.0, 25))]
+)
+def test_a_car_beside_a_gap_backs_its_trailer_into_it(gap: float, weight: float, steps: int) -> None:
+    """It has to drive on first. What is missed by plans that only turn is stationary, and they are where all other
+    starts lead.
+    """
+    cars = [Shape(f"{x:+}", False, np.array([x * gap / 2, -0.5]), np.pi / 2, (1.3, 0.9)) for x in (-1, 1)]
+    task = Task(
+        wheelbase=2.7, trailers=(3.0,), dt=20.0 / steps, steps=steps, start=np.array([-1.0, 4.5, 0.0, 0.0, 0.0]),
+        goal=np.array([0.0, 1.5, np.pi / 2, 0.0, 0.0]), exact=True, weight=weight, effort=np.array([0.5, 0.5]),
+        obstacles=tuple(cars), repulsion=None, clearance=0.02, top=np.array([1.5, 0.8]), bounds=np.array([0.6, 0.8]),
+        road=(-100.0, 100.0),
+    )  # fmt: skip
+    solution = ls.smooth(problem_of(task), threads=1)
+    assert solution.status is ls.Status.CONVERGED, solution
+    assert judge.examine(task, solution.trajectory.states, solution.trajectory.controls).wrong == []
 
 
 @pytest.mark.parametrize("number", [13, *rarely(133)])

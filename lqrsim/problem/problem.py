@@ -242,6 +242,19 @@ class Problem:
         terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
         return self._with(**costs, _terms=self._terms | terms)
 
+    def with_constraints(self, constraints: Sequence[Constraint]) -> "Problem":
+        """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`.
+
+        Args:
+          constraints: the constraints, in the place of the present ones.
+
+        Raises:
+          InputError: the constraints do not fit the system, or each other.
+        """
+        wanted = "a list of constraints, such as [Clearance(...)]"
+        kept = check_items("constraints", constraints, Constraint, wanted)
+        return self._with(constraints=kept, _constraint_terms=bind_all(kept, self.dynamics, self.times))
+
     def later(self, seconds: float) -> "Problem":
         """The same problem with a later beginning: moving obstacles are at their positions at that time, and costs and
         constraints with a row for each knot begin with a later one and repeat the last.

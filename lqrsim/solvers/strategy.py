@@ -3,9 +3,9 @@
 `solve`
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
      With constraints, the others follow as long as they may cost less.
-  2. If the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: other
-     routes, found with larger weights of obstacles and goal; without an ObstacleCost, other paths and oscillating
-     controls (`Search.widen`).
+  2. If the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: from a
+     plan without the constraints that it may pass on one side or another; other routes, found with larger weights of
+     obstacles and goal; without an ObstacleCost, other paths and oscillating controls (`Search.widen`).
   3. If the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
   4. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
@@ -214,9 +214,10 @@ class Search:
 
     def widen(self) -> None:
         """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
-        # INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
-        poor = self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
-        if not (poor and self._may_go_on):
+        if not (self._is_poor and self._may_go_on):
+            return
+        self._try_past_constraints()
+        if not self._is_poor:
             return
         if pull(self._problem) > 0:
             for times in HEAVIER:
@@ -258,6 +259,30 @@ class Search:
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
+
+    def _try_past_constraints(self) -> None:
+        """While no plan keeps the constraints: plan without those that may be passed on one side or another.
+
+        A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
+        """
+        problem = self._problem
+        kept = [one for one, passed in zip(problem.constraints, passable(problem), strict=True) if not passed]
+        exact = self.best[0].second_order
+        if not (exact and self._without_plan) or len(kept) == len(problem.constraints) or self._budget.stop.due:
+            return
+        free = problem.with_constraints(kept)
+        given = guides(free, None)
+        search = Search(
+            [name for name, _ in given], [self._another(resolve(one, free), free) for _, one in given],
+            self._callback, self._threads,
+        )  # fmt: skip
+        search.run()
+        search.widen()
+        found = search.best[1]
+        if found.success and not self._budget.stop.due:
+            run = self._add(policy_of(found, "a plan without what is in the way"))
+            self._known.from_start = False
+            self._offer(run, self._finish(run, refine))
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
@@ -520,6 +545,14 @@ class Search:
         if not self._tried and self._is_unacceptable:
             return True
         return bool(self._soft) or any(True for _ in self._problem.dynamics.softened(self.best[1].states))
+
+    @property
+    def _is_poor(self) -> bool:
+        """Whether other starts are to be tried.
+
+        INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
+        """
+        return self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
 
     @property
     def _is_unacceptable(self) -> bool:

@@ -244,6 +244,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Problem.with_costs": ({
             "self": place.problem, "stage_cost": place.problem.stage_cost, "final_cost": place.problem.final_cost,
         },),
+        "Problem.with_constraints": ({"self": place.problem, "constraints": [ls.StateBounds({"m": (-9.0, 9.0)})]},),
         "Problem.terms": ({"self": place.problem, "which": "initial"},),
         "Obstacle": ({
             "name": "box", "kind": "box", "position": np.zeros(3), "rotation": np.eye(3), "size": np.ones(3)
