@@ -258,7 +258,8 @@ def test_filters_estimate_and_command_what_they_do_in_python(
             expected = policy.sensor[k] @ policy.nominal[k, :n] + policy.sensor_offset[k]
             measured = None if step % 3 == 1 else expected + 0.1 * rng.normal(size=len(seen))
             python, state = policy.step(state, measured, t)
-            np.testing.assert_allclose(law(measured, t), python, rtol=1e-12, atol=1e-11)
+            # Rounding errors grow from step to step, for the drawn filters need not be stable.
+            np.testing.assert_allclose(law(measured, t), python, rtol=1e-12, atol=1e-9)
 
 
 @needs_compiler

@@ -543,7 +543,7 @@ def test_a_callback_hears_of_the_iterations_of_all_starts_that_are_run_to_their_
     told: list[Iteration] = []
     solution = ls.smooth(problem(ls.GoalState(x=far, v=0.0), goal=(far, 0.0), limit=0.5), callback=told.append)
     assert solution.status is Status.INFEASIBLE
-    assert len(solution.candidates) > 3
+    assert len(solution.candidates) >= 3
     assert len(told) == sum(one.iterations for one in solution.candidates)
 
 

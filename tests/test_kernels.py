@@ -6,6 +6,7 @@ compiled on its own it has to make the same.
 
 import ast
 import ctypes
+import itertools
 import threading
 import time
 from collections import Counter
@@ -40,6 +41,7 @@ from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
+    bound_by_knot,
     certificate,
     cost_to_come_dual,
     cost_to_come_primal,
@@ -773,6 +775,10 @@ class TestRareEnds:
         data = np.array([1.0, -1.0, 0.5, 2.0])
         for t in (2, 3):
             replay(source_of(state_bound), SIZES, "value", X, U, t, 0, data)
+        each = np.array([2.0, 1.0, -1.0, 2.0, 0.5, np.inf, 0.0, 1.0, np.inf, -np.inf, 0.1])  # two rows, of two knots
+        for t, row in itertools.product(range(4), range(2)):
+            replay(source_of(bound_by_knot), SIZES, "value", X, U, t, row, each)
+            replay(source_of(bound_by_knot), SIZES, "slope", X, U, t, row, each, np.zeros(5))
         ball = np.array(WORLD.table).ravel()
         at = np.zeros(3), np.zeros((3, 3))
         given = *WORLD.obstacles[0].position.tolist(), *at

@@ -418,7 +418,7 @@ def test_kinds_and_steps_are_part_of_the_digest() -> None:
         (lambda: ls.StateBounds(x=(-np.inf, np.inf)), "StateBounds: 'x': got -inf to inf, want low below high, and"),
         (lambda: anything.StateBounds([0, 0]), "StateBounds: got [0, 0], want (low, high) by name of a state"),
         (lambda: anything.StateBounds(x=1.0), "StateBounds: 'x': got 1.0, want (low, high)"),
-        (lambda: ls.StateBounds(x=(np.nan, 1)), "StateBounds: 'x': got nan"),
+        (lambda: ls.StateBounds(x=(np.nan, 1)), "StateBounds: 'x': low: got nan"),
         (lambda: problem(ls.StateBounds(y=(0, 1))), "StateBounds: states: got 'y', want one of: x, v"),
         (lambda: problem(ls.StateBounds(x=(-np.inf, 0.5)), ls.GoalState([1, 0])),
          "constraints: got a goal of 1 m for x, want x of at most 0.5 m"),

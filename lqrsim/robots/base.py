@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_number, keep, vectors_of
+from lqrsim.errors import Array, InputError, check_kind, check_number, keep, vectors_of
 
 if TYPE_CHECKING:
     from lqrsim.problem.collision_shape import CollisionGeoms, ShapeInWorld
@@ -64,7 +64,9 @@ class Robot(abc.ABC):
           InputError: the shape has no distance to one of them.
         """
         from lqrsim.problem.collision_shape import shape_in
+        from lqrsim.scenes.world import World
 
+        check_kind("world", world, World, "a World, such as scene.world")
         return shape_in(self.dynamics, world, **self.shape)
 
     @property

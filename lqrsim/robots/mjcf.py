@@ -15,6 +15,7 @@ from lqrsim.errors import (
     check_array,
     check_flag,
     check_items,
+    check_kind,
     check_name,
     check_number,
     check_weights,
@@ -165,7 +166,7 @@ class MjcfRobot(Robot):
         Raises:
           InputError: an obstacle is a mesh or the like, or has the name of a geom.
         """
-        if not len(world):
+        if not len(check_kind("world", world, World, "a World, such as scene.world")):
             return shape_in(self.dynamics, world, geoms=self.geoms)
         copy = Scene(self.name, with_obstacles(self.scene.xml, world), self.scene.model, World(), ())
         stated: dict[str, Any] = {**self._stated, "obstacles": world.names}

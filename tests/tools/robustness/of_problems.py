@@ -126,6 +126,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "self": slider, "start": slider.at(), "goal": slider.at(slider=0.2), "steps": 5, "dt": 0.02,
             "weights": 10.0, "effort": [1.0], "damping": 1e-3,
         }, 0.3),
+        **{f"{kind}.among": ({"self": robot, "world": place.plant.world},) for kind, robot in known.items()},
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),
