@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -294,6 +295,28 @@ def test_what_is_done_quickly_is_not_talked_about(capsys: pytest.CaptureFixture[
         for done in (40, 60, 100):
             progress(done, 100)
     assert capsys.readouterr() == ("40 of 100 trials are done, 60 to go\n", "")
+
+
+@pytest.mark.parametrize(("total", "each", "count"), [(12, 30.0, 12), (400, 0.7, 27), (3, 4000.0, 3)])
+def test_lines_say_how_far_it_is_what_is_found_and_how_long_it_takes(
+    total: int, each: float, count: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where there is no terminal, at most one in ten seconds, by a clock on which each part takes as long."""
+    now, times = 0.0, list[float]()
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: now))
+    with console.progress("looking", "knot") as progress:
+        for done in range(total + 1):
+            progress(done, total, f"level {done}")
+            for line in capsys.readouterr().out.splitlines():
+                times.append(now)
+                what, rate, left, found = re.split(", |; ", line)
+                assert (what, found) == (f"looking: {done} of {total} knots", f"level {done}")
+                assert float(rate.removesuffix(" knots/s")) == pytest.approx(1 / each, rel=0.01)
+                *hours, minutes, seconds = map(int, left.removesuffix(" left").split(":"))
+                assert 60 * (60 * sum(hours) + minutes) + seconds == pytest.approx((total - done) * each, abs=1.0)
+            now += each
+    assert len(times) == count
+    assert (np.diff(times[:-1]) > 10.0).all()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no semaphores with names")

@@ -649,6 +649,20 @@ def test_a_funnel_that_its_trials_do_not_show_is_refused(tmp_path: Path, drive_s
             ls.load(path)
 
 
+@pytest.mark.parametrize("text", ["\x1b[2J", "\x9b31m", "\a", "fell\nover", "\u202eover", "\u2028"])
+def test_a_funnel_with_text_that_acts_on_a_terminal_is_refused(
+    tmp_path: Path, drive_solution: ls.Solution, text: str
+) -> None:
+    """Its summary prints the reasons and the disturbances."""
+    funnel = funnel_by_hand(drive_solution, np.eye(2), knots=(0, 50), levels=(1.0, 2.0))
+    for name, changed in (("reasons", ["", text]), ("disturbances", ["wind", text])):
+        path = ls.save(dataclasses.replace(funnel, disturbances=("wind", "gusts")), tmp_path / "funnel.npz")
+        rewrite(path, **{name: changed})
+        with pytest.raises(ls.InputError, match=rf"{name}\[1\]: got .*, want one printable line") as refused:
+            ls.load(path)
+        assert str(refused.value).isprintable()
+
+
 @pytest.mark.parametrize("status", ls.Status)
 def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(
     drive_solution: ls.Solution, status: ls.Status

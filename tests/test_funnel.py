@@ -137,7 +137,10 @@ def test_from_nowhere(ice: ls.Plant) -> None:
 
 def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
     options: dict[str, Any] = {"disturbances": [ForceNoise(0.02)], "knots": (0, 3), "seed": 4, **COARSE}
-    found = ls.funnel(ice, PLAN, **options)
+    told: list[tuple[int, int, str]] = []
+    found = ls.funnel(ice, PLAN, progress=lambda *one: told.append(one), **options)
+    assert {one[:2] for one in told[:-1]} == {(0, 2), (1, 2)}  # while it looks, too
+    assert told[-1] == (2, 2, f"level {found.levels[1]:.3g} at knot 3; {found.simulated:,} trials")
     again = ls.funnel(ice, PLAN, threads=1, **options)
     assert found.digest == again.digest
     options["seed"] = 5

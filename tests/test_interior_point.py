@@ -555,7 +555,7 @@ def test_the_time_limit_and_the_limit_of_iterations_end_it_with_the_best_plan() 
         assert len(solution.iterations) <= most
         ends(of, solution)
         assert solution.violation <= before
-        before = np.inf
+        before = solution.violation
     late = ls.smooth(of, time_limit=1.0, callback=lambda iteration: time.sleep(1.0))
     assert late.status is Status.TIME_LIMIT
     assert len(late.iterations) == 1

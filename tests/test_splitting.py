@@ -19,6 +19,7 @@ from lqrsim.disturbances import (
     Push,
 )
 from lqrsim.simulation.disturbances import preset
+from lqrsim.stress.design_point import smallest_failure
 from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import rate
 from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision_score, miss_score
@@ -437,3 +438,25 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
 def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_progress_is_told_from_the_beginning_to_the_result(seed: int) -> None:
+    """Before anything is done, after each part, and at last with what is returned."""
+    told: list[tuple[int, int, str]] = []
+
+    def note(done: int, of: int, found: str) -> None:
+        told.append((done, of, found))
+
+    rare = failure_probability(along(3, 2.0), 3, repetitions=5, particles=200, seed=seed, progress=note)
+    assert [one[:2] for one in told] == [(done, 5) for done in range(6)]
+    assert (told[0][2], told[-1][2]) == ("", f"{rare.probability.value:.2g}")
+    for done, _, found in told[1:]:  # the mean of what is done
+        assert float(found) == pytest.approx(rare.repetitions[:done].mean(), rel=0.06)
+    told.clear()
+    nearest = smallest_failure(along(3, 2.0), 3, rounds=6, seed=seed, progress=note)
+    assert told[0][:2] == (0, 6)
+    assert [one[0] for one in told] == list(range(len(told)))
+    distances = [float(found.removeprefix("distance ")) for _, _, found in told]
+    assert distances == pytest.approx(nearest.history[: len(told)], rel=0.01)
+    assert distances[-1] == pytest.approx(nearest.distance, rel=0.01)
