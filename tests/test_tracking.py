@@ -540,7 +540,7 @@ def test_it_warns_if_no_law_brings_the_model_back(caplog: pytest.LogCaptureFixtu
     assert "loses the plan from some deviations" in caplog.text
 
 
-@pytest.mark.parametrize("std", [1.0, 2.0])
+@pytest.mark.parametrize("std", [2.0, pytest.param(1.0, marks=pytest.mark.long)])
 def test_a_law_that_limits_and_a_wrong_parameter_defeat_is_not_chosen(std: float) -> None:
     """A reaction a -> b -> c that runs away if it is heated, with one rate that is not known: what is made of b.
 
