@@ -109,7 +109,7 @@ def test_plans_meet_the_conditions_of_an_optimum(seed: int, steps: int, size: tu
 
 @pytest.mark.parametrize("finish", ["newton", None])
 def test_the_same_bound_at_each_knot_is_one_bound(finish: Any) -> None:
-    """To the last bit, though another kernel computes it."""
+    """To the last bit."""
     once = cart(constraints=[ls.StateBounds(x=(-np.inf, 1.02), v=(-0.2, 0.7))])
     each = cart(constraints=[ls.StateBounds(x=(-np.inf, 1.02), v=(np.full(21, -0.2), np.full(21, 0.7)))])
     one, other = ls.smooth(once, finish=finish), ls.smooth(each, finish=finish)
@@ -173,6 +173,25 @@ def test_replanning_keeps_them_at_their_times(horizon: Any) -> None:
         np.testing.assert_allclose(x, plan.trajectory.states[after:, 0], atol=1e-5)
     else:
         assert x.max() > 0.6
+
+
+@pytest.mark.parametrize("after", [12, 13, 19])
+@pytest.mark.parametrize("horizon", ["shrinking", "moving"])
+def test_bounds_that_are_over_hold_nothing(horizon: str, after: int) -> None:
+    """The gate is closed up to knot 12; of what is left after that, the plan is the one without a gate."""
+    closed = np.full(21, np.inf)
+    closed[:13] = 0.5
+
+    def rest(problem: ls.Problem) -> ls.Problem:
+        if horizon == "moving":
+            problem, gone = problem.later(after * DT), 0
+        else:
+            gone = after
+        return problem.from_state([0.45, 0.3], after=gone)
+
+    gated, free = (ls.smooth(rest(cart(constraints=kept))) for kept in ([ls.StateBounds(x=(-np.inf, closed))], []))
+    assert gated.success
+    assert gated.cost == pytest.approx(free.cost, rel=1e-9)
 
 
 def test_violations_of_runs_are_counted_knot_by_knot() -> None:

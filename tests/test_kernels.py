@@ -41,7 +41,6 @@ from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
-    bound_by_knot,
     certificate,
     cost_to_come_dual,
     cost_to_come_primal,
@@ -772,13 +771,9 @@ class TestRareEnds:
                 replay(source_of(mjcf_dynamics), {"N": 6, "M": 1, "W": 7}, "rotation_vector_near", *given)
 
     def test_after_the_last_step_and_in_the_middle(self) -> None:
-        data = np.array([1.0, -1.0, 0.5, 2.0])
-        for t in (2, 3):
-            replay(source_of(state_bound), SIZES, "value", X, U, t, 0, data)
-        each = np.array([2.0, 1.0, -1.0, 2.0, 0.5, np.inf, 0.0, 1.0, np.inf, -np.inf, 0.1])  # two rows, of two knots
+        data = np.array([2.0, 1.0, -1.0, 2.0, 0.5, np.inf, 0.0, 1.0, np.inf, -np.inf, 0.1])  # two rows, of two knots
         for t, row in itertools.product(range(4), range(2)):
-            replay(source_of(bound_by_knot), SIZES, "value", X, U, t, row, each)
-            replay(source_of(bound_by_knot), SIZES, "slope", X, U, t, row, each, np.zeros(5))
+            replay(source_of(state_bound), SIZES, "value", X, U, t, row, data)
         ball = np.array(WORLD.table).ravel()
         at = np.zeros(3), np.zeros((3, 3))
         given = *WORLD.obstacles[0].position.tolist(), *at

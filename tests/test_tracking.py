@@ -2,7 +2,7 @@
 
 import dataclasses
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
 
@@ -483,6 +483,14 @@ def test_states_that_the_goal_leaves_free_are_held_loosely() -> None:
     assert np.sqrt(tube.covariance[-1, 0, 0]) < 0.004
 
 
+def stepped(rate: Callable[[Array, Array], Array], x: Array, u: Array, h: float) -> Array:
+    """The states (K, n) after a step of h seconds by Runge and Kutta's method."""
+    a = rate(x, u)
+    b = rate(x + h / 2 * a, u)
+    c = rate(x + h / 2 * b, u)
+    return x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, u))
+
+
 def in_wind(most: float, limit: float) -> ls.Problem:
     """A boat that the wind stops when it heads up by more than `most`, and that cannot turn without speed."""
     boat = ls.Dynamics(
@@ -515,10 +523,7 @@ def test_a_law_that_the_linear_model_alone_likes_is_not_chosen() -> None:
         for t in range(100):
             u = np.clip(x @ policy.gain[t].T + policy.offset[t], -20, 20)[:, 0]
             for _ in range(8):
-                a = rate(x, u)
-                b = rate(x + h / 2 * a, u)
-                c = rate(x + h / 2 * b, u)
-                x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, u))
+                x = stepped(rate, x, u, h)
         lost = ~(np.linalg.norm(x[:, :2] - (10, 0), axis=1) < 6 * 0.4)
     assert lost.mean() < 0.5
 
@@ -580,10 +585,7 @@ def test_a_law_that_limits_and_a_wrong_parameter_defeat_is_not_chosen(std: float
     for t in range(steps):
         u = np.clip(x @ policy.gain[t].T + policy.offset[t], -0.6, 0.6)[:, 0]
         for _ in range(2):
-            a = speed(x, u)
-            b = speed(x + h / 2 * a, u)
-            c = speed(x + h / 2 * b, u)
-            x = x + h / 6 * (a + 2 * b + 2 * c + speed(x + h * c, u))
+            x = stepped(speed, x, u, h)
     off = x[:, 1] - solution.trajectory.states[-1, 1]
     predicted = float(np.sqrt(tube.covariance[-1, 1, 1]))
     assert off.std() < 1.3 * predicted

@@ -30,7 +30,7 @@ from lqrsim.errors import (
     keep,
     numbers_of,
 )
-from lqrsim.kernels import bound_by_knot, state_bound
+from lqrsim.kernels import state_bound
 from lqrsim.problem.costs import OfFunction, ProblemPart, bound_at, rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 
@@ -205,9 +205,9 @@ class GoalState(Constraint):
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         rows = list(self._numbers(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
-        data = [(i, 1.0, number, np.inf) for i, number in rows]
+        data = _bound_data([(i, 1.0, np.inf, np.array([number])) for i, number in rows])
         return ConstraintTerm(
-            source_of(state_bound), np.ravel(data), len(rows), described.__getitem__, equality=True, final_only=True
+            source_of(state_bound), data, len(rows), described.__getitem__, equality=True, final_only=True
         )
 
 
@@ -251,8 +251,12 @@ class StateBounds(Constraint):
         return other
 
     def _of(self, dynamics: Dynamics) -> dict[int, tuple[Side, Side]]:
-        """(low, high) of each bounded state, by index."""
-        return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, _bound)
+        """(low, high) of each bounded state, by index. Of what is left of a plan, all of them may be infinite."""
+
+        def sides(field: str, given: object) -> tuple[Side, Side]:
+            return given  # pyright: ignore[reportReturnType]
+
+        return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, sides)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_to_goal(dynamics, {}, 0)
@@ -268,22 +272,16 @@ class StateBounds(Constraint):
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
             for i, sides in self._of(dynamics).items():
                 name, numbers = names[i], np.atleast_1d(sides[side])
-                finite = numbers[np.isfinite(numbers)]
-                if not len(finite):
+                acts = np.isfinite(numbers)
+                if not (acts.any() or isinstance(sides[side], np.ndarray)):
                     continue
-                wanted = f"{name} of {word} {_quantities(finite, units[i])}"
+                wanted = f"{name} of {word} {_quantities(numbers[acts] if acts.any() else numbers, units[i])}"
                 if i in goals and sign * (goals[i] - numbers[-1]) < 0:
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
-                rows.append((i, sign, numbers, steps - 1 if i in goals else np.inf))
+                rows.append((i, sign, steps - 1 if i in goals else np.inf, numbers))
                 described.append(wanted)
-        knots = max(len(numbers) for _, _, numbers, _ in rows)
-        if knots == 1:
-            data = np.ravel([(i, sign, numbers[0], last) for i, sign, numbers, last in rows])
-            return ConstraintTerm(source_of(state_bound), data, len(rows), described.__getitem__)
-        table = [[i, sign, last, *np.broadcast_to(numbers, knots)] for i, sign, numbers, last in rows]
-        data = np.concatenate([[knots], np.ravel(table)])
-        return ConstraintTerm(source_of(bound_by_knot), data, len(rows), described.__getitem__)
+        return ConstraintTerm(source_of(state_bound), _bound_data(rows), len(rows), described.__getitem__)
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
@@ -404,6 +402,13 @@ def _side(field: str, given: object) -> Side:
 
 def _ahead(side: Side, steps: int, horizon: str) -> Side:
     return rows_ahead(side, steps, horizon) if isinstance(side, np.ndarray) else side
+
+
+def _bound_data(rows: Sequence[tuple[int, float, float, Array]]) -> Array:
+    """The numbers for `state_bound.py`: of each row the state, the sign, the last step, and one bound or K of them."""
+    knots = max(len(bounds) for *_, bounds in rows)
+    table = [[i, sign, last, *np.broadcast_to(bounds, knots)] for i, sign, last, bounds in rows]
+    return np.concatenate([[knots], np.ravel(table)])
 
 
 def _quantity(number: float, unit: str) -> str:
