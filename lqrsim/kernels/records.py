@@ -611,5 +611,7 @@ MEMORY = _row(
 # A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")
 
-# The results of `certificate.certify`.
-CERTIFICATE = _row("cost", "scale", "dynamics_residual", "policy_residual", "beyond_limits", "decrease")
+# The results of `certificate.certify`; and of `certificate.reduced_curvature`, the curvature.
+CERTIFICATE = _row(
+    "cost", "scale", "typical", "dynamics_residual", "policy_residual", "beyond_limits", "decrease", "curvature"
+)  # fmt: skip

@@ -12,7 +12,7 @@ from lqrsim.results import notebook
 from lqrsim.results.fields import LINE, Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
+from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -101,6 +101,11 @@ class Solution(Plan):
     def optimality(self) -> float:
         """First-order optimality of the plan; see `Certificate`."""
         return self.certificate.optimality
+
+    @property
+    def curvature(self) -> Curvature:
+        """Whether a converged plan is a minimum; see `Curvature`."""
+        return self.certificate.curvature
 
     @property
     def violation(self) -> float:

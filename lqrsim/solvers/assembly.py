@@ -125,6 +125,8 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
         return (
             'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
         )
+    if status is Status.NOT_FINITE and not np.isfinite(found.states).all():
+        return "begin with start=[...], controls under which the states stay in their domain"
     if status is Status.INFEASIBLE and found.against:
         relaxed = f"relax {found.against[0].rsplit(' at ', 1)[0]}"
         return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"
