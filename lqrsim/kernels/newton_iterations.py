@@ -142,7 +142,7 @@ def newton_pass(settings, model, work, memory):
         size = max(size, abs(second.constant[t]))
     memory.negligible = 1e-26 * size
     memory.decrease = 2 * left
-    memory.promised = relative_optimality(failed, left, memory.merit, memory.negligible)
+    memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     return good
 
 

@@ -105,10 +105,10 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success."""
+    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success that needs none."""
     status = found.status
-    if status.success:
-        return ""
+    if status.success or found.remedy:
+        return found.remedy
     if inside := problem.goal_inside:
         geoms = any("geoms" in one.shape for one in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")

@@ -111,7 +111,21 @@ class Ladder:
                 self._best = None  # the given plan is better
             if self._budget.over:
                 break
+        if not self._budget.over and (self._best is None or not self._best.success):
+            self._free()
         return self._answer(start)
+
+    def _free(self) -> None:
+        """From the best plan, by Newton's method without the constraints: they may not act at the optimum."""
+        best = self._best
+        if best is None or not best.violation <= self._allowed or not np.isfinite(best.cost):
+            return
+        best = best.kept()
+        self._point.without_multipliers()
+        self._run.work.take(best.states, best.controls, best.cost)
+        found = self._run.newton(detail=best.detail)
+        if found.success and found.violation == 0:
+            self._remember(replace(found, multipliers=()))
 
     def _from_valley(self) -> RunResult | None:
         """From the plan of smoothing without the constraints."""

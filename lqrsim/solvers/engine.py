@@ -221,6 +221,7 @@ class RunResult:
         `assemble`.
       final: whether no other start can do better.
       stuck: whether the violation no longer falls, however large the penalty.
+      remedy: a remedy that is known already; empty for the usual one.
       against: in words, the constraints and limits that conflict with the violated constraints, the strongest first.
     """
 
@@ -238,6 +239,7 @@ class RunResult:
     final: bool = False
     stuck: bool = False
     against: tuple[str, ...] = ()
+    remedy: str = ""
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
@@ -390,9 +392,12 @@ class SolveRun:
             self.problem, self.ending, self._rows["cost"][: self._row], start, control, refuse=self.budget.attentive
         )
 
-    def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
-        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints."""
-        self.work.begin_newton(added)
+    def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0) -> RunResult:
+        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints.
+
+        What it promises is relative to the cost, or to `least` if that is more.
+        """
+        self.work.begin_newton(added, least)
         ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
@@ -530,9 +535,10 @@ class SolveRun:
                 # As for iLQR, whose steps need neither of these.
                 values["cost_to_come"] = values["inverse_law"] = None
                 off, gap = gap, np.nan
-                detail += (
-                    f"; the states of least total cost are {off:.1g} off the plan, so the cost-to-come is left out"
-                )
+                why = f"the states of least total cost are {off:.1g} off the plan"
+                if not np.isfinite(off):
+                    why = "its pass needs a cost that is curved in every control"
+                detail += f"; the cost-to-come is left out: {why}"
         return RunResult(
             status=status, detail=detail.removeprefix("; "), states=states, controls=controls, law=law,
             cost=work.cost, violation=self._violation_of(work.best), gap=gap, values=values,
@@ -801,9 +807,10 @@ class Workspace:
         memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
 
-    def begin_newton(self, added: float = 0.0) -> None:
-        """The same for Newton's method, which begins with a pass about the plan."""
+    def begin_newton(self, added: float = 0.0, least: float = 0.0) -> None:
+        """The same for Newton's method, which begins with a pass about the plan; see `SolveRun.newton`."""
         self.memory["merit"], self.memory["share"] = self.memory["plan_cost"] + added, -1.0
+        self.memory["least"] = least
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""

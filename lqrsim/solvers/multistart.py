@@ -6,11 +6,12 @@ Other paths, bent to the sides, lead to other optima. After a few iterations it 
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of, weighing_obstacles
 from lqrsim.problem.derivative_check import functions_of
@@ -178,30 +179,25 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     return nominal + far * np.sign(cycles) * np.sin(2 * np.pi * (abs(cycles) * times - np.arange(len(nominal)) / 4))
 
 
-def constant_controls(problem: Problem) -> Array | None:
-    """Constant controls (m,) under which all states and the cost are finite, of least cost; None if none was found.
+def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
+    """Constant controls (m,) under which all states are finite, and the plans that they make.
 
     Args:
       problem: one that names a start.
     """
     space, nominal, start = problem.control_coordinates, problem.nominal_control, problem.start
     assert start is not None
-    m = len(nominal)
-    low, high = (np.where(np.isfinite(side), side, nominal + far) for side, far in ((space.low, -1.0), (space.high, 1.0)))
+    m, steps = len(nominal), problem.steps
     shares = LEVELS if m < 3 else LEVELS[::2]
     each = itertools.product(shares, repeat=m) if m < 5 else zip(*[shares] * m, strict=True)
-    best, least = None, np.inf
-    zero = np.zeros((problem.steps, m, len(start)))
-    for share in each:
-        for far in (1.0,) if np.isfinite([space.low, space.high]).all() else UNLIMITED:
-            control = nominal + far * (low + np.array(share) * (high - low) - nominal)
-            control = np.clip(control, space.low, space.high)
-            plan = compiled.rollout(problem, zero, np.tile(control, (problem.steps, 1)), start.copy())
-            if np.isfinite(plan[0]).all():
-                cost = float(compiled.costs_of(problem, plan[0][None], plan[1][None])[0])
-                if cost < least:
-                    best, least = control, cost
-    return best
+    limited = np.isfinite([space.low, space.high]).all()
+    for share, far in itertools.product(each, (1.0,) if limited else UNLIMITED):
+        low = np.where(np.isfinite(space.low), space.low, nominal - far)
+        high = np.where(np.isfinite(space.high), space.high, nominal + far)
+        control = low + np.array(share) * (high - low)
+        plan = compiled.rollout(problem, np.zeros((steps, m, len(start))), np.tile(control, (steps, 1)), start.copy())
+        if np.isfinite(plan[0]).all():
+            yield control, Motion(*plan)
 
 
 def check_starts(problem: Problem, count: int | None) -> None:

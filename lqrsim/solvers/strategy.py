@@ -35,14 +35,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory
-from lqrsim.solvers import compiled
+from lqrsim.solvers import compiled, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.budget import Budget, Callback, Stop
@@ -83,6 +83,7 @@ ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 # sizes; and the relative decrease of cost that such a step must lead to.
 SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 
+CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
 
 Finish = Callable[[SolveRun, Known], RunResult]
@@ -273,11 +274,17 @@ class Search:
         if np.isfinite(self.best[1].cost) or problem.start is None or self._budget.stop.due:
             return
         self._known.from_start = False
-        begin = constant_controls(problem)
-        if begin is not None:
-            run = self._add(resolve(begin, problem), "constant controls")
+        work, plans = self.best[0].work, list[tuple[float, float, Array]]()
+        for control, plan in constant_controls(problem):
+            missed = float(f"{work.violation(work.constraint_values(*plan)):.2g}")
+            plans.append((missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control))
+        plans = [one for one in plans if np.isfinite(one[:2]).all()]
+        for _, _, control in sorted(plans, key=lambda one: one[:2])[:CONSTANT]:
+            run = self._add(resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}")
             self._offer(run, self._finish(run))
-        if np.isfinite(self.best[1].cost) or not exact or self._budget.stop.due:
+            if self.best[1].success or self._budget.stop.due:
+                return
+        if np.isfinite(self.best[1].cost) or not exact:
             return
         end = problem.start if problem.goal is None else np.where(np.isnan(problem.goal), problem.start, problem.goal)
         states = np.linspace(problem.start, end, problem.steps + 1)
@@ -428,12 +435,13 @@ class Search:
     def keep(self, given: RunResult | None) -> None:
         """If the best plan is worse than the plan that the caller gave: descend from that plan, or return it."""
         run, found = self.best
-        if given is None or not run.is_worse(found, given):
+        if given is None or not (run.is_worse(found, given) or reach.goal_left(self._problem, found, given)):
             return
         if not self._budget.stop.due:
             run = self._add(policy_of(given, "descent from the given plan"))
-            found = self._finish(run, refine)
-            self._offer(run, found, better=not run.is_worse(found, given))
+            other = self._finish(run, refine)
+            keeps = not run.is_worse(other, given)
+            self._offer(run, other, better=keeps and (run.is_worse(found, given) or other.rank < found.rank))
         run, found = self.best
         if run.is_worse(found, given):
             status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
@@ -599,12 +607,31 @@ class Search:
         elif self._cut_short and np.isfinite(found.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
+        elif not stop.due and np.isfinite(found.cost):
+            found = self._told_of_unmoved(found)
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         return assemble(
             problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
             options=settings.options(chosen.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
+
+    def _told_of_unmoved(self, found: RunResult) -> RunResult:
+        """The result with the states that miss their goal and that no control changes; STALLED if others would."""
+        problem = self._problem
+        allowed = self._settings.violation_tolerance(problem)
+        places = reach.unmoved(problem, found.states, found.controls, found.cost, allowed)
+        if not places:
+            return found
+        detail = "; ".join(part for part in (reach.described(problem, found.states, places), found.detail) if part)
+        otherwise = reach.moved_otherwise(problem, found.states, places)
+        status = Status.STALLED if found.success and otherwise else found.status
+        names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
+        remedy = f"leave {names} out of the goal, which no control that was tried changes"
+        if otherwise:
+            what = "with which the robot touches that body" if problem.dynamics.discrete else f"that change {names}"
+            remedy = f"begin with start=[...], controls {what}"
+        return replace(found, status=status, detail=detail, remedy=remedy)
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""

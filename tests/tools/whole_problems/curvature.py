@@ -201,7 +201,8 @@ def _of_an_optimum(case: Case, solution: ls.Solution) -> list[str]:
         found.append(f"a saddle: the least eigenvalue is {least:.2g} of {largest:.2g} (said: {claimed})")
     if claimed == "minimum" and least < 1e-11 * largest:
         found.append(f"no minimum: the least eigenvalue is {least:.2g} of {largest:.2g}")
-    if claimed == "singular" and least > 1e-3 * largest:
+    idle = of.inequality & (np.abs(of.forces) < 1e-6 * max(float(np.abs(of.gradient).max(initial=0.0)), curve))
+    if claimed == "singular" and least > 1e-3 * largest and not idle.any():
         found.append(f"not singular: the least eigenvalue is {least:.2g} of {largest:.2g}")
     return found
 

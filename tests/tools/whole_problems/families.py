@@ -311,7 +311,8 @@ def overflow(rng: Generator) -> Case:
     limits, horizon = (-6.0, 6.0), 2.5
     numbers["goal"] = float(rng.uniform(-0.5, 0.3))
     if rate is tank:
-        limits, horizon, numbers["goal"] = (0.0, 2.5), float(rng.uniform(4.5, 8.0)), float(rng.uniform(0.3, 1.5))
+        empty = 2.0 / numbers["a"]  # seconds until it is, without an inflow
+        limits, horizon, numbers["goal"] = (0.0, 2.5), empty * float(rng.uniform(1.05, 2.0)), float(rng.uniform(0.3, 1.5))
     steps = int(rng.integers(40, 110))
     kind = rng.integers(3)
     rows = [(lambda x, u, p, lib: x[0] + (0.0 if rate is tank else 3.0), False, False)] if kind == 1 else []
@@ -333,8 +334,8 @@ def torque(x: Any, u: Any, p: Any, lib: Any) -> Any:
     return p.effort / 2 * (u[0] / p.force) ** 2
 
 
-def scales(rng: Generator) -> Case:
-    size, force, money = (float(10 ** rng.uniform(-8, 8)) if rng.random() < 0.5 else 1.0 for _ in range(3))
+def scales(rng: Generator, *, sized: bool = True) -> Case:
+    size, force, money = (float(10 ** rng.uniform(-8, 8)) if sized and rng.random() < 0.5 else 1.0 for _ in range(3))
     numbers = {
         "size": size, "force": force, "drag": 0.1, "effort": money * _log(rng, 1e-2, 1.0),
         "weight": money * _log(rng, 10.0, 1e3), "goal": size * float(rng.uniform(-3, 3)), "rest": 0.1,
@@ -371,9 +372,14 @@ def time(rng: Generator) -> Case:
     )  # fmt: skip
 
 
+def pushed(rng: Generator) -> Case:
+    """A pendulum of usual size: constraints have tolerances in their units, within which a given plan may miss them."""
+    return scales(rng, sized=False)
+
+
 def given(rng: Generator) -> Case:
     """A saturating goal, a bump on the way, or an escape, with a plan that is good already."""
-    base = (saturating, symmetric, scales)[int(rng.integers(3))](rng)
+    base = (saturating, symmetric, pushed)[int(rng.integers(3))](rng)
     problem, m = base.problem, len(base.low)
     kind = int(rng.integers(4))
     low, high = np.maximum(base.low, -1e300), np.minimum(base.high, 1e300)
