@@ -561,6 +561,8 @@ class SolveRun:
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
             return replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
+        if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
+            return replace(found, status=Status.NOT_POSITIVE_DEFINITE)
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
     def bend(self, found: RunResult) -> Bend:
