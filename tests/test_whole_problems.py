@@ -96,8 +96,8 @@ def test_the_check_of_families_can_fail() -> None:
     assert "no minimum" in dense.contradictions(flat, dataclasses.replace(plateau, certificate=claimed))[0]
     early = dataclasses.replace(ls.smooth(case.problem, max_iterations=1, safeguard=False), status=Status.STALLED)
     assert "a step lowers the cost" in dense.contradictions(case, early)[0]
-    lost = _with_plan(minimum, states=np.full_like(minimum.trajectory.states, np.nan))
-    assert "not finite" in dense.contradictions(case, dataclasses.replace(lost, status=Status.STALLED))[0]
+    lost = np.full_like(early.trajectory.states, np.nan)
+    assert "not finite" in dense.contradictions(case, _with_plan(early, states=lost))[0]
 
 
 def test_what_is_known_otherwise_is_noticed() -> None:
