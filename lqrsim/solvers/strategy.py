@@ -185,7 +185,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     if not beside.cost < saddle.cost:
         return None
     run.work.take(beside.states, beside.controls, beside.cost)
-    return run.certified(run.newton())
+    return run.certified(run.newton(patient=True))
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
@@ -212,7 +212,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     if budget.over:
         return replace(other, status=found.status, detail=found.detail)
     run.work.take(other.states, other.controls, other.cost)
-    return run.newton(detail=found.detail)
+    return run.newton(detail=found.detail, patient=True)
 
 
 class Search:
