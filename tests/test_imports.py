@@ -67,10 +67,11 @@ FLOORS_WITHIN = {
     "solvers": (
         ("budget", "compiled", "initial_guess"),
         ("certify", "settings", "stages"),
+        ("curvature",),
         ("engine", "interior_point", "parallel"),
         ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),
         ("interior_run", "restoration", "risk"),
-        ("constrained", "free_duration"),
+        ("constrained", "free_duration", "reach"),
         ("strategy",),
     ),
     "simulation": (("plant_validation", "plant", "simulator"), ("physics", "mujoco_physics"), ("disturbances",)),

@@ -78,7 +78,7 @@ def test_solve_and_simulate(printed: Any, tmp_path: Path) -> None:
     for name in ("cost", "gap", "optimality", "violation", "detail", "solver", "scenario", "problem_digest", "success"):
         same(shown[name], getattr(solution, name))
     assert shown["status"] == "CONVERGED"
-    assert shown["certificate"] == asdict(solution.certificate)
+    assert shown["certificate"] == asdict(solution.certificate) | {"curvature": solution.curvature.name}
     assert len(shown["iterations"]) == len(solution.iterations) > 3
     for row, iteration in zip(shown["iterations"], solution.iterations, strict=True):
         for field in fields(iteration):

@@ -539,6 +539,10 @@ def descended(
         if outcome == declarations.RUNNING:
             arguments = run._plan_arguments(declarations.FINISH, done, done + 1, log)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
+    if not sizes["NOISY"]:
+        found = run.result(run.ending)
+        arguments = run._check_arguments(declarations.CURVE, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
+        replay(source, sizes, "smoother", *with_rows(arguments))
     return outcome
 
 
@@ -1180,6 +1184,10 @@ class TestInteriorPoint:
         replay(source, SIZES, "trial_cost", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
         replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
+        held = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
+        for curve, free, good in ((stages.models.convex + np.eye(5), 1.0, True), (-np.ones((4, 5, 5)), 0.0, False)):
+            given = 3, np.full(3, free), curve, jacobian, held, np.zeros(2)
+            assert replay(source_of(stage_kernels), SIZES, "least_curvatures", *given) == good
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
         to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
         changes = Motion(np.zeros((4, 3)), np.zeros((3, 2)))

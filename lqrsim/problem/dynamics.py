@@ -244,7 +244,8 @@ class Dynamics:
         """The body that a state moves, if nothing that moves touches it along a plan; empty without bodies.
 
         Args:
-          states: (T+1, n) of the plan. state: the index of the state.
+          states: (T+1, n) of the plan.
+          state: the index of the state.
         """
         return ""
 

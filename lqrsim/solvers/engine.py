@@ -401,9 +401,12 @@ class SolveRun:
         self.work.begin_newton(added, least)
         self.work.memory["patient"] = float(patient)
         ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
+        status = ending.status
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
-        return self.damped_result(ending, ending.status, detail)
+        if patient and ending.outcome != declarations.TIMED_OUT and not status.success and self.work.memory["damping"]:
+            status = Status.NOT_POSITIVE_DEFINITE  # its last models had no minimum without weights
+        return self.damped_result(ending, status, detail)
 
     def safeguard(self, found: RunResult) -> RunResult:
         """Damped iterations from the best plan so far, after smoothing failed."""

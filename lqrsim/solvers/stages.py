@@ -189,7 +189,7 @@ class Stages:
         counts = np.maximum(self.live.sum(axis=0), 1)
         rows = np.sqrt(np.einsum("trw,trw->rw", self.slopes, self.slopes) @ both**2 / counts)
         cost = 0.5 * float(np.abs(np.einsum("tww->w", hessian)) @ both**2)
-        return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
+        return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost if 0 < cost < np.inf else 1.0)
 
     def spread(self, rows: Array) -> Array:
         """Numbers of the live rows (K,) at their places in (T+1, R); others are zero."""
