@@ -257,15 +257,15 @@ class MjcfRobot(Robot):
         return MjcfRobot(scene, **self._stated)
 
     def hold(self, state: npt.ArrayLike) -> Array:
-        """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
+        """The controls that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.
 
         Args:
           state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
 
         Returns:
-          (m,), within the limits. If no controls hold the robot, those with the least sum of squared remaining forces.
-          An actuator without an actrange that integrates its control, which cannot be 0, is never at rest:
-          `print(robot)` says so.
+          (m,), the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
+          those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
+          which activations never rest, as an integrator's whose control cannot be 0.
 
         Raises:
           InputError: the state is not (n,) finite numbers.
@@ -490,9 +490,10 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        A joint that an equality constraint couples to another follows it, unless it is named. The joints of a closed
-        loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of actuators are
-        those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
+        A joint that an equality constraint couples to another follows it; if it is named, the other moves. The joints
+        of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of
+        actuators are those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not
+        count.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -502,7 +503,8 @@ class MjcfRobot(Robot):
           (n,).
 
         Raises:
-          InputError: no such keyframe or state; or a loop does not close there.
+          InputError: no such keyframe or state; the keyframe has mocap bodies elsewhere; a loop does not close there;
+            or values of joints contradict an equality constraint.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))

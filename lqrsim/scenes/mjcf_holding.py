@@ -13,14 +13,17 @@ from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, input_names, ranges
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
-_STEPS, _HALVES, _NUDGE = 20, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients
-_EXACT, _PROGRESS = 1e-12, 0.5  # of the score: small enough, and the factor by which a step must lower it to go on
-_LIGHT = 1e-6  # weight of controls relative to forces: selects the smallest that hold; its square is lost of the force
-_HEAVY = 1e3  # weight of the force that a limit cuts off: actuators do not push against their limits
+_STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients
+_EXACT, _PROGRESS = 1e-12, 0.99  # of the score: small enough, and the factor by which a step must lower it to go on
+_LIGHT = 1e-4  # weight of controls relative to forces: selects the smallest that hold
+_HEAVY = 1e2  # weight of the force that a limit cuts off: actuators do not push against their limits
 _FAR = 2.0 ** np.arange(-3, 20)  # distances at which an activation may be at rest
 _DRIFTS = 2  # mode of an activation that cannot rest
 _REST, _TIGHT = 1e-7, 1e-4  # what is no rate, relative; weight of rates that may be left over
-_INFEASIBLE = 1e-12  # least share of an answer of non-negative least squares; without one, bounds contradict
+_SCALES, _NEAR = (
+    10.0 ** np.arange(13),
+    0.1,
+)  # relative lengths of a step that bounds make; 1 / (1 + square) of a right one
 _END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
@@ -229,25 +232,25 @@ class _Search:
         self._low, self._high = low, high
         self._modes[:] = 0
         z = rest.neutral.copy()
-        score = np.inf
+        score = self._score(z) if (np.abs(self._left(z)[1]) < _REST).all() else np.inf
+        first = True
         for _ in range(_STEPS):
             linear = rest.linear(z)
-            aim = self._aim(z, linear)
+            aim = self._aim(z, linear, rest.neutral if first else z)
             if aim is None:  # some activations cannot be at rest within their ranges
                 if not self._leave(z, linear):
                     break
                 score = np.inf
                 continue
-            before = score
+            first = False
+            before, shorter = score, False
             for share in 0.5 ** np.arange(_HALVES):
-                tried = np.clip(z + share * (aim - z), low, high)
+                tried = self._rested(z + share * (aim - z))
                 if (then := self._score(tried)) < score:
-                    z, score = tried, then
+                    z, score, shorter = tried, then, share < 1
                     break
-            if score <= _EXACT**2 or (score > _PROGRESS * before and not self._turn(z[model.nu :])):
+            if score <= _EXACT**2 or (score > _PROGRESS * before and not shorter and not self._turn(z[model.nu :])):
                 break
-        exact = np.clip(rest.rested(z, np.flatnonzero(self._modes == 0)), low, high)
-        z = exact if self._score(exact) <= score else z
         z = np.clip(np.where(np.abs(z) * self._weights < _EXACT, 0.0, z), low, high)  # rounding
         left, moving = self._left(z)
         missed, drifting = np.zeros(model.nv), np.zeros(model.nactuator, dtype=bool)
@@ -255,6 +258,11 @@ class _Search:
         drifting[rest.of[model.nu :][np.abs(moving) > _HELD * np.maximum(1.0, np.abs(z[model.nu :]))]] = True
         held = bool((np.abs(left) <= _HELD * rest.largest).all()) and not drifting.any()
         return Holding(z[: model.nu], z[model.nu :], missed, drifting, held)
+
+    def _rested(self, z: Array) -> Array:
+        """The same controls, with activations at rest and within the ranges."""
+        which = np.flatnonzero((self._modes == 0) & ~self._idle)
+        return np.clip(self._rest.rested(np.clip(z, self._low, self._high), which), self._low, self._high)
 
     def _turn(self, act: Array) -> bool:
         """Let activations that are at the ends of their ranges (na,) stay there; whether there are any."""
@@ -264,8 +272,10 @@ class _Search:
         self._modes[ends] = np.where(upper, 1, -1)[ends]
         return bool(ends.any())
 
-    def _aim(self, z: Array, linear: _Linear) -> Array | None:
+    def _aim(self, z: Array, linear: _Linear, neutral: Array) -> Array | None:
         """The z that holds if forces and rates are linear, or comes nearest; None if activations cannot do as said.
+
+        Of several it is the one nearest to `neutral`.
 
         The unknowns are the change of z and, for each limit of a force, the part of the force that it cuts off.
         """
@@ -277,8 +287,14 @@ class _Search:
         forces[self._limited] -= cut[: len(self._limited)]
         joints, now = rest.moments.T @ forces, rest.compensated + rest.moments.T @ linear.forces
         joints[self._limited_dofs] -= cut[len(self._limited) :]
-        rows = self._carried @ joints / self._size, self._sparing[:, None] * change, _HEAVY / self._size * cut
-        aims = self._carried @ (rest.wanted - now) / self._size, self._sparing * (rest.neutral - z), np.zeros(len(cut))
+        # Where more is wanted than a joint takes, an actuator of several joints may push against its limit for others.
+        limited = model.jnt_actfrclimited.astype(bool)
+        asked, joint_range = rest.wanted[self._limited_dofs], model.jnt_actfrcrange[limited].T
+        beyond = (asked > joint_range[1]).astype(float) - (asked < joint_range[0])
+        price = np.concatenate([np.ones(len(self._limited)), np.where(beyond != 0, _LIGHT / _HEAVY, 1.0)])
+        price *= _HEAVY / self._size
+        rows = self._carried @ joints / self._size, self._sparing[:, None] * change, price[:, None] * cut
+        aims = [self._carried @ (rest.wanted - now) / self._size, self._sparing * (neutral - z), np.zeros(len(cut))]
         rates, rates_now = linear.rates_by @ change / self._steepness[:, None], linear.rates / self._steepness
         follows, at_end = (self._modes == 0) & ~self._idle, np.isin(self._modes, (-1, 1))
         stays = at_end | self._idle
@@ -286,14 +302,19 @@ class _Search:
         ends = np.where(self._idle, rest.neutral[nu:], ends)
         met = np.concatenate([rates[follows], change[nu:][stays]])
         met_at = np.concatenate([-rates_now[follows], (ends - z[nu:])[stays]])
-        sign, limited = self._modes[at_end], model.jnt_actfrclimited.astype(bool)
-        least, most = model.jnt_actfrcrange[limited].T - now[self._limited_dofs]
+        sign, (least, most) = self._modes[at_end], joint_range - now[self._limited_dofs]
         sides = [
             (change, self._low - z, self._high - z),
             (sign[:, None] * rates[at_end], -sign * rates_now[at_end], np.full(len(sign), np.inf)),
             (joints[self._limited_dofs], least, most),
+            (beyond[:, None] * cut[len(self._limited) :], np.zeros(len(beyond)), np.full(len(beyond), np.inf)),
             *_force_limits(model, forces, linear.forces),
         ]
+        if len(cut):  # what must be cut off in any case is not to cost anything
+            least = _least_squares(np.concatenate(rows[1:]), np.concatenate(aims[1:]), (met, met_at), sides)
+            if least is None:
+                return None
+            aims[2] = price * least[count:]
         found = _least_squares(np.concatenate(rows), np.concatenate(aims), (met, met_at), sides)
         return None if found is None else z + found[:count]
 
@@ -391,13 +412,16 @@ def _least_squares(
         return None
     bound, least = bound[~fixed] / sizes[~fixed, None], least[~fixed] / sizes[~fixed]
     farthest = float(least.max(initial=0.0))
-    if farthest > 0:
-        matrix = np.concatenate([bound.T, least[None] / farthest])
-        aim = np.append(np.zeros(len(bound.T)), 1.0)
+    aim = np.append(np.zeros(len(bound.T)), 1.0)
+    for distance in farthest * _SCALES if farthest > 0 else ():
+        matrix = np.concatenate([bound.T, least[None] / distance])
         residual = matrix @ nnls(matrix, aim)[0] - aim
-        if -residual[-1] < _INFEASIBLE:
+        if -residual[-1] > _NEAR:
+            nearest = nearest - distance * residual[:-1] / residual[-1]
+            break
+    else:
+        if farthest > 0:
             return None
-        nearest = nearest - farthest * residual[:-1] / residual[-1]
     return start + ways @ solve_triangular(corner, nearest)
 
 

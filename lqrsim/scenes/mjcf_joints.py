@@ -301,6 +301,8 @@ class Equalities:
                 step = np.zeros(model.nv)
                 step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=_RANK)[0]
                 mujoco.mj_integratePos(model, place, step, 1.0)
+                if np.abs(step).max() < _MET:  # as near as it gets on the way: only the aim is to be consistent
+                    break
             else:
                 return None
         return place if np.abs(off).max(initial=0.0) < _TYPED else None
@@ -347,30 +349,70 @@ def keyframe(model: mujoco.MjModel, xml: str, name: str, what: str) -> tuple[Arr
 
 
 def with_mocap(xml: str, model: mujoco.MjModel, name: str, what: str) -> str:
-    """The MJCF with its mocap bodies where a keyframe has them.
+    """The MJCF with its mocap bodies where a keyframe has them, and all else as it is.
+
+    What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies.
 
     Raises:
-      InputError: there is no keyframe of that name; or a body's place cannot be stated, as in a <frame>.
+      InputError: there is no keyframe of that name; or the text cannot say this, as of a body in a <frame>.
     """
     number = _key(model, name, f"{what}: keyframe")
     if not (moved := _moved(model, number)):
         return xml
     root = ElementTree.fromstring(xml)
+    elements = {one.get("name", ""): one for world in root.iter("worldbody") for one in world.iter("body")}
     for body in moved:
-        where = int(model.body_mocapid[body])
-        for element in root.iterfind(f"worldbody//body[@name='{model.body(body).name}']"):
-            for other in ("axisangle", "xyaxes", "zaxis", "euler"):
-                element.attrib.pop(other, None)
-            for attribute, values in (("pos", model.key_mpos), ("quat", model.key_mquat)):
-                numbers = values[number].reshape(model.nmocap, -1)[where].tolist()
-                element.set(attribute, " ".join(map(repr, numbers)))
-    placed_there = ElementTree.tostring(root, encoding="unicode")
-    for body in _moved(mujoco.MjModel.from_xml_string(placed_there), number):
+        element, where = elements[model.body(body).name], int(model.body_mocapid[body])
+        for other in ("axisangle", "xyaxes", "zaxis", "euler"):
+            element.attrib.pop(other, None)
+        for attribute, values in (("pos", model.key_mpos), ("quat", model.key_mquat)):
+            element.set(attribute, _text(values[number].reshape(model.nmocap, -1)[where]))
+    elements["world"] = next(root.iter("worldbody"))
+    ties = [one for section in root.findall("equality") for one in section]
+    for i, (tie, values) in enumerate(zip(ties, model.eq_data, strict=False)):
+        if tie.tag == "weld" and "body1" in tie.attrib:
+            tie.set("relpose", _text(values[3:10]))
+        elif tie.tag == "connect" and "body1" in tie.attrib:
+            del tie.attrib["anchor"]
+            for side, place in enumerate((values[:3], values[3:6]), 1):
+                site = f"{name}_tie_{i}_{side}"
+                ElementTree.SubElement(
+                    elements[tie.attrib.pop(f"body{side}", "world")],
+                    "site",
+                    {"name": site, "pos": _text(place), "group": "5"},
+                )
+                tie.set(f"site{side}", site)
+    found = ElementTree.tostring(root, encoding="unicode")
+    if not _same_forces(model, number, mujoco.MjModel.from_xml_string(found)):
         raise InputError(
-            f"{what}: mocap: got the mocap body {model.body(body).name!r} in a <frame>, <replicate> or attached model,"
-            " want it directly in the <worldbody>"
+            f"{what}: mocap: got the keyframe {name!r}, whose mocap bodies cannot be placed by rewriting the MJCF, want"
+            " them directly in the <worldbody>, and springs of tendons at them with a springlength"
         )
-    return placed_there
+    return found
+
+
+def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool:
+    """Whether another model has the forces of this one with its mocap bodies where a keyframe has them."""
+    rng, found = np.random.default_rng(0), []
+    move = rng.normal(size=(3, model.nv))
+    for one in (model, other):
+        data = mujoco.MjData(one)
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        for step in move:
+            mujoco.mj_integratePos(one, data.qpos, step, 0.3)
+            mujoco.mj_inverse(one, data)
+            rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            found.append(
+                np.concatenate([data.efc_pos[rows], data.ten_length, data.qfrc_passive, data.mocap_pos.ravel()])
+            )
+    pairs = zip(found[:3], found[3:], strict=True)
+    return not _moved(other, key) and all(
+        len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
+    )
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(map(repr, numbers.tolist()))
 
 
 def _key(model: mujoco.MjModel, name: str, field: str) -> int:
