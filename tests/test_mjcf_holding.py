@@ -251,3 +251,22 @@ def test_free_joints_without_a_name_are_told_apart_by_their_bodies() -> None:
         assert {"drone_x", "drone_wz", "box_x", "box_rz", *(f"{one}_z" for one in extra)} <= set(names)
     alone = f"<mujoco><worldbody>{bodies.split('<body name=' + chr(34) + 'box')[0]}</worldbody>{thrust}</mujoco>"
     assert ls.MjcfRobot(scene_from_xml(alone, "one")).dynamics.state_coordinates.names[:3] == ("x", "y", "z")
+
+
+@pytest.mark.parametrize("most", [5.0, 1.0])
+def test_adhesion_between_two_bodies_that_touch(most: float) -> None:
+    """A motor carries two spheres of which the upper one is stuck to it, or falls short by what MuJoCo accelerates."""
+    bodies = "".join(
+        f'<body name="{name}" pos="0 0 {height}"><joint name="{name}" type="slide" axis="0 0 1" damping="5"'
+        ' stiffness="50"/><geom size=".05" mass=".2"/></body>'
+        for name, height in (("a", 0.0), ("b", 0.0995))
+    )
+    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/>
+      <worldbody>{bodies}</worldbody><actuator><adhesion name="stick" body="a" gain="20" ctrlrange="0 3"/>
+      <motor joint="a" ctrlrange="{-most} {most}"/></actuator></mujoco>""", "stuck"), position=())  # fmt: skip
+    state, model = robot.at(a=0.01, b=0.0096), robot.scene.model
+    held, rest = robot._held(state), Rest(model, robot.configuration(state)[0])
+    np.testing.assert_allclose(held.missed, -rest.forces(held.controls), rtol=0, atol=1e-9)
+    assert held.held == (most == 5.0)
+    if held.held:
+        assert moved(model, rest.data.qpos, held.controls) < STAYS
