@@ -199,10 +199,10 @@ def replayed(robot: ls.MjcfRobot, solution: ls.Solution, tolerance: float | None
     data, nv = mujoco.MjData(model), robot.scene.model.nv
     data.qpos[:], data.qvel[:] = robot.configuration(plan.states[0])
     data.act[:] = plan.states[0, 2 * nv :]
-    numbers, worst, substeps = [model.actuator(one).id for one in robot.actuators], 0.0, robot_steps(robot, plan.dt)
+    worst, substeps = 0.0, robot_steps(robot, plan.dt)
     for step, nominal in enumerate(plan.states[:-1]):
         state = np.concatenate([robot.state(data.qpos, data.qvel, near=nominal), data.act])
-        data.ctrl[numbers] = solution.policy(state, step * plan.dt)
+        data.ctrl[:] = solution.policy(state, step * plan.dt)
         mujoco.mj_step(model, data, substeps)
         there = robot.state(data.qpos, data.qvel, near=plan.states[step + 1])
         worst = max(worst, float(np.abs(there[:nv] - plan.states[step + 1, :nv]).max()))

@@ -64,8 +64,9 @@ class MjcfRobot(Robot):
     Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
     and `<name>_wx` to `_wz` in body axes; free joints also `<name>_x` to `_z` and `<name>_vx` to `_vz`, without the
     `<name>_` if the joint has no name. States of actuators are `<name>_activation`. A hinge without limits is an
-    angle. The controls are MuJoCo's `ctrl`, by the actuators' names, limited by their ctrlrange. Elements without a
-    name in the MJCF get a name, such as `unnamed_joint_0`.
+    angle. The controls are MuJoCo's `ctrl`, limited by ctrlrange, by the actuators' names; those of an actuator with
+    several are `<actuator>_pos` and `<actuator>_vel`, by MuJoCo's names of its inputs. Elements without a name in the
+    MJCF get a name, such as `unnamed_joint_0`; of several free joints without one, each gets its body's.
 
     If the file has no light, one is added. Without a camera named overview, pictures show the whole run.
 
@@ -89,6 +90,8 @@ class MjcfRobot(Robot):
         them, and all geoms on which it stands and that a free joint or a slide moves it over.
       obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
+      mocap: the keyframe whose mpos and mquat place the mocap bodies, in plans and runs; by default they stay where the
+        MJCF has them. In a plan they do not move.
 
     Attributes:
       scene: the scene that the robot moves in.
@@ -110,10 +113,14 @@ class MjcfRobot(Robot):
         outline: bool | None = None,
         floors: bool = True,
         obstacles: Choice = True,
+        mocap: str | None = None,
     ) -> None:
         self.name, xml = (file.name, file.xml) if isinstance(file, Scene) else read_mjcf(file)
         xml, who = mjcf_joints.named(xml), f"MjcfRobot {self.name}"
         model = checked_model(xml, self.name)
+        if mocap is not None:
+            xml = mjcf_joints.with_mocap(xml, model, mocap, who)
+            model = checked_model(xml, self.name)
         seen = mjcf_joints.lit(xml, model)
         if seen != xml:
             xml, model = seen, checked_model(seen, self.name)
@@ -127,11 +134,10 @@ class MjcfRobot(Robot):
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
-        self._joints, actuators = mjcf_joints.joints_of(model), mjcf_joints.actuators_of(model)
+        self._joints, inputs = mjcf_joints.joints_of(model), mjcf_joints.controls_of(model)
         self.body = model.body(number).name
         self.joints = tuple(one.name for one in self._joints)
-        self.actuators = tuple(one.name for one in actuators)
-        self._numbers = np.array([one.number for one in actuators], dtype=np.intp)
+        self.actuators = tuple(model.actuator(number).name for number in range(model.nactuator))
         self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
@@ -145,10 +151,10 @@ class MjcfRobot(Robot):
         self._dynamics = MjcfDynamics(
             xml, who, model=model, body=number, obstacles=tuple(geoms), states=states,
             controls=Coordinates(
-                names=self.actuators or ("none",), units=tuple(one.unit for one in actuators) or ("",),
-                low=tuple(one.low for one in actuators), high=tuple(one.high for one in actuators),
+                names=tuple(one.name for one in inputs) or ("none",), units=tuple(one.unit for one in inputs) or ("",),
+                low=tuple(one.low for one in inputs), high=tuple(one.high for one in inputs),
             ),
-            actuators=tuple(one.number for one in actuators),
+            actuators=tuple(range(model.nu)),
         )  # fmt: skip
         reach = mjcf_joints.reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
@@ -180,9 +186,10 @@ class MjcfRobot(Robot):
         """Names and units: positions, velocities, states of actuators."""
         turned = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
         moved = [(axis, "m") for axis in _AXES], [(f"v{axis}", "m/s") for axis in _AXES]
+        loose = [one for one in self._joints if one.kind == "free" and one.name.startswith(mjcf_joints.UNNAMED)]
         for side in (0, 1):
             for one in self._joints:
-                own = "" if one.kind == "free" and one.name.startswith(mjcf_joints.UNNAMED) else one.name
+                own = "" if [one] == loose else one.name
                 if one.kind in ("free", "ball"):
                     entries = [*(moved[side] if one.kind == "free" else []), *turned[side]]
                     yield from ((f"{own}_{name}" if own else name, unit) for name, unit in entries)
@@ -250,15 +257,15 @@ class MjcfRobot(Robot):
         return MjcfRobot(scene, **self._stated)
 
     def hold(self, state: npt.ArrayLike) -> Array:
-        """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
+        """The controls that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.
 
         Args:
           state: (n,). Its velocities do not count, nor do its activations, which are set to the values that hold it.
 
         Returns:
-          (m,), within the limits. If no controls hold the robot, those with the least sum of squared remaining forces.
-          An actuator without an actrange that integrates its control, which cannot be 0, is never at rest:
-          `print(robot)` says so.
+          (m,), the smallest that hold within the limits of controls, activations and forces. If none hold the robot,
+          those with the least sum of squared remaining forces nearby; `print(robot)` says what is missing at rest, and
+          which activations never rest, as an integrator's whose control cannot be 0.
 
         Raises:
           InputError: the state is not (n,) finite numbers.
@@ -299,15 +306,20 @@ class MjcfRobot(Robot):
     def _drifting(self, held: Holding) -> list[str]:
         """Why each actuator that never rests does not, as text."""
         model, found = self.dynamics.physics.model, []
+        space = self.dynamics.control_coordinates
         for number in np.flatnonzero(held.drifting).tolist():
-            low, high = model.actuator_ctrlrange[number]
-            least = f"at least {low:g}" if low > 0 else f"at most {high:g}"
-            found.append(f"the activation of {model.actuator(number).name} drifts: its control is {least}")
+            first = int(model.actuator_ctrladr[number])
+            own = range(first, first + int(model.actuator_ctrlnum[number]))
+            ends = [("least", space.low, k) for k in own if held.controls[k] <= space.low[k]]
+            ends += [("most", space.high, k) for k in own if held.controls[k] >= space.high[k]]
+            its = "its control" if len(own) == 1 else "{}"
+            why = ", ".join(f"{its.format(space.names[k])} is at {end} {side[k]:g}" for end, side, k in ends[:1])
+            found.append(f"the activation of {model.actuator(number).name} drifts" + (f": {why}" if why else ""))
         return found
 
     def _held(self, state: Array) -> Holding:
         model = self.dynamics.physics.model
-        return holding(model, self.configuration(state)[0], state[2 * model.nv :], self._numbers)
+        return holding(model, self.configuration(state)[0])
 
     def problem(
         self,
@@ -359,7 +371,7 @@ class MjcfRobot(Robot):
         self._check_limits(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
-        spent = efforts(model, self._numbers) ** -2.0 if effort is None else effort
+        spent = efforts(model) ** -2.0 if effort is None else effort
         cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
         damping, moves = check_number("damping", damping, at_least=0.0), np.zeros(n)
         for one in self._joints:
@@ -478,9 +490,10 @@ class MjcfRobot(Robot):
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
 
-        A joint that an equality constraint couples to another follows it, unless it is named. The joints of a closed
-        loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of actuators are
-        those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
+        A joint that an equality constraint couples to another follows it; if it is named, the other moves. The joints
+        of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations of
+        actuators are those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not
+        count.
 
         Args:
           keyframe: its name; None for the MJCF's rest.
@@ -490,7 +503,8 @@ class MjcfRobot(Robot):
           (n,).
 
         Raises:
-          InputError: no such keyframe or state; or a loop does not close there.
+          InputError: no such keyframe or state; the keyframe has mocap bodies elsewhere; a loop does not close there;
+            or values of joints contradict an equality constraint.
         """
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
@@ -503,10 +517,7 @@ class MjcfRobot(Robot):
         names = self.dynamics.state_coordinates.names
         for name, value in values.items():
             state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
-        for one in mjcf_joints.couplings_of(model) if keyframe is None or values else ():
-            if names[one.dof] not in values:
-                state[one.dof] = one.offset + (one.ratio * state[one.other] if one.other >= 0 else 0.0)
-        if (keyframe is None or values) and mjcf_joints.loops_of(model):
+        if (keyframe is None or values) and model.eq_active0.any():
             state[: model.nv] = self._closed(state, qpos, values)
         if self.activations and act is None:
             unnamed = [i for i in range(2 * model.nv, len(names)) if names[i] not in values]
@@ -514,7 +525,7 @@ class MjcfRobot(Robot):
         return state
 
     def _closed(self, state: Array, qpos: Array, named: Iterable[str]) -> Array:
-        """The positions (nv,) of a state at which loops are closed and the named joints are where they are in it.
+        """The positions (nv,) of a state at which equalities are met and the named joints are where they are in it.
 
         Args:
           qpos: (nq,), with which to begin.
@@ -523,11 +534,16 @@ class MjcfRobot(Robot):
         fixed = np.zeros(model.nv, dtype=bool)
         for one in self._joints:
             fixed[one.dofs] = not set(names[one.dofs]).isdisjoint(named)
-        equalities = mjcf_joints.Equalities(model)
-        place = equalities.met(qpos, self.configuration(state)[0], fixed)
+        equalities, aim = mjcf_joints.Equalities(model), self.configuration(state)[0]
+        # Followers follow; what they follow moves only if one of them is named.
+        tries = (equalities.met(qpos, aim, one) for one in (fixed | mjcf_joints.leaders_of(model), fixed))
+        place = next((place for place in tries if place is not None), None)
         if place is None:
             told = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
-            raise InputError(f"MjcfRobot {self.name}: joints: got {told}, want positions at which all loops close")
+            raise InputError(
+                f"MjcfRobot {self.name}: joints: got {told}, want positions at which all loops close and followers are"
+                " where their equalities have them"
+            )
         found = self.state(place, np.zeros(model.nv))[: model.nv]
         found[fixed] = state[: model.nv][fixed]  # to the last bit
         return found

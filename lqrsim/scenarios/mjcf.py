@@ -38,7 +38,7 @@ def mjcf(
     Args:
       path: path of the MJCF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
-        "pole": 3.14}. Other states are at rest, as in the MJCF.
+        "pole": 3.14}. Other states are at rest, as in the MJCF. Mocap bodies are where the keyframe has them.
       goal: the goal, in the same form. Without a start and a goal, the robot is to stay at rest, and a warning says
         this.
       weights: weights of the final error: a number for all states, or by name or unit, as {"m": 100, "rad": 100};
@@ -56,7 +56,9 @@ def mjcf(
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
-    robot = MjcfRobot(path, body=body, floors=floors, obstacles=obstacles)
+    keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
+    mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
+    robot = MjcfRobot(path, body=body, floors=floors, obstacles=obstacles, mocap=mocap)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
     if given:
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")

@@ -1,6 +1,8 @@
-"""The controls that hold a robot from an MJCF still, by MuJoCo's inverse dynamics."""
+"""The controls that hold a robot from an MJCF still, by MuJoCo's own forces and rates of activations at rest."""
 
 import copy
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -8,12 +10,23 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, couplings_of, loops_of, ranges
+from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, input_names, ranges
 
-_HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
-_NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
+_HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
+_STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients
+_EXACT, _PROGRESS = 1e-12, 0.99  # of the score: small enough, and the factor by which a step must lower it to go on
+_LIGHT = 1e-4  # weight of controls relative to forces: selects the smallest that hold
+_HEAVY = 1e2  # weight of the force that a limit cuts off: actuators do not push against their limits
+_FAR = 2.0 ** np.arange(-3, 20)  # distances at which an activation may be at rest
+_DRIFTS = 2  # mode of an activation that cannot rest
+_REST, _TIGHT = 1e-7, 1e-4  # what is no rate, relative; weight of rates that may be left over
+_SCALES, _NEAR = (
+    10.0 ** np.arange(13),
+    0.1,
+)  # relative lengths of a step that bounds make; 1 / (1 + square) of a right one
+_END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
-_LIGHT = 1e-9  # weight of the controls relative to the forces: selects the smallest controls that hold
+_NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +34,11 @@ class Holding:
     """Controls, and the forces that they leave.
 
     Attributes:
-      controls: (m,), within their limits, that come nearest to holding the robot still.
-      activations: (na,), the states of actuators at which they do so: a filter's state is its control, an integrator's
-        state is the value that it has reached.
+      controls: (nu,), within their limits, that come nearest to holding the robot still.
+      activations: (na,), the states of actuators, at rest with these controls.
       missed: (nv,), the missing force of each joint in N or N m; 0 for joints that follow others.
-      drifting: (nu,), the actuators whose activation never rests: integrators whose control cannot be 0.
+      drifting: (nactuator,), the actuators whose activations are not at rest: as an integrator's whose control cannot
+        be 0.
       held: whether the controls hold the robot.
     """
 
@@ -36,95 +49,412 @@ class Holding:
     held: bool
 
 
-class _Levels:
-    """The variable in which each actuator's force is affine: its control or, if it has one, its activation.
-
-    A filter's and a muscle's activation comes to rest at the control, or at the end of its own range that is nearest to
-    it. An integrator's rests anywhere with a control of zero. Where its control cannot be zero, it rests at the end of
-    its range, and without a range it drifts.
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """Forces and rates about controls and activations z: their values, and their slopes by z.
 
     Attributes:
-      low, high: (nu,), of the levels at which it may rest. drifting: (nu,), whether it never does.
-      ranges: of the controls, two (nu,).
+      forces: (nout,), of actuators, without limits. rates: (na,), of activations. forces_by, rates_by: their slopes.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        kinds, D = model.actuator_dyntype, mujoco.mjtDyn
-        integrates = kinds == D.mjDYN_INTEGRATOR.value
-        follows = np.isin(kinds, [one.value for one in (D.mjDYN_FILTER, D.mjDYN_FILTEREXACT, D.mjDYN_MUSCLE)])
-        self.activated = np.flatnonzero(follows | integrates)
-        self.places = model.actuator_actadr[self.activated] + model.actuator_actnum[self.activated] - 1
-        self.ranges = control_ranges(model)
-        least, most = ranges(model.actuator_actlimited.astype(bool) & (follows | integrates), model.actuator_actrange)
-        self.low, self.high = (np.clip(side, least, most) for side in self.ranges)
-        pushed = np.clip(0.0, *self.ranges)  # the control of an integrator that is nearest to rest
-        self.low = np.where(integrates, np.where(pushed > 0, most, least), self.low)
-        self.high = np.where(integrates, np.where(pushed < 0, least, most), self.high)
-        self.drifting = integrates & (((pushed > 0) & np.isinf(most)) | ((pushed < 0) & np.isinf(least)))
-        self.low[self.drifting], self.high[self.drifting] = -np.inf, np.inf
-        self._integrates, self._pushed = integrates, pushed
-
-    def controls(self, levels: Array) -> Array:
-        """The controls (nu,) that go with levels (nu,), which need not be within the range."""
-        return np.where(self._integrates, self._pushed, levels)
-
-    def act(self, levels: Array, data: mujoco.MjData) -> None:
-        """Apply levels (nu,) to the model's data."""
-        data.ctrl[:] = self.controls(levels)
-        data.act[self.places] = levels[self.activated]
+    forces: Array
+    rates: Array
+    forces_by: Array
+    rates_by: Array
 
 
-def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
-    """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
+class _AtRest:
+    """The actuators of a model at positions qpos, without velocity: what they exert, as MuJoCo computes it.
 
-    Actuator forces are assumed to be affine in the controls or activations, like those of motors and servos: inverse
-    dynamics give the required forces, and least squares within the limits finds the controls. `act` matters only for
-    actuators of other kinds.
+    Everything is a function of z (nz,), all controls and then all activations.
+
+    Attributes:
+      wanted: (nv,), the forces of actuators with which nothing accelerates. largest: the largest force that acts, in N
+        or N m. moments: (nout, nv). compensated: (nv,), what is exerted beside the forces of actuators, against
+        gravity. low, high: (nz,), the ranges of z. neutral: (nz,), the smallest z, with targets of position where
+        the robot is. of: (nz,), the actuator of each. slow: (nz,), which are targets of velocity.
+    """
+
+    def __init__(self, model: mujoco.MjModel, qpos: Array) -> None:
+        self.model, self._free = model, _unlimited(model)
+        self.data = data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_inverse(model, data)
+        self.wanted = data.qfrc_inverse.copy()
+        parts = self.wanted, data.qfrc_bias, data.qfrc_passive, data.qfrc_constraint
+        self.largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
+        self.moments = np.zeros((model.nout, model.nv))
+        if model.nout:
+            mujoco.mju_sparse2dense(
+                self.moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+            )
+        self.of = np.concatenate([_owners(model.nu, model.actuator_ctrladr, model.actuator_ctrlnum),
+                                  _owners(model.na, model.actuator_actadr, model.actuator_actnum)])  # fmt: skip
+        acting = self.of[model.nu :]
+        act = ranges(model.actuator_actlimited[acting].astype(bool), model.actuator_actrange[acting])
+        for number, entry, place in _integrals(model):
+            if (most := model.actuator_dynprm[number, entry]) > 0:
+                act[0][place], act[1][place] = -most, most
+        self.low, self.high = (np.concatenate(side) for side in zip(control_ranges(model), act, strict=True))
+        inputs = [name for number in range(model.nactuator) for name in input_names(model, number)]
+        self.slow = np.array([*(name == "vel" for name in inputs), *np.zeros(model.na)], dtype=bool)
+        self.neutral = np.clip(np.concatenate([self._targets(), np.zeros(model.na)]), self.low, self.high)
+        self.neutral = np.clip(self.rested(self.neutral, np.arange(model.na)), self.low, self.high)
+        self._apply(self._free, self.neutral)
+        self.compensated = data.qfrc_actuator - data.actuator_force @ self.moments
+
+    def _targets(self) -> Array:
+        """Controls (nu,) of 0, or for targets of position those of the actuators' lengths."""
+        model, found = self.model, np.zeros(self.model.nu)
+        for number in range(model.nactuator):
+            first, out = int(model.actuator_ctrladr[number]), int(model.actuator_outadr[number])
+            names = input_names(model, number)
+            lengths = self.data.actuator_length[out : out + int(model.actuator_outnum[number])]
+            if names == ["rx", "ry", "rz"]:
+                found[first : first + 3] = lengths
+            elif names == ["qw", "qx", "qy", "qz"]:
+                turn = np.linalg.norm(lengths)
+                mujoco.mju_axisAngle2Quat(found[first : first + 4], lengths / max(turn, 1e-300), turn)
+            elif "pos" in names:
+                found[first + names.index("pos")] = lengths[0]
+        return found
+
+    def rested(self, z: Array, which: npt.NDArray[np.intp]) -> Array:
+        """The same controls with these activations (k,) where their rates are 0, if there is such a place."""
+        from scipy.optimize import brentq
+
+        z = z.copy()
+        for place in (self.model.nu + which).tolist():
+
+            def rate(act: float, place: int = place) -> float:
+                z[place] = act
+                return float(self._unlimited(z)[place - len(z)])
+
+            begin = float(z[place])
+            if (now := rate(begin)) != 0:
+                tried = (begin + np.sign(now) * far for far in _FAR)
+                end = next((end for end in tried if rate(end) * now <= 0), None)
+                z[place] = begin if end is None else float(brentq(rate, begin, end, xtol=1e-15))  # pyright: ignore[reportArgumentType]
+        return z
+
+    def _apply(self, model: mujoco.MjModel, z: Array) -> None:
+        self.data.ctrl[:], self.data.act[:] = z[: model.nu], z[model.nu :]
+        mujoco.mj_fwdActuation(model, self.data)
+
+    def exerted(self, z: Array) -> tuple[Array, Array]:
+        """The forces on the joints (nv,), within all limits, and the rates (na,) at which activations change."""
+        model, data, act = self.model, self.data, z[self.model.nu :]
+        self._apply(model, z)
+        step, inside = model.opt.timestep, slice(model.nu, None)
+        held = model.actuator_actlimited[self.of[inside]].astype(bool)  # their next value stays within the range
+        ahead = act + step * data.act_dot
+        ahead = np.where(held, np.clip(ahead, self.low[inside], self.high[inside]), ahead)
+        return data.qfrc_actuator.copy(), (ahead - act) / step
+
+    def _unlimited(self, z: Array) -> Array:
+        """Forces of actuators and rates of activations, (nout + na,), without limits of either."""
+        self._apply(self._free, z)
+        return np.concatenate([self.data.actuator_force, self.data.act_dot])
+
+    def linear(self, z: Array) -> _Linear:
+        """Forces and rates without limits about z, with slopes by differences within the range."""
+        nudge = _NUDGE * np.maximum(1.0, np.abs(z))
+        ahead, behind = (np.clip(z + side * nudge, self.low, self.high) for side in (1, -1))
+        stuck = ahead == behind
+        ahead[stuck], behind[stuck] = (z + nudge)[stuck], (z - nudge)[stuck]
+        slopes = np.zeros((self.model.nout + self.model.na, len(z)))
+        for k in range(len(z)):
+            sides = [np.concatenate([z[:k], side[k : k + 1], z[k + 1 :]]) for side in (ahead, behind)]
+            slopes[:, k] = (self._unlimited(sides[0]) - self._unlimited(sides[1])) / (ahead[k] - behind[k])
+        values, outs = self._unlimited(z), self.model.nout
+        return _Linear(values[:outs], values[outs:], slopes[:outs], slopes[outs:])
+
+    def driven(self, linear: _Linear) -> npt.NDArray[np.bool_]:
+        """Which joints (nv,) actuators move, if forces had no limits."""
+        return np.asarray((self.moments.T @ linear.forces_by).any(axis=1))
+
+
+def holding(model: mujoco.MjModel, qpos: Array) -> Holding:
+    """The controls with which nothing accelerates at rest and activations stay, at positions (nq,).
+
+    Of several, the smallest. If there are none, those with the least sum of squared remaining forces nearby.
+    """
+    rest = _AtRest(model, qpos)
+    search = _Search(rest)
+    # Targets of velocity are left at 0 if other controls can hold.
+    low, high = (np.where(rest.slow, rest.neutral, side) for side in (rest.low, rest.high))
+    found = search.found(low, high)
+    if rest.slow.any() and not found.held:
+        found = search.found(rest.low, rest.high)
+    return found
+
+
+class _Search:
+    """Gauss-Newton steps to controls and activations that hold, each a least-squares problem with bounds.
+
+    Each activation has a mode: 0 if its rate is zero; 1 or -1 if it is at the upper or lower end of its range and its
+    rate would take it further; `_DRIFTS` if it can do neither.
+    """
+
+    def __init__(self, rest: _AtRest) -> None:
+        self._rest, model = rest, rest.model
+        first = rest.linear(rest.neutral)
+        self._kept, self._carried = _carried(model, rest.data.qpos, rest.driven(first))
+        self._modes = np.zeros(model.na, dtype=np.intp)
+        # What nothing changes at rest, such as the bristles of a model of dry friction, is not to carry anything.
+        self._idle = np.asarray(~first.rates_by.any(axis=1))
+        self._steepness = np.where(self._idle, 1.0, np.linalg.norm(first.rates_by, axis=1))
+        self._size = max(rest.largest, float(np.abs(first.forces @ rest.moments).max(initial=0.0)), 1e-12)
+        effects = np.abs(rest.moments.T @ first.forces_by).max(axis=0, initial=0.0)
+        most = np.array([effects[rest.of == number].max() for number in rest.of])  # of an actuator, all count alike
+        self._weights = np.where(most > 0, most, 1.0) / self._size
+        self._sparing = _LIGHT * self._weights
+        limited = model.actuator_forcelimited.astype(bool)
+        for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
+            limited |= _pulls(model, tendon)
+        self._limited = np.flatnonzero(np.repeat(limited, model.actuator_outnum))
+        self._limited_dofs = model.jnt_dofadr[np.flatnonzero(model.jnt_actfrclimited)]
+
+    def _left(self, z: Array) -> tuple[Array, Array]:
+        """The missing forces of the free joints in N or N m, and how far activations (na,) are from rest."""
+        forces, rates = self._rest.exerted(z)
+        return self._carried @ (self._rest.wanted - forces), rates / self._steepness
+
+    def _score(self, z: Array) -> float:
+        """The sum of squares of what is left, as forces, relative to the largest force."""
+        missing, moving = self._left(z)
+        moving = moving * self._weights[self._rest.model.nu :]
+        return float(missing @ missing) / self._size**2 + float(moving @ moving)
+
+    def found(self, low: Array, high: Array) -> Holding:
+        """The controls and activations that hold within these ranges (nz,), or a least score nearby."""
+        rest, model = self._rest, self._rest.model
+        self._low, self._high = low, high
+        self._modes[:] = 0
+        z = rest.neutral.copy()
+        score = self._score(z) if (np.abs(self._left(z)[1]) < _REST).all() else np.inf
+        first = True
+        for _ in range(_STEPS):
+            linear = rest.linear(z)
+            aim = self._aim(z, linear, rest.neutral if first else z)
+            if aim is None:  # some activations cannot be at rest within their ranges
+                if not self._leave(z, linear):
+                    break
+                score = np.inf
+                continue
+            first = False
+            before, shorter = score, False
+            for share in 0.5 ** np.arange(_HALVES):
+                tried = self._rested(z + share * (aim - z))
+                if (then := self._score(tried)) < score:
+                    z, score, shorter = tried, then, share < 1
+                    break
+            if score <= _EXACT**2 or (score > _PROGRESS * before and not shorter and not self._turn(z[model.nu :])):
+                break
+        z = np.clip(np.where(np.abs(z) * self._weights < _EXACT, 0.0, z), low, high)  # rounding
+        left, moving = self._left(z)
+        missed, drifting = np.zeros(model.nv), np.zeros(model.nactuator, dtype=bool)
+        missed[self._kept] = left
+        drifting[rest.of[model.nu :][np.abs(moving) > _HELD * np.maximum(1.0, np.abs(z[model.nu :]))]] = True
+        held = bool((np.abs(left) <= _HELD * rest.largest).all()) and not drifting.any()
+        return Holding(z[: model.nu], z[model.nu :], missed, drifting, held)
+
+    def _rested(self, z: Array) -> Array:
+        """The same controls, with activations at rest and within the ranges."""
+        which = np.flatnonzero((self._modes == 0) & ~self._idle)
+        return np.clip(self._rest.rested(np.clip(z, self._low, self._high), which), self._low, self._high)
+
+    def _turn(self, act: Array) -> bool:
+        """Let activations that are at the ends of their ranges (na,) stay there; whether there are any."""
+        nu = self._rest.model.nu
+        lower, upper = (np.isclose(act, side[nu:], rtol=_END, atol=_END) for side in (self._low, self._high))
+        ends = (lower | upper) & (self._modes == 0) & ~self._idle
+        self._modes[ends] = np.where(upper, 1, -1)[ends]
+        return bool(ends.any())
+
+    def _aim(self, z: Array, linear: _Linear, neutral: Array) -> Array | None:
+        """The z that holds if forces and rates are linear, or comes nearest; None if activations cannot do as said.
+
+        Of several it is the one nearest to `neutral`.
+
+        The unknowns are the change of z and, for each limit of a force, the part of the force that it cuts off.
+        """
+        rest, model, nu, count = self._rest, self._rest.model, self._rest.model.nu, len(z)
+        width = count + len(self._limited) + len(self._limited_dofs)
+        whole = np.eye(width)
+        change, cut = whole[:count], whole[count:]
+        forces = linear.forces_by @ change
+        forces[self._limited] -= cut[: len(self._limited)]
+        joints, now = rest.moments.T @ forces, rest.compensated + rest.moments.T @ linear.forces
+        joints[self._limited_dofs] -= cut[len(self._limited) :]
+        # Where more is wanted than a joint takes, an actuator of several joints may push against its limit for others.
+        limited = model.jnt_actfrclimited.astype(bool)
+        asked, joint_range = rest.wanted[self._limited_dofs], model.jnt_actfrcrange[limited].T
+        beyond = (asked > joint_range[1]).astype(float) - (asked < joint_range[0])
+        price = np.concatenate([np.ones(len(self._limited)), np.where(beyond != 0, _LIGHT / _HEAVY, 1.0)])
+        price *= _HEAVY / self._size
+        rows = self._carried @ joints / self._size, self._sparing[:, None] * change, price[:, None] * cut
+        aims = [self._carried @ (rest.wanted - now) / self._size, self._sparing * (neutral - z), np.zeros(len(cut))]
+        rates, rates_now = linear.rates_by @ change / self._steepness[:, None], linear.rates / self._steepness
+        follows, at_end = (self._modes == 0) & ~self._idle, np.isin(self._modes, (-1, 1))
+        stays = at_end | self._idle
+        ends = np.where(self._modes > 0, self._high[nu:], self._low[nu:])
+        ends = np.where(self._idle, rest.neutral[nu:], ends)
+        met = np.concatenate([rates[follows], change[nu:][stays]])
+        met_at = np.concatenate([-rates_now[follows], (ends - z[nu:])[stays]])
+        sign, (least, most) = self._modes[at_end], joint_range - now[self._limited_dofs]
+        sides = [
+            (change, self._low - z, self._high - z),
+            (sign[:, None] * rates[at_end], -sign * rates_now[at_end], np.full(len(sign), np.inf)),
+            (joints[self._limited_dofs], least, most),
+            (beyond[:, None] * cut[len(self._limited) :], np.zeros(len(beyond)), np.full(len(beyond), np.inf)),
+            *_force_limits(model, forces, linear.forces),
+        ]
+        if len(cut):  # what must be cut off in any case is not to cost anything
+            least = _least_squares(np.concatenate(rows[1:]), np.concatenate(aims[1:]), (met, met_at), sides)
+            if least is None:
+                return None
+            aims[2] = price * least[count:]
+        found = _least_squares(np.concatenate(rows), np.concatenate(aims), (met, met_at), sides)
+        return None if found is None else z + found[:count]
+
+    def _leave(self, z: Array, linear: _Linear) -> bool:
+        """Let activations that cannot be at rest within their ranges go to the ends, or drift; whether there are any.
+
+        Of an actuator's activations as few as may be, the last first, which follow the others.
+        """
+        rest, nu, any_left = self._rest, self._rest.model.nu, False
+        for number in np.unique(rest.of[nu:]):
+            own = np.flatnonzero(rest.of == number)
+            acts = own[own >= nu] - nu
+            acts = acts[(self._modes[acts] == 0) & ~self._idle[acts]]
+            now = linear.rates[acts] / self._steepness[acts]
+            rates = linear.rates_by[np.ix_(acts, own)] / self._steepness[acts, None]
+            off, left_out = _unmet(rates, now, (self._low - z)[own], (self._high - z)[own])
+            end = np.where(off > 0, self._high[nu + acts], self._low[nu + acts])
+            modes = np.where(np.isfinite(end), np.where(off > 0, 1, -1), _DRIFTS)
+            self._modes[acts[left_out]] = modes[left_out]
+            any_left = any_left or bool(left_out.any())
+        return any_left
+
+
+def _unmet(rates: Array, now: Array, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Of the rates now + rates x of an actuator, with low <= x <= high, as few as may be left that are not zero.
+
+    Returns:
+      What they are then, and which are left, of several the last.
     """
     from scipy.optimize import lsq_linear
 
-    free = _without_force_limits(model)
-    data = mujoco.MjData(free)
-    data.qpos[:], data.act[:] = qpos, act
-    mujoco.mj_inverse(free, data)
-    wanted = data.qfrc_inverse.copy()
-    levels = _Levels(model)
-    low, high = levels.low, levels.high
-
-    def force(asked: Array) -> Array:
-        levels.act(asked, data)
-        mujoco.mj_forward(free, data)
-        return data.qfrc_actuator.copy()
-
-    middle = np.clip(np.zeros(model.nu), low, high)
-    rest = force(middle)
-    columns = np.stack([force(middle + one) - rest for one in np.eye(model.nu)], axis=1)
-    size = max(1.0, float(np.abs(wanted).max(initial=0.0)))
-    kept, carried = _carried(model, qpos, np.asarray(columns.any(axis=1)))
-    columns, rest, wanted = carried @ columns, carried @ rest, carried @ wanted
-    scale = np.abs(columns).max(axis=0)
-    scale[scale == 0] = 1.0  # for example if a state of the actuator comes in between
-    rows = np.concatenate([columns / scale, _LIGHT * np.eye(model.nu)])
-    aims = np.concatenate([wanted - rest, np.zeros(model.nu)])
-    bounds = (low - middle) * scale, (high - middle) * scale
-    tight = bounds[1] - bounds[0] < 1e-12  # lsq_linear refuses such bounds
-    bounds = np.where(tight, -1e-12, bounds[0]), np.where(tight, 1e-12, bounds[1])
-    found = middle + lsq_linear(rows, aims, bounds).x / scale
-    found = np.clip(found, low, high)
-    found[np.abs(found) * scale < 1e-12 * size] = 0.0  # rounding
-    missed = np.zeros(model.nv)
-    missed[kept] = wanted - rest - columns @ (found - middle)
-    levels.act(found, data)
-    held = bool((np.abs(missed) <= _HELD * size).all()) and not levels.drifting.any()
-    controls = np.clip(data.ctrl, *levels.ranges)[actuators]
-    return Holding(controls, data.act.copy(), missed, levels.drifting, held)
+    tight = np.where(low == high, _TIGHT, 0.0)  # lsq_linear refuses such bounds
+    every, off = range(len(now)), now
+    for left in itertools.chain.from_iterable(itertools.combinations(every[::-1], count) for count in range(len(now))):
+        out = np.isin(every, left)
+        weights = np.where(out, _TIGHT, 1.0)
+        off = now + rates @ lsq_linear(weights[:, None] * rates, -weights * now, (low - tight, high + tight)).x
+        if (np.abs(off[~out]) < _REST).all():
+            return off, out
+    return off, np.ones(len(now), dtype=bool)
 
 
-def _without_force_limits(model: mujoco.MjModel) -> mujoco.MjModel:
+def _force_limits(model: mujoco.MjModel, forces: Array, now: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Limits of the forces of actuators and tendons: rows, and the least and largest change.
+
+    Args:
+      forces: (nout, k), slopes of the forces. now: (nout,), the forces.
+    """
+    limited, single = model.actuator_forcelimited.astype(bool), model.actuator_outnum == 1
+    outs, least, most = model.actuator_outadr, *model.actuator_forcerange.T
+    some = np.flatnonzero(limited & single)
+    yield forces[outs[some]], least[some] - now[outs[some]], most[some] - now[outs[some]]
+    for number in np.flatnonzero(limited & ~single).tolist():  # a torque, whose size is limited
+        own = slice(outs[number], outs[number] + model.actuator_outnum[number])
+        largest = float(np.linalg.norm(now[own]))
+        if largest > 0:
+            yield (now[own] / largest @ forces[own])[None], np.array([-np.inf]), np.array([most[number] - largest])
+    for tendon in np.flatnonzero(model.tendon_actfrclimited).tolist():
+        own = outs[_pulls(model, tendon)]
+        least, most = model.tendon_actfrcrange[tendon, :, None] - now[own].sum()
+        yield forces[own].sum(axis=0)[None], least, most
+
+
+def _pulls(model: mujoco.MjModel, tendon: int) -> npt.NDArray[np.bool_]:
+    """Which actuators pull at a tendon."""
+    return (model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON.value) & (model.actuator_trnid[:, 0] == tendon)
+
+
+def _least_squares(
+    rows: Array, aims: Array, equal: tuple[Array, Array], sides: Iterable[tuple[Array, Array, Array]]
+) -> Array | None:
+    """The x with the least |rows x - aims|, for which equalities hold and rows of `sides` are within their limits.
+
+    Equalities are eliminated; what remains is a least-distance problem, which is one of non-negative least squares
+    (Lawson and Hanson, Solving Least Squares Problems, ch. 23). None if there is no such x.
+    """
+    from scipy.linalg import null_space, solve_triangular
+    from scipy.optimize import nnls
+
+    start = np.linalg.lstsq(*equal, rcond=None)[0]
+    if np.abs(equal[0] @ start - equal[1]).max(initial=0.0) > _REST * (1 + np.abs(equal[1]).max(initial=0.0)):
+        return None
+    ways = null_space(equal[0]) if len(equal[0]) else np.eye(rows.shape[1])
+    turned, corner = np.linalg.qr(rows @ ways)
+    nearest = turned.T @ (aims - rows @ start)
+    above = [(one[np.isfinite(least)], least[np.isfinite(least)]) for one, least, _ in sides]
+    below = [(-one[np.isfinite(most)], -most[np.isfinite(most)]) for one, _, most in sides]
+    bound, least = (np.concatenate(part) for part in zip(*above, *below, strict=True))
+    least = least - bound @ start
+    bound = solve_triangular(corner, (bound @ ways).T, trans=1).T
+    least = least - bound @ nearest
+    sizes = np.linalg.norm(bound, axis=1)
+    fixed = sizes <= 1e-12 * sizes.max(initial=0.0)
+    if (least[fixed] > _REST).any():
+        return None
+    bound, least = bound[~fixed] / sizes[~fixed, None], least[~fixed] / sizes[~fixed]
+    farthest = float(least.max(initial=0.0))
+    aim = np.append(np.zeros(len(bound.T)), 1.0)
+    for distance in farthest * _SCALES if farthest > 0 else ():
+        matrix = np.concatenate([bound.T, least[None] / distance])
+        residual = matrix @ nnls(matrix, aim)[0] - aim
+        if -residual[-1] > _NEAR:
+            nearest = nearest - distance * residual[:-1] / residual[-1]
+            break
+    else:
+        if farthest > 0:
+            return None
+    return start + ways @ solve_triangular(corner, nearest)
+
+
+def _unlimited(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model without limits of forces, and of what integrates errors of position."""
     free = copy.copy(model)
     free.actuator_forcelimited[:] = 0
     free.jnt_actfrclimited[:] = 0
+    free.tendon_actfrclimited[:] = 0
+    for number, entry, _ in _integrals(model):
+        free.actuator_dynprm[number, entry] = 0.0
     return free
+
+
+def _integrals(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
+    """What integrates an error of position: its actuator, the place of its limit in dynprm, and its activation."""
+    for number, kind in enumerate(model.actuator_dyntype):
+        if kind == mujoco.mjtDyn.mjDYN_PID.value:
+            gain, slew, limit = model.actuator_gainprm[number, 0], 1, 0
+        elif kind == mujoco.mjtDyn.mjDYN_DCMOTOR.value:
+            gain, slew, limit = model.actuator_gainprm[number, 5], 7, 8
+        else:
+            continue
+        if gain != 0:  # a limit of the rate of targets adds an activation before it
+            yield number, limit, int(model.actuator_actadr[number]) + int(model.actuator_dynprm[number, slew] > 0)
+
+
+def _owners(size: int, first: npt.NDArray[np.int32], count: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
+    """The actuator of each control or activation, (size,)."""
+    found = np.zeros(size, dtype=np.intp)
+    for number in np.flatnonzero(count):
+        found[first[number] : first[number] + count[number]] = number
+    return found
 
 
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
@@ -133,18 +463,8 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     It uses Newton's method with steps of least norm: contacts are springs, and nothing moves in a free direction, such
     as along a floor.
     """
-    data, levels, strong = mujoco.MjData(model), _Levels(model), _without_force_limits(model)
-    data.qpos[:] = qpos
-
-    def forces(asked: Array) -> Array:
-        levels.act(asked, data)
-        mujoco.mj_forward(strong, data)  # at its limit, a force does not change, though the joint is driven
-        return data.qfrc_actuator.copy()
-
-    driven = np.zeros(model.nv, dtype=bool)
-    for one in np.eye(model.nu):
-        driven |= forces(one) != forces(-one)
-    free = np.flatnonzero(~driven)
+    data, actuators = mujoco.MjData(model), _AtRest(model, qpos)
+    free = np.flatnonzero(~actuators.driven(actuators.linear(actuators.neutral)))
     if not len(free):
         return qpos.copy(), 0.0
 
@@ -159,8 +479,8 @@ def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     moved = np.zeros(len(free))
     place, left = missing(moved)
     for _ in range(_NEWTON):
-        slopes = [missing(moved + one)[1] - missing(moved - one)[1] for one in _NUDGE * np.eye(len(free))]
-        step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _NUDGE), left, rcond=1e-6)[0]
+        slopes = [missing(moved + one)[1] - missing(moved - one)[1] for one in _SMALL * np.eye(len(free))]
+        step = -np.linalg.lstsq(np.array(slopes).reshape(len(free), -1).T / (2 * _SMALL), left, rcond=1e-6)[0]
         for share in 0.5 ** np.arange(_HALVES):
             tried, then = missing(moved + share * step)
             if np.linalg.norm(then) < np.linalg.norm(left):
@@ -176,38 +496,35 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
 
     In a loop those follow that are not driven, as far as there are enough of them.
     """
-    if loops_of(model):
-        from scipy.linalg import qr
+    if not model.eq_active0.any():
+        return np.arange(model.nv), np.eye(model.nv)
+    from scipy.linalg import qr
 
-        _, slopes = Equalities(model).at(qpos)
-        _, corner, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
-        rank = int((np.abs(np.diagonal(corner)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
-        follow, kept = (np.sort(one).astype(np.intp) for one in (order[:rank], order[rank:]))
-        moves = np.eye(model.nv)[:, kept]
-        moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, kept], rcond=None)[0]
-        return kept, moves.T
-    moves, coupled = np.eye(model.nv), couplings_of(model)
-    for one in coupled:
-        moves[one.dof] = one.ratio * moves[one.other] if one.other >= 0 else 0.0
-    kept = np.setdiff1d(np.arange(model.nv), [one.dof for one in coupled])
-    return kept, moves[:, kept].T
+    _, slopes = Equalities(model).at(qpos)
+    _, corner, order = qr(slopes * np.where(driven, 1.0, _RATHER), mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
+    rank = int((np.abs(np.diagonal(corner)) > _RANK * np.abs(slopes).max(initial=0.0)).sum())
+    follow, kept = (np.sort(one).astype(np.intp) for one in (order[:rank], order[rank:]))
+    moves = np.eye(model.nv)[:, kept]
+    moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, kept], rcond=None)[0]
+    return kept, moves.T
 
 
-def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
-    """The largest size of each control, (m,): from its own limits, else from its force's; 1 without limits."""
+def efforts(model: mujoco.MjModel) -> Array:
+    """The largest size of each control, (nu,): from its own limits, else from its force's; 1 without limits."""
     found = np.ones(model.nu)
-    for number in range(model.nu):
-        gain, gear = abs(float(model.actuator_gainprm[number, 0])), abs(float(model.actuator_gear[number, 0]))
+    for k, number in enumerate(_owners(model.nu, model.actuator_ctrladr, model.actuator_ctrlnum)):
+        gain = abs(float(model.actuator_gainprm[number, 0]))
+        gear = abs(float(model.actuator_gear[model.actuator_outadr[number], 0]))
         joint = int(model.actuator_trnid[number, 0])
         of_joint = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT and model.jnt_actfrclimited[joint]
         servo = model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE  # its control is no force
-        if model.actuator_ctrllimited[number]:
-            largest = float(np.abs(model.actuator_ctrlrange[number]).max())
+        if model.actuator_ctrllimited[k]:
+            largest = float(np.abs(model.actuator_ctrlrange[k]).max())
         elif model.actuator_forcelimited[number] and gain and not servo:
             largest = float(np.abs(model.actuator_forcerange[number]).max()) / gain
         elif of_joint and gain and gear and not servo:
             largest = float(np.abs(model.jnt_actfrcrange[joint]).max()) / (gain * gear)
         else:
             continue
-        found[number] = largest if largest > 0 else 1.0
-    return found[actuators]
+        found[k] = largest if largest > 0 else 1.0
+    return found

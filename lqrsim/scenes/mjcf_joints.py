@@ -58,41 +58,36 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Actuator:
-    """An actuator: its name, MuJoCo's number, the unit of its control (or empty), and its limits."""
+class Control:
+    """A control: its name, its unit (or empty), and its limits."""
 
     name: str
-    number: int
     unit: str
     low: float
     high: float
 
 
-@dataclass(frozen=True)
-class Coupling:
-    """A joint that an equality constraint moves with another joint, linearly.
-
-    Attributes:
-      dof: index of the joint's velocity. other: index of the velocity of the joint that it follows; -1 if it stands
-        still. offset: its position if the other's is 0, in m or rad. ratio: ratio of both.
-    """
-
-    dof: int
-    other: int
-    offset: float
-    ratio: float
-
-
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
+_TYPED = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
 _RANK = 1e-9  # relative size of singular values that count as zero
 _STRIDE = 0.05  # m or rad, of joints that others follow
+_SAME = 1e-12  # m, and of quaternions, within which a mocap body is where a keyframe has it
 UNNAMED = "unnamed_"  # prefix of the names of bodies, joints, geoms and actuators without a name in the MJCF
 
 
 def named(xml: str) -> str:
-    """An MJCF in which every body, joint, geom and actuator has a name: `unnamed_<kind>_<number>`, counted from 0."""
+    """An MJCF in which every body, joint, geom and actuator has a name: `unnamed_<kind>_<number>`, counted from 0.
+
+    Of several free joints without a name, each gets its body's.
+    """
     root = ElementTree.fromstring(xml)
     taken = {element.get("name") for element in root.iter()}
+    joints = {element.get("name") for tag in ("joint", "freejoint") for element in root.iter(tag)}
+    free = [(body.get("name"), one) for body in root.iter("body") for one in body if _is_free(one)]
+    for body, joint in free if len(free) > 1 else ():
+        if body is not None and body not in joints:
+            joint.set("name", body)
+            joints.add(body)
 
     def name(elements: Iterable[ElementTree.Element], kind: str) -> None:
         count = 0
@@ -111,11 +106,22 @@ def named(xml: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+def _is_free(element: ElementTree.Element) -> bool:
+    """Whether it is a free joint without a name."""
+    free = element.tag == "freejoint" or (element.tag == "joint" and element.get("type") == "free")
+    return free and element.get("name") is None
+
+
 def check_attached(xml: str, model: mujoco.MjModel, what: str) -> None:
     """Raises InputError if a model that the MJCF attaches has elements without a name, which its text cannot name."""
     if "<attach" not in xml:
         return
-    for kind, count in (("body", model.nbody), ("joint", model.njnt), ("geom", model.ngeom), ("actuator", model.nu)):
+    for kind, count in (
+        ("body", model.nbody),
+        ("joint", model.njnt),
+        ("geom", model.ngeom),
+        ("actuator", model.nactuator),
+    ):
         for number in range(count):
             if not getattr(model, kind)(number).name:
                 raise InputError(
@@ -155,24 +161,33 @@ def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
     return tuple(found)
 
 
-def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
-    """All actuators, in MuJoCo's order."""
+def input_names(model: mujoco.MjModel, actuator: int) -> list[str]:
+    """MuJoCo's names of an actuator's controls, such as pos and vel; empty for one that is just a command."""
+    count = int(model.actuator_ctrlnum[actuator])
+    return [mujoco.mj_actuatorInputName(model, actuator, i) or "" for i in range(count)]
+
+
+def controls_of(model: mujoco.MjModel) -> tuple[Control, ...]:
+    """All controls, in MuJoCo's order: named as their actuator, `<actuator>_<input>` if it has several, or none."""
     low, high = (side.tolist() for side in control_ranges(model))
-    return tuple(
-        Actuator(model.actuator(number).name, number, _unit(model, number), low[number], high[number])
-        for number in range(model.nu)
-    )
+    found = list[Control]()
+    for number in range(model.nactuator):
+        inputs, name = input_names(model, number), model.actuator(number).name
+        for one in inputs:
+            full, k = f"{name}_{one}" if len(inputs) > 1 else name, len(found)
+            found.append(Control(full, _unit(model, number, one), low[k], high[k]))
+    return tuple(found)
 
 
 def ranges(limited: npt.NDArray[np.bool_], sides: Array) -> tuple[Array, Array]:
-    """The least and the largest numbers (nu,) of ranges (nu, 2), infinite where there is no limit."""
+    """The least and the largest numbers (k,) of ranges (k, 2), infinite where there is no limit."""
     low, high = np.where(limited, sides.T, [[-np.inf], [np.inf]])
     return low, high
 
 
 def control_ranges(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """The least and the largest control of each actuator, (nu,). To a muscle MuJoCo passes on only what is in 0..1."""
-    muscle = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE.value
+    """The least and the largest of each control, (nu,). To a muscle MuJoCo passes on only what is in 0..1."""
+    muscle = np.repeat(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE.value, model.actuator_ctrlnum)
     low, high = ranges(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange)
     return np.where(muscle, np.clip(low, 0, 1), low), np.where(muscle, np.clip(high, 0, 1), high)
 
@@ -180,25 +195,27 @@ def control_ranges(model: mujoco.MjModel) -> tuple[Array, Array]:
 def activations_of(model: mujoco.MjModel) -> tuple[str, ...]:
     """The names of the states of actuators, (na,): `<actuator>_activation`, numbered if an actuator has several."""
     names = [""] * model.na
-    for number in range(model.nu):
+    for number in range(model.nactuator):
         first, count = int(model.actuator_actadr[number]), int(model.actuator_actnum[number])
         for i in range(count if first >= 0 else 0):
             names[first + i] = f"{model.actuator(number).name}_activation" + (f"_{i}" if count > 1 else "")
     return tuple(names)
 
 
-def _unit(model: mujoco.MjModel, number: int) -> str:
-    """The unit of a control, for plain motors and servos of joints; empty for others, which have no fixed unit."""
+def _unit(model: mujoco.MjModel, number: int, what: str) -> str:
+    """The unit of an actuator's input, for plain motors and servos of joints; empty for others, which have none."""
     joint = int(model.actuator_trnid[number, 0])
-    gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
+    gear = model.actuator_gear[model.actuator_outadr[number]]
+    gain, bias = model.actuator_gainprm[number], model.actuator_biasprm[number]
     if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:
-        return ""
-    if mujoco.mjtGain(model.actuator_gaintype[number]) != mujoco.mjtGain.mjGAIN_FIXED:
         return ""
     kind = _KINDS[mujoco.mjtJoint(model.jnt_type[joint])]
     if kind not in ("slide", "hinge"):
         return ""
     force, length = ("N", "m") if kind == "slide" else ("N m", "rad")
+    units = {"pos": length, "vel": f"{length}/s", "ff": force, "voltage": "V", "pressure": ""}
+    if what or mujoco.mjtGain(model.actuator_gaintype[number]) != mujoco.mjtGain.mjGAIN_FIXED:
+        return units.get(what, "")
     plain = mujoco.mjtDyn(model.actuator_dyntype[number]) == mujoco.mjtDyn.mjDYN_NONE
     if mujoco.mjtBias(model.actuator_biastype[number]) == mujoco.mjtBias.mjBIAS_NONE:
         return force if gain[0] == 1 and plain else ""
@@ -232,32 +249,14 @@ def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     ]
 
 
-def couplings_of(model: mujoco.MjModel) -> tuple[Coupling, ...]:
-    """The active equality constraints that couple joints linearly: see `is_linear`."""
-    found = []
-    for number in np.flatnonzero(model.eq_active0).tolist():
-        if not is_linear(model, number):
-            continue
-        first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
-        offset, ratio = (float(entry) for entry in model.eq_data[number, :2])
-        rest = float(model.qpos0[model.jnt_qposadr[first]])
-        if second < 0:
-            found.append(Coupling(int(model.jnt_dofadr[first]), -1, rest + offset, 0.0))
-            continue
-        offset += rest - ratio * float(model.qpos0[model.jnt_qposadr[second]])
-        found.append(Coupling(int(model.jnt_dofadr[first]), int(model.jnt_dofadr[second]), offset, ratio))
-    return tuple(found)
-
-
-def is_linear(model: mujoco.MjModel, number: int) -> bool:
-    """Whether an equality constraint couples a joint linearly to another joint, or fixes it."""
-    joints = model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT
-    return bool(joints and (int(model.eq_obj2id[number]) < 0 or not model.eq_data[number, 2:5].any()))
-
-
-def loops_of(model: mujoco.MjModel) -> list[int]:
-    """The numbers of the active equality constraints that are not linear in the joints, as those that close a loop."""
-    return [number for number in np.flatnonzero(model.eq_active0).tolist() if not is_linear(model, number)]
+def leaders_of(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
+    """Which degrees of freedom (nv,) are those of joints that others follow by an equality, and that follow none."""
+    joints = np.flatnonzero(model.eq_active0 & (model.eq_type == mujoco.mjtEq.mjEQ_JOINT.value))
+    leads, follows = np.zeros(model.nv, dtype=bool), np.zeros(model.nv, dtype=bool)
+    follows[model.jnt_dofadr[model.eq_obj1id[joints]]] = True
+    others = model.eq_obj2id[joints]
+    leads[model.jnt_dofadr[others[others >= 0]]] = True
+    return leads & ~follows
 
 
 class Equalities:
@@ -291,18 +290,22 @@ class Equalities:
         mujoco.mj_differentiatePos(model, move, 1.0, qpos, aim)
         move[~fixed] = 0.0
         steps = max(1, int(np.ceil(np.abs(move).max(initial=0.0) / _STRIDE)))
+        off = np.zeros(0)
         for _ in range(steps):
             mujoco.mj_integratePos(model, place, move / steps, 1.0)
             for _ in range(_NEWTON):
                 off, slopes = self.at(place)
-                if np.abs(off).max(initial=0.0) < _MET:
+                within_reach = slopes[:, ~fixed].any(axis=1)  # others need to be met at the aim only
+                if np.abs(off[within_reach]).max(initial=0.0) < _MET:
                     break
                 step = np.zeros(model.nv)
                 step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=_RANK)[0]
                 mujoco.mj_integratePos(model, place, step, 1.0)
+                if np.abs(step).max() < _MET:  # as near as it gets on the way: only the aim is to be consistent
+                    break
             else:
                 return None
-        return place
+        return place if np.abs(off).max(initial=0.0) < _TYPED else None
 
     def closed(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Positions (nq,) and velocities (nv,) near those given at which they are met; None if none were found."""
@@ -331,13 +334,102 @@ def keyframe(model: mujoco.MjModel, xml: str, name: str, what: str) -> tuple[Arr
     """qpos, qvel and act of a keyframe; act is None if the MJCF does not state it, for which the model has zeros.
 
     Raises:
-      InputError: there is no keyframe of that name.
+      InputError: there is no keyframe of that name, or mocap bodies are elsewhere in it.
     """
-    names = [model.key(number).name for number in range(model.nkey)]
-    number = names.index(check_name(f"{what}: keyframe", name, names))
+    number = _key(model, name, f"{what}: keyframe")
+    moved = [model.body(body).name for body in _moved(model, number)]
+    if moved:
+        raise InputError(
+            f"{what}: keyframe: got {name!r}, in which the mocap bodies {', '.join(moved)} are elsewhere, want"
+            f" MjcfRobot(..., mocap={name!r}), which has them there"
+        )
     stated = model.na > 0 and len(mujoco.MjSpec.from_string(xml).keys[number].act) > 0
     act = model.key_act[number].copy() if stated else None
     return model.key_qpos[number].copy(), model.key_qvel[number].copy(), act
+
+
+def with_mocap(xml: str, model: mujoco.MjModel, name: str, what: str) -> str:
+    """The MJCF with its mocap bodies where a keyframe has them, and all else as it is.
+
+    What MuJoCo compiles from where bodies are at rest is stated as it was: what ties two bodies.
+
+    Raises:
+      InputError: there is no keyframe of that name; or the text cannot say this, as of a body in a <frame>.
+    """
+    number = _key(model, name, f"{what}: keyframe")
+    if not (moved := _moved(model, number)):
+        return xml
+    root = ElementTree.fromstring(xml)
+    elements = {one.get("name", ""): one for world in root.iter("worldbody") for one in world.iter("body")}
+    for body in moved:
+        element, where = elements[model.body(body).name], int(model.body_mocapid[body])
+        for other in ("axisangle", "xyaxes", "zaxis", "euler"):
+            element.attrib.pop(other, None)
+        for attribute, values in (("pos", model.key_mpos), ("quat", model.key_mquat)):
+            element.set(attribute, _text(values[number].reshape(model.nmocap, -1)[where]))
+    elements["world"] = next(root.iter("worldbody"))
+    ties = [one for section in root.findall("equality") for one in section]
+    for i, (tie, values) in enumerate(zip(ties, model.eq_data, strict=False)):
+        if tie.tag == "weld" and "body1" in tie.attrib:
+            tie.set("relpose", _text(values[3:10]))
+        elif tie.tag == "connect" and "body1" in tie.attrib:
+            del tie.attrib["anchor"]
+            for side, place in enumerate((values[:3], values[3:6]), 1):
+                site = f"{name}_tie_{i}_{side}"
+                ElementTree.SubElement(
+                    elements[tie.attrib.pop(f"body{side}", "world")],
+                    "site",
+                    {"name": site, "pos": _text(place), "group": "5"},
+                )
+                tie.set(f"site{side}", site)
+    found = ElementTree.tostring(root, encoding="unicode")
+    if not _same_forces(model, number, mujoco.MjModel.from_xml_string(found)):
+        raise InputError(
+            f"{what}: mocap: got the keyframe {name!r}, whose mocap bodies cannot be placed by rewriting the MJCF, want"
+            " them directly in the <worldbody>, and springs of tendons at them with a springlength"
+        )
+    return found
+
+
+def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool:
+    """Whether another model has the forces of this one with its mocap bodies where a keyframe has them."""
+    rng, found = np.random.default_rng(0), []
+    move = rng.normal(size=(3, model.nv))
+    for one in (model, other):
+        data = mujoco.MjData(one)
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        for step in move:
+            mujoco.mj_integratePos(one, data.qpos, step, 0.3)
+            mujoco.mj_inverse(one, data)
+            rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            found.append(
+                np.concatenate([data.efc_pos[rows], data.ten_length, data.qfrc_passive, data.mocap_pos.ravel()])
+            )
+    pairs = zip(found[:3], found[3:], strict=True)
+    return not _moved(other, key) and all(
+        len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
+    )
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(map(repr, numbers.tolist()))
+
+
+def _key(model: mujoco.MjModel, name: str, field: str) -> int:
+    names = [model.key(number).name for number in range(model.nkey)]
+    return names.index(check_name(field, name, names))
+
+
+def _moved(model: mujoco.MjModel, key: int) -> list[int]:
+    """The mocap bodies that are elsewhere in a keyframe than in the MJCF."""
+    found = []
+    for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
+        where = int(model.body_mocapid[body])
+        quat = model.key_mquat[key].reshape(model.nmocap, 4)[where]
+        near = np.abs(model.key_mpos[key].reshape(model.nmocap, 3)[where] - model.body_pos[body]).max() < _SAME
+        if not near or 1 - abs(float(quat @ model.body_quat[body])) > _SAME * np.linalg.norm(quat):
+            found.append(body)
+    return found
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
     for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
         if (name := model.geom(number).name) in elements["geom"]:
             found.append(Number("friction", name, float(model.geom_friction[number, 0])))
-    for number, gear in enumerate(model.actuator_gear):
+    for number, gear in enumerate(model.actuator_gear[model.actuator_outadr]):
         if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
             found.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
     found += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
@@ -85,7 +85,11 @@ def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], w
         elif one.what == "friction":
             _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
         elif one.what == "gear":
-            _set(elements["actuator"][one.part], "gear", [*(ratio * model.actuator(one.part).gear)])
+            _set(
+                elements["actuator"][one.part],
+                "gear",
+                [*(ratio * np.reshape(model.actuator(one.part).gear, (-1, 6))[0])],
+            )
         else:
             _set(ElementTree.SubElement(root, "option"), one.what, [value])  # the last element takes precedence
     if scales:

@@ -126,7 +126,7 @@ class MjcfPhysics:
 def _check(model: mujoco.MjModel, name: str) -> None:
     """Raises InputError if there is no actuator, or for features that have their own states."""
     refused = {
-        "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
+        "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
         "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
         "plugins": (model.npluginstate > 0, "got plugins with their own states", "none"),
         "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),

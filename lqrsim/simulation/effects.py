@@ -106,7 +106,7 @@ class Effects:
         """Alter the models of the trials; `Physics.prepare` must follow."""
         for name, effect in self._effects:
             for parameter, factors in (effect.factors or {}).items():
-                columns = len(physics.plant.ctrl) if parameter == "thrust" else 1
+                columns = len(physics.plant.actuators) if parameter == "thrust" else 1
                 shape = len(self.displaced), columns
                 physics.multiply(parameter, shaped(f"{name}: factors: {parameter}", factors, shape))
             if effect.alter is not None:

@@ -65,7 +65,7 @@ class MujocoPhysics(Physics):
         field, which = {
             "mass": ("body_mass", self.plant.bodies),
             "inertia": ("body_inertia", self.plant.bodies),
-            "thrust": ("actuator_gainprm", self.plant.ctrl),
+            "thrust": ("actuator_gainprm", self.plant.actuators),
         }[parameter]
         values = self.simulations.expand(field)
         values[:, which] *= factors if values.ndim == 2 else factors[:, :, None]

@@ -46,7 +46,8 @@ class Plant:
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body.
       bodies: ids of all its bodies: that one, those that its joints move, and those attached to them.
-      qpos, qvel, ctrl: indices of its joints and actuators in MuJoCo's arrays.
+      qpos, qvel, ctrl: indices of its joints and controls in MuJoCo's arrays.
+      actuators: ids of its actuators, of which each has any number of controls.
       contact: indices of the contact sensors in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: timestep of the physics, in seconds.
 
@@ -90,7 +91,9 @@ class Plant:
         joints = [self.model.joint(name) for name in robot.joints]
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
         self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
-        self.ctrl = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
+        self.actuators = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
+        controls = self.model.actuator_ctrladr[self.actuators], self.model.actuator_ctrlnum[self.actuators]
+        self.ctrl = _ranges(zip(*controls, strict=True))
         self.contact = np.arange(self.model.nsensordata - len(self.obstacles), self.model.nsensordata)
         try:
             batch.Batch(self.model, 1, 1)
@@ -305,7 +308,13 @@ class Plant:
         except (ValueError, mujoco.FatalError) as error:
             raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
-        if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
+        if (had.ngeom, had.nbody, had.nq, had.nv, had.nactuator) != (
+            has.ngeom,
+            has.nbody,
+            has.nq,
+            has.nv,
+            has.nactuator,
+        ):
             raise InputError(f"scene {self.scene.name}: got a model that differs from its xml, want one of load_scene")
         if self._step is not None:
             spec.option.timestep = self._step
@@ -431,4 +440,4 @@ def _attached(model: mujoco.MjModel, roots: Iterable[int]) -> Indices:
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:
-    return np.concatenate([np.arange(start, start + size) for start, size in starts_and_sizes], dtype=np.intp)
+    return np.array([at for start, size in starts_and_sizes for at in range(start, start + size)], dtype=np.intp)

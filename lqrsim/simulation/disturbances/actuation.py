@@ -212,9 +212,9 @@ class ActuatorLoss(Disturbance):
                 f" ends at {plan.horizon:g} s"
             )
         if self.actuator is None:
-            lost = plant.ctrl[[int(generator.integers(len(plant.ctrl))) for generator in generators]]
+            lost = plant.actuators[[int(generator.integers(len(plant.actuators))) for generator in generators]]
         else:
-            lost = np.full(len(generators), plant.ctrl[plant.robot.actuators.index(self.actuator)])
+            lost = np.full(len(generators), plant.actuators[plant.robot.actuators.index(self.actuator)])
         trials, parameters = np.arange(len(generators)), []
 
         def alter(simulations: batch.Batch) -> None:
@@ -233,7 +233,7 @@ class ActuatorLoss(Disturbance):
 
 def check_gains(disturbance: Disturbance, plant: Plant) -> None:
     """Raise InputError unless the forces of the robot's actuators are proportional to their gains and biases."""
-    for name, number in zip(plant.robot.actuators, plant.ctrl, strict=True):
+    for name, number in zip(plant.robot.actuators, plant.actuators, strict=True):
         if plant.model.actuator_gaintype[number] not in _FIXED or plant.model.actuator_biastype[number] not in (0, 1):
             raise InputError(
                 f"{type(disturbance).__name__}: got robot {plant.robot.name}, whose actuator {name!r} has a gain or"

@@ -195,7 +195,7 @@ class ThrustMismatch(Mismatch):
     def check(self, plant: Plant) -> None:
         super().check(plant)
         check_gains(self, plant)
-        if plant.model.actuator_biastype[plant.ctrl].any():
+        if plant.model.actuator_biastype[plant.actuators].any():
             raise InputError(
                 f"ThrustMismatch: got robot {plant.robot.name}, whose actuators are servos, want one whose actuators"
                 " exert forces"
@@ -313,9 +313,12 @@ def controls_of(plant: Plant) -> dict[str | None, str]:
     names = plant.robot.dynamics.control_coordinates.names
     each = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
     none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in each)
-    follows = (one != none) | (two != none) | ~np.isfinite(one + two)  # (controls, actuators)
+    follows = (one != none) | (two != none) | ~np.isfinite(one + two)  # (controls, MuJoCo's controls)
     found: dict[str | None, str] = {}
-    for j, actuator in enumerate(plant.robot.actuators):
+    counts = plant.model.actuator_ctrlnum[plant.actuators]
+    for j, actuator, count in zip(np.cumsum(counts) - counts, plant.robot.actuators, counts, strict=True):
+        if count != 1:
+            continue
         followed = np.flatnonzero(follows[:, j])
         if len(followed) == 1:
             i = followed[0]
@@ -330,7 +333,7 @@ def driven_by(plant: Plant, body: int) -> str | None:
     model = plant.model
     found = [
         name
-        for name, number in zip(plant.robot.actuators, plant.ctrl, strict=True)
+        for name, number in zip(plant.robot.actuators, plant.actuators, strict=True)
         if model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT
         and model.jnt_bodyid[model.actuator_trnid[number, 0]] == body
     ]
