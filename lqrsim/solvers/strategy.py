@@ -3,17 +3,22 @@
 `solve`
   1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
      With constraints, the others follow as long as they may cost less.
-  2. If the best plan is far from the goal, goes through an obstacle, violates the constraints or does nothing: from a
-     plan without the constraints that it may pass on one side or another; other routes, found with larger weights of
-     obstacles and goal; without an ObstacleCost, other paths and oscillating controls (`Search.widen`).
+  2. If the states leave their domain: constant controls under which they do not, and a line of states. If the best plan
+     is far from the goal, goes through an obstacle, violates the constraints or does nothing: from a plan without the
+     constraints that it may pass on one side or another; other routes, found with larger weights of obstacles and goal;
+     without an ObstacleCost, other paths and oscillating controls (`Search.widen`).
   3. If the best plan touches a constraint that may be passed on another side: paths to the left and to the right
      (`Search.look_aside`).
-  4. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
+  4. If the best plan is a saddle: down along its direction of negative curvature (`Search.leave_saddles`).
+  5. If no control changes a state that misses its goal: pushes by one control at a time (`Search.move`).
+  6. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
      (`Search.retry_without_risk`).
-  5. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
+  7. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
      step by step to the true ones (`Search.soften`).
-  6. If that ends at a jump or a kink: softening again from the best plan, and a descent that keeps the active contacts,
-     in turn (`Search.alternate`).
+  8. If the answer is worse than the plan that the caller gave, or has left what that moved: a descent from that plan
+     (`Search.keep`).
+  9. If all that ends at a jump or a kink: softening again from the best plan, and a descent that keeps the active
+     contacts, in turn (`Search.alternate`).
   A free duration is found in an outer loop around these steps (`free_duration.py`).
 
 `finish`, for one start
