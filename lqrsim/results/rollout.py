@@ -412,7 +412,7 @@ class Rollout:
             what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
             how, final = f"{outcome}{what} {when}", ""
         else:
-            worst = self.target.worst(self.states[k, -1])
+            worst = self.target.worst(self.states[k, -1], self.goal_radius)
             how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}{f' ({worst})' if worst else ''}"
             final = f", final {self.tracking_error[k, -1]:.3g}"
         error, unit = self.tracking_error[k, counts], self.tracking_unit

@@ -72,7 +72,7 @@ def simulate(
       first_trial: number of the first trial. Trial `i` of a seed is bit-identical, whatever other trials run with it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or a tenth
         of the distance to the goal if the plan starts within the radius.
-      goal_tolerance: the tolerance for goals without a position, relative to the plan's range; 0.1 by default.
+      goal_tolerance: the tolerance for goals without a position, relative to each state's way; 0.1 by default.
         `results/goal.py` has the details.
       frames: whether to record the data for drawing, including times between the control periods; needed for a video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. If False, the robot
