@@ -19,6 +19,7 @@ TOLERANCE = 0.1  # default tolerance of the scaled error
 NEAR = 4.0  # robot radii within which a start is so near its goal that the radius says little
 STAYS = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
 NEGLIGIBLE = 1e-6  # in the units of a state; a shorter way is rounding
+ABRUPT = 1e-4  # of the ranges, in `departure`
 ASIDE = 0.01  # of the longest way in a unit; a state with a shorter way starts at its goal
 OF_RANGE, OF_WAY = "of the plan's range", "of the way"
 
@@ -47,6 +48,33 @@ def worst_of(space: Coordinates, off: Array, scale: Array, tolerance: float | No
     unit = space.units[worst]
     allowed = "" if tolerance is None else f", within {tolerance * scale[worst]:.3g} {unit}".rstrip()
     return f"{space.names[worst]} {off[worst]:+.3g} {unit}".rstrip() + allowed
+
+
+def departure(space: Coordinates, states: Array, plan: Array, dt: float) -> str:
+    """Where a run (T+1, n) leaves a plan (T+1, n), as text: "LEAVES the plan at 0.4 s: ..."; empty if it does not.
+
+    It leaves the plan where a state is not finite, or off by more than TOLERANCE of the largest range along the plan in
+    its unit. A run that was still on the plan a period before, to within ABRUPT of that, met a step that jumps.
+    """
+    units, ranges = np.array(space.units), np.ptp(plan, axis=0)
+    alike = (units[:, None] == units) & (units != "") | np.eye(len(units), dtype=bool)
+    scale = (alike * ranges).max(axis=1)
+    scale = np.where(scale > NEGLIGIBLE, scale, 1.0)
+    off = space.difference(states, plan)
+    share = np.max(np.abs(off) / scale, axis=1)
+    beyond = ~(share <= TOLERANCE)
+    if not beyond.any():
+        return ""
+    knot = int(np.argmax(beyond))
+    if not np.isfinite(share[knot]):
+        return f"does not get beyond {(knot - 1) * dt:.4g} s of the plan"
+    text = f"LEAVES the plan at {knot * dt:.4g} s: {worst_of(space, off[knot], scale, TOLERANCE)}"
+    if knot and share[knot - 1] <= ABRUPT:
+        text += (
+            f"; a period before, no state was off by more than {share[knot - 1]:.1g} of its range: that step jumps, as"
+            " where a contact or a limit begins, and a rounding error decides which way"
+        )
+    return text
 
 
 def tracking_unit(space: Coordinates) -> str:

@@ -70,6 +70,8 @@ class Plant:
         plant_validation.check_names(robot, scene)
         self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, in place of the timestep of the MJCF
+        # The last undisturbed run of a plan's own policy: hash of the policy, the plan's states, and the run's.
+        self.ran: tuple[str, bytes, Array | None] | None = None
         if robot.geoms is not None and not robot.geoms.of_scene(scene):
             raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
