@@ -5,16 +5,29 @@ line searches that found the plan. The cost is the value that comes with the der
 `certify.py` compares the results with a solver's claims.
 """
 
-from math import nan
+from math import inf, nan
 
+from lqrsim.kernels.cost_to_go import minimize_control
 from lqrsim.kernels.declarations import NOISY, M, N, W, stack, zeros
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, copy, copy_matrix, fill
-from lqrsim.kernels.model_functions import augment_cost, cost_alone, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, congruence, copy, copy_matrix, fill
+from lqrsim.kernels.model_functions import (
+    augment_cost,
+    cost_alone,
+    cost_of_order,
+    cost_quadratic,
+    noise_quadratic,
+    step_jacobian,
+    step_second_order,
+)
 from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
+from lqrsim.kernels.rollouts import larger
 
 # A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
 # that an optimal cost of zero leaves.
 SQUARES = 1e-28
+# Where a control block has no curvature, a weight on changes of controls takes its place: this part of the typical cost
+# for a change by a control's size. A block has none if it is definite only by this part of the largest so far.
+WEIGHT, NO_CURVATURE = 1e-2, 1e-9
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
@@ -23,8 +36,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
     later controls respond with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the
     prediction of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their
-    limits. Cost and decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the
-    cost does not.
+    limits. Where E is singular, as for a control that costs nothing, a weight on changes takes its place. Cost and
+    decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
       own: whether to compute the Hessians S (T+1, N, N) here, for the policy with controls at their limits, and write
@@ -32,6 +45,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
       plan: Motion. policy: Policy. to_go: CostToGo. model: ProblemModel.
       found: row of CERTIFICATE, written.
         scale: size of the curved part of the cost without cancellation; rounding errors are relative to it.
+        typical: the cost of changing each state and control by its range along the plan, or a control by its size.
         dynamics_residual: the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1.
         policy_residual: the largest difference of a control from the policy's, within its limits, relative to the terms
         of the policy's sum.
@@ -40,14 +54,24 @@ def certify(settings, own, plan, policy, to_go, model, found):
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, room = stack(N), Limits(stack(M), stack(M))
     none, costate, size, residual, nowhere = zeros(M), stack(N), stack(N), zeros(N), zeros(N)
-    states, steps, hessians = plan.states, settings.steps, to_go.hessian
-    off_policy, limits, decrease = 0.0, 0.0, 0.0
+    states, steps, hessians, sizes = plan.states, settings.steps, to_go.hessian, stack(W)
+    off_policy, limits, decrease, uncurved = 0.0, 0.0, 0.0, 0.0
     for i in range(N):
         size[i] = 1.0
+        low, high = states[0, i], states[0, i]
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
+            low, high = min(low, states[t, i]), max(high, states[t, i])
+        sizes[i] = high - low
+    for i in range(M):
+        sizes[N + i] = 0.0
+        for t in range(steps):
+            sizes[N + i] = max(sizes[N + i], abs(plan.controls[t, i]))
+        if sizes[N + i] == 0:
+            sizes[N + i] = min(1.0, max(model.limits.high[i], -model.limits.low[i]))
     # Constraint terms are never part of the sum: a large penalty would leave its rounding errors.
     cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
+    typical = largest = cost_of_change(stage, sizes)
     augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
     copy(stage.gradient, N, costate)
@@ -57,6 +81,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         x, u = states[t], plan.controls[t]
         step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
         cost += cost_alone(x, u, t, model.stage, 0.0, stage.hessian, stage.gradient)
+        typical += cost_of_change(stage, sizes)
         augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # for this policy, the gradient of the cost-to-go is the costate
             given = model.noise.risk[2] > 0  # a cost-to-go about the origin
@@ -78,11 +103,16 @@ def certify(settings, own, plan, policy, to_go, model, found):
             limits = max(limits, room.low[i], -room.high[i])
         off_policy = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, off_policy)
         terms += curved_terms(states[t + 1], hessians[t + 1])
-        decrease += predicted_decrease(step, stage, policy.gain[t], hessians[t + 1], room, SQUARES * terms, costate)
+        predicted, slopes, largest = predicted_decrease(
+            step, stage, policy.gain[t], hessians[t + 1], room, sizes, largest, costate
+        )
+        decrease += 0.0 if predicted <= SQUARES * terms else predicted
+        uncurved += slopes
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
+        typical += cost_of_change(stage, sizes)
         terms = scale_of(states[0], none, stage)
         scale += terms
         terms += curved_terms(states[0], hessians[0])
@@ -91,8 +121,18 @@ def certify(settings, own, plan, policy, to_go, model, found):
     for i in range(N):
         if not residual[i] <= worst * size[i]:
             worst = residual[i] / size[i]
-    found.cost, found.scale, found.dynamics_residual = cost, scale, worst
+    if uncurved > 0:
+        decrease += uncurved / (2 * WEIGHT * typical)
+    found.cost, found.scale, found.typical, found.dynamics_residual = cost, scale, typical, worst
     found.policy_residual, found.beyond_limits, found.decrease = off_policy, limits, decrease
+
+
+def cost_of_change(stage, sizes):
+    """The cost of changing each entry of (x, u) by its size (W,), by the curvature of a stage."""
+    total = 0.0
+    for i in range(W):
+        total += 0.5 * stage.hessian[i, i] * sizes[i] * sizes[i]
+    return total
 
 
 def scale_of(x, u, stage):
@@ -129,13 +169,17 @@ def policy_residual(x, u, gain, offset, limits, worst):
     return worst
 
 
-def predicted_decrease(step, stage, gain, S, room, rounding, costate):
+def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
     """The decrease `1/2 e' E^-1 e` that the controls of a step predict, within the room that their limits leave.
 
     Args:
       step: LinearStep. stage: QuadraticStage at the plan. gain: (M, N). S: (N, N) at t + 1. room: Limits of changes.
-      rounding: a decrease up to this is none.
+      sizes: (W,) of states and controls. largest: the largest curvature of a control so far, for a change by its size.
       costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
+
+    Returns:
+      The decrease, 0 where E has no curvature; there the squares of the slopes along changes by the controls' sizes,
+      else 0; and the largest curvature.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
     slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
@@ -161,18 +205,23 @@ def predicted_decrease(step, stage, gain, S, room, rounding, costate):
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
     copy(before, N, costate)
-    decrease = box_decrease(factor, slope, room.low, room.high, moved)
-    return 0.0 if decrease <= rounding else decrease
-
-
-def singular_semidefinite(matrix):
-    """Whether a control block (M, M) is positive semidefinite up to rounding: definite with a larger diagonal."""
-    block, size = stack(M, M), 1e-300
     for i in range(M):
-        size = max(size, abs(matrix[i, i]))
+        largest = larger(largest, 0.5 * factor[i, i] * sizes[N + i] * sizes[N + i])
+    if is_curved(factor, sizes, NO_CURVATURE * largest):
+        return box_decrease(factor, slope, room.low, room.high, moved), 0.0, largest
+    squares = 0.0
+    for i in range(M):
+        far = min(sizes[N + i], -room.low[i] if slope[i] > 0 else room.high[i])
+        squares += far * far * slope[i] * slope[i]
+    return 0.0, squares, largest
+
+
+def is_curved(matrix, sizes, least):
+    """Whether a control block (M, M) is definite by at least this cost for changes by the controls' sizes."""
+    block = stack(M, M)
     for i in range(M):
         copy(matrix[i], M, block[i])
-        block[i, i] += 1e-9 * size
+        block[i, i] -= 2 * least / (sizes[N + i] * sizes[N + i])
     return cholesky(block, M)
 
 
@@ -235,9 +284,7 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
 
 
 def box_decrease(matrix, slope, lowest, highest, best):
-    """The decrease of `1/2 x'E x + e'x` at its minimiser within a box about zero; NaN unless E >= 0.
-
-    If E is singular, it is the decrease of e'x, an upper bound.
+    """The decrease of `1/2 x'E x + e'x` at its minimiser within a box about zero; NaN unless E > 0.
 
     Args:
       matrix: E (M, M). slope: e (M,). lowest, highest: (M,) bounds of the box. best: (M,), the minimiser, written.
@@ -247,12 +294,8 @@ def box_decrease(matrix, slope, lowest, highest, best):
     for i in range(M):
         best[i] = -slope[i]
         copy(matrix[i], M, factor[i])
-    if not cholesky(factor, M):  # an upper bound: the decrease of e'x within the box
-        decrease = 0.0
-        for i in range(M):
-            if slope[i] != 0:
-                decrease += slope[i] * -lowest[i] if slope[i] > 0 else -slope[i] * highest[i]
-        return decrease if singular_semidefinite(matrix) else nan
+    if not cholesky(factor, M):
+        return nan
     cholesky_solve(factor, M, best)
     for i in range(M):
         inside = inside and lowest[i] <= best[i] <= highest[i]
@@ -275,3 +318,79 @@ def box_decrease(matrix, slope, lowest, highest, best):
         for j in range(M):
             decrease -= 0.5 * best[i] * matrix[i, j] * best[j]
     return decrease
+
+
+def reduced_curvature(settings, plan, model, found):
+    """Write the least curvature of the cost of a plan in the controls, while later controls respond at their best.
+
+    The recursion is that of Newton's method, with exact Hessians, about a plan without constraints. A control that its
+    slope presses against a limit stays there. The curvatures of a control are relative to its largest along the plan.
+
+    Args:
+      plan: Motion that satisfies the dynamics. model: ProblemModel, with second derivatives of the dynamics.
+      found: row of CERTIFICATE; `curvature` is written, -1 unless the reduced Hessian is positive definite.
+    """
+    stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
+    S, costate, none, least, most, states = stack(N, N), stack(N), zeros(M), stack(M), zeros(M), plan.states
+    hessian, gradient, low, high = stage.hessian, stage.gradient, model.limits.low, model.limits.high
+    found.curvature = -1.0
+    fill(least, M, inf)
+    cost_of_order(states[settings.steps], none, settings.steps, model.final, 1.0, hessian, gradient)
+    copy_matrix(hessian, N, N, S)
+    copy(gradient, N, costate)
+    for t in range(settings.steps - 1, -1, -1):
+        u = plan.controls[t]
+        cost_of_order(states[t], u, t, model.stage, 1.0, hessian, gradient)
+        step_second_order(states[t], u, model, costate, step.offset, step.jacobian, hessian)
+        congruence(step.jacobian, S, costate, hessian, gradient)
+        for i in range(M):
+            if (u[i] == low[i] and gradient[N + i] > 0) or (u[i] == high[i] and gradient[N + i] < 0):
+                for j in range(W):
+                    hessian[N + i, j], hessian[j, N + i] = 0.0, 0.0
+                hessian[N + i, N + i] = inf
+            else:
+                most[i] = max(most[i], hessian[N + i, N + i])
+        copy(gradient, N, costate)
+        if not reduce_stage(hessian, least, S):
+            return
+    if not settings.fixed:
+        cost_of_order(states[0], none, 0, model.initial, 1.0, hessian, gradient)
+        for i in range(N):
+            for j in range(N):
+                S[i, j] += hessian[i, j]
+            if S[i, i] == 0 and gradient[i] + costate[i] == 0:  # a state without weight need not move
+                S[i, i] = 1.0
+        if not cholesky(S, N):
+            return
+    curvature = inf
+    for i in range(M):
+        if most[i] > 0:
+            curvature = min(curvature, least[i] / most[i])
+    found.curvature = curvature
+
+
+def reduce_stage(hessian, least, S):
+    """Minimise a stage's curvature over the controls: write S (N, N) of the states alone.
+
+    Lowers the least curvatures (M,) of the controls to those of the control block, each with the earlier controls at
+    their best. A control whose curvature is infinite stays. Returns whether the block is positive definite.
+
+    Args:
+      hessian: (W, W) with the cost-to-go; overwritten. least: (M,), written.
+    """
+    block, gain, offset, none, unused = stack(M, M), stack(M, N), stack(M), zeros(W), stack(N)
+    for i in range(M):
+        for j in range(M):
+            block[i, j] = hessian[N + i, N + j]
+    for k in range(M):
+        if block[k, k] == inf:
+            hessian[N + k, N + k] = 1.0
+            continue
+        if not block[k, k] > 0:
+            return False
+        least[k] = min(least[k], block[k, k])
+        for i in range(k + 1, M):
+            factor = block[k, i] / block[k, k]
+            for j in range(i, M):
+                block[i, j] -= factor * block[k, j]
+    return minimize_control(hessian, none, gain, offset, S, unused) >= 0

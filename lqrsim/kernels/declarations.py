@@ -31,7 +31,7 @@ ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), 
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
-ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE = 0, 1, 2, 3, 4, 5
+ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5, 6
 
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4

@@ -6,11 +6,12 @@ once.
 
 from math import inf
 
-from lqrsim.kernels.certificate import certify
+from lqrsim.kernels.certificate import certify, reduced_curvature
 from lqrsim.kernels.control_limits import riccati_backward
 from lqrsim.kernels.damped_iterations import damped_iterations, relinearize
 from lqrsim.kernels.declarations import (
     CERTIFY,
+    CURVE,
     DAMP,
     EVALUATE,
     FINISH,
@@ -39,12 +40,15 @@ def smoother(task, first, last, settings, model, work, memory, log):
     Args:
       task: one of ITERATE, DAMP, FINISH; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
         to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
-        of the policy itself, which overwrite them.
+        of the policy itself, which overwrite them; or CURVE, to measure the curvature of the cost about that rollout.
       first, last: iterations to run, `last` excluded. The rest are records.
 
     Returns:
       As `iterations.py` says.
     """
+    if task == CURVE:
+        reduced_curvature(settings, work.last, model, work.certificate[0])
+        return 0, 0, False, -1
     if task >= CERTIFY:
         certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1

@@ -29,7 +29,9 @@ from lqrsim.kernels.rollouts import copy_plan, differential_pass, ilqr_pass, ini
 # Fractions of the second-order terms, tried in this order until a pass has a minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
 ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
-SMALLEST = 1e-3  # smallest fraction of a step that the line search tries
+# Smallest fractions of a step that the line search tries: with second-order terms, and without. A projected model knows
+# nothing of where a cost saturates, so its steps may be too long by orders of magnitude.
+SMALLEST, LEAST = 1e-3, 1e-8
 ROUNDING = 1e-12  # rounding error of a merit, relative to the merit
 SMALL, WEIGHTS = 1e-10, 8  # first weight on control changes, relative to the merit; number of weights, each times 1000
 MORE = 3  # largest number of further steps while the smoothed states are not at the plan
@@ -65,7 +67,10 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         for i in range(N):
             shift[i] = work.x_hat[i] - plan.states[0, i]
         bound, wanted = memory.merit + ROUNDING * abs(memory.merit), ARMIJO * memory.decrease
-        merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, SMALLEST, work.last)
+        smallest = SMALLEST
+        if memory.share == 0:
+            wanted, smallest = 0.0, LEAST
+        merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, smallest, work.last)
         outcome = RUNNING
         if fraction > 0:
             improvement = relative_improvement(memory.merit, merit, memory.negligible)
@@ -137,7 +142,7 @@ def newton_pass(settings, model, work, memory):
         size = max(size, abs(second.constant[t]))
     memory.negligible = 1e-26 * size
     memory.decrease = 2 * left
-    memory.promised = relative_optimality(failed, left, memory.merit, memory.negligible)
+    memory.promised = relative_optimality(failed, left, memory.merit, max(memory.negligible, memory.least))
     return good
 
 

@@ -9,12 +9,14 @@ zero. `solvers/interior_point.py`, `solvers/active_set.py` and `solvers/restorat
 
 from math import inf
 
+from lqrsim.kernels.certificate import reduce_stage
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
 from lqrsim.kernels.declarations import FIRST, ROWS, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
     cholesky_solve,
+    congruence,
     copy,
     copy_matrix,
     entry,
@@ -260,6 +262,37 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
                 total += policy.gain[t, i, j] * (out.states[t, j] - plan.states[t, j])
             out.controls[t, i] = min(max(total, limits.low[t, i]), limits.high[t, i])
         advance(out.states[t], out.controls[t], model, model.dt, out.states[t + 1])
+
+
+def least_curvatures(steps, free, hessian, jacobian, held, least):
+    """Write the least curvatures (M,) of the controls along a plan, while later controls respond at their best.
+
+    Args:
+      free: (N,) 0 for the states that the start fixes, else 1. hessian: (T+1, W, W) of the Lagrangian, with weights on
+      rows that are held. jacobian: (T, N, W). held: (T, M), not 0 for a control that stays at its limit.
+
+    Returns:
+      Whether the reduced Hessian is positive definite.
+    """
+    S, stage, none = stack(N, N), stack(W, W), zeros(W)
+    copy_matrix(hessian[steps], N, N, S)
+    fill(least, M, inf)
+    for t in range(steps - 1, -1, -1):
+        copy_matrix(hessian[t], W, W, stage)
+        congruence(jacobian[t], S, none, stage, zeros(W))
+        for i in range(M):
+            if held[t, i] != 0:
+                for j in range(W):
+                    stage[N + i, j], stage[j, N + i] = 0.0, 0.0
+                stage[N + i, N + i] = inf
+        if not reduce_stage(stage, least, S):
+            return False
+    for i in range(N):
+        for j in range(N):
+            S[i, j] *= free[i] * free[j]
+        if free[i] == 0:
+            S[i, i] = 1.0
+    return cholesky(S, N)
 
 
 # With an active set.

@@ -240,6 +240,14 @@ class Dynamics:
         """
         return False
 
+    def untouched_body(self, states: Array, state: int) -> str:
+        """The body that a state moves, if nothing that moves touches it along a plan; empty without bodies.
+
+        Args:
+          states: (T+1, n) of the plan. state: the index of the state.
+        """
+        return ""
+
     def _cause_of_failure(self, state: Array) -> str | None:
         """Why a step from a state is not finite, as the end of a message.
 

@@ -12,7 +12,7 @@ from lqrsim.results import notebook
 from lqrsim.results.fields import LINE, Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
+from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -38,7 +38,7 @@ class Solution(Plan):
       problem_digest: hash of everything that defines the problem.
       problem_parts: what the problem asks for, by part, as `print(problem)` says it; empty in older files.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
-      remedy: a remedy to try in this case; empty for a success.
+      remedy: a remedy to try in this case; empty for a success, unless its goal is one that no control comes nearer to.
       scenario: the scenario that the command line solved; empty if a program called the solver.
       candidates: the starts that were tried, if there were several.
     """
@@ -101,6 +101,11 @@ class Solution(Plan):
     def optimality(self) -> float:
         """First-order optimality of the plan; see `Certificate`."""
         return self.certificate.optimality
+
+    @property
+    def curvature(self) -> Curvature:
+        """Whether a converged plan is a minimum; see `Curvature`."""
+        return self.certificate.curvature
 
     @property
     def violation(self) -> float:
@@ -173,7 +178,7 @@ class Solution(Plan):
         if not np.isfinite(self.trajectory.states).all():
             return []
         lines = self.target.of_plan(self.target.radius_of_plan(self.goal_radius))
-        return lines if self.success else lines[:1]  # the remedy of a failure follows
+        return lines if self.success and not self.remedy else lines[:1]  # which says what to do
 
     def _beyond_limits(self) -> list[str]:
         """A line for each control with a plan beyond its limits."""

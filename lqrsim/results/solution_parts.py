@@ -98,6 +98,20 @@ class Status(enum.StrEnum):
         return _STATUS_TEXT[self][1]
 
 
+class Curvature(enum.StrEnum):
+    """The curvature of the cost at a plan, along all changes that keep dynamics, limits and active constraints.
+
+    MINIMUM: positive along all, so that no nearby plan is as good. SINGULAR: zero along some, as for least time or
+    costs that are flat. SADDLE: negative along some. NOT_CHECKED: the plan is not converged, or second derivatives are
+    not exact, or noise adds to the cost.
+    """
+
+    MINIMUM = "minimum"
+    SINGULAR = "singular"
+    SADDLE = "saddle"
+    NOT_CHECKED = "not checked"
+
+
 _STATUS_TEXT = {
     Status.CONVERGED: ("optimality and, with a cost-to-come, the gap are within tolerance", ""),
     Status.COST_CONVERGED: (
@@ -264,6 +278,7 @@ class Certificate:
         relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient. With `contacts` it
         is the decrease within the plan's contact modes, where switches bound the steps as limits bound controls.
       contacts: for a plan through contacts of an MJCF that ends at the edge of its contact modes; None otherwise.
+      curvature: whether a converged plan is a minimum, by the exact second derivatives of problem and constraints.
     """
 
     cost: float
@@ -274,6 +289,7 @@ class Certificate:
     violation: float
     optimality: float
     contacts: ContactCertificate | None = None
+    curvature: Curvature = Curvature.NOT_CHECKED
 
     def __post_init__(self) -> None:
         check_fields(self)

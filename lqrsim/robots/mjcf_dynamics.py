@@ -23,7 +23,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
 from lqrsim.scenes.mjcf_joints import FAR_PAST, joints_of
 from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
-from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches
+from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches, untouched_body
 from lqrsim.scenes.scene import unlogged
 
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
@@ -151,6 +151,9 @@ class MjcfDynamics(Dynamics):
 
     def touches(self, states: Array) -> bool:
         return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
+
+    def untouched_body(self, states: Array, state: int) -> str:
+        return untouched_body(self.physics.model, states, state)
 
     def _cause_of_failure(self, state: Array) -> str | None:
         found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in joints_of(self.physics.model))

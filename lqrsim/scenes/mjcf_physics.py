@@ -3,6 +3,7 @@
 import copy
 import ctypes
 import platform
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -162,9 +163,29 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
 
 def touches(model: mujoco.MjModel, states: Array) -> bool:
     """Whether a contact or a limit acts at one of these states (k, n), in the form of `kernels/mjcf_dynamics.py`."""
-    data, kinds = mujoco.MjData(model), mujoco.mjtConstraint.__members__
+    kinds = mujoco.mjtConstraint.__members__
     one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
-    unturned = np.zeros(model.nq)
+    return any(np.isin(data.efc_type, one_sided).any() for data in _placed(model, states))
+
+
+def untouched_body(model: mujoco.MjModel, states: Array, state: int) -> str:
+    """The body that a state (an index) moves, if nothing that moves touches it at any of states (k, n); else empty."""
+    dof = state % model.nv if state < 2 * model.nv else -1
+    if dof < 0:
+        return ""
+    body = int(model.dof_bodyid[dof])
+    roots = model.body_weldid
+    for data in _placed(model, states):
+        for pair in data.contact.geom:
+            first, second = (int(roots[model.geom_bodyid[one]]) for one in pair)
+            if int(roots[body]) in (first, second) and first and second:
+                return ""
+    return model.body(body).name
+
+
+def _placed(model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:
+    """MuJoCo's data at the positions of each of these states (k, n)."""
+    data, unturned = mujoco.MjData(model), np.zeros(model.nq)
     for joint, kind in enumerate(model.jnt_type):
         if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
             unturned[model.jnt_qposadr[joint] + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 0)] = 1.0
@@ -172,9 +193,7 @@ def touches(model: mujoco.MjModel, states: Array) -> bool:
         data.qpos[:] = unturned
         mujoco.mj_integratePos(model, data.qpos, state[: model.nv], 1.0)
         mujoco.mj_fwdPosition(model, data)
-        if np.isin(data.efc_type, one_sided).any():
-            return True
-    return False
+        yield data
 
 
 def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -105,10 +105,10 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success."""
+    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success that needs none."""
     status = found.status
-    if status.success:
-        return ""
+    if status.success or found.remedy:
+        return found.remedy
     if inside := problem.goal_inside:
         geoms = any("geoms" in one.shape for one in problem.kept_clear)
         return f"move the goal, which is {inside}" + ("; or leave that geom out by obstacles=" if geoms else "")
@@ -125,6 +125,8 @@ def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], opti
         return (
             'solve with finish="newton" and stop="optimal": the interior point finds plans where this method does not'
         )
+    if status is Status.NOT_FINITE and not np.isfinite(found.states).all():
+        return "begin with start=[...], controls under which the states stay in their domain"
     if status is Status.INFEASIBLE and found.against:
         relaxed = f"relax {found.against[0].rsplit(' at ', 1)[0]}"
         return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"

@@ -22,6 +22,8 @@ from lqrsim.results.value_functions import Quadratic
 LAW, MOTION, COST = 1e-11, 1e-8, 1e-8
 # If the terms of a cost cancel, a rounding error remains that is relative to the terms.
 REST = 1e-13
+# An optimal cost may be zero, or next to it. A decrease is then relative to this part of the cost of typical changes.
+TYPICAL = 1e-6
 # The optimality is computed about the plan; the solver computes its own about states within the gap tolerance of the
 # plan. The certificate's optimality may therefore be slightly larger.
 SLACK = 2.0
@@ -80,13 +82,14 @@ def no_value(states: Array) -> CostToGo:
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
     """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
-    cost, scale, motion, law, beyond, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
+    cost, scale, typical, motion, law, beyond, decrease, _ = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
         start = float(np.abs(states[0] - problem.initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
-    optimality = decrease / max(abs(cost), 1e-26 * scale, 1e-300) if np.isfinite(decrease) else np.inf
+    least = max(abs(cost), TYPICAL * typical, 1e-26 * scale, 1e-300)
+    optimality = decrease / least if np.isfinite(decrease) else np.inf
     return Certificate(
         cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
         violation=violation, optimality=optimality,

@@ -27,7 +27,7 @@ from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, damped_from_rollout, meet_constraints
 from lqrsim.solvers.budget import Laps
-from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
@@ -39,8 +39,6 @@ FAR = 100.0  # a violation above this many tolerances may be evidence that the c
 AUGMENTED, STALE, REFINED = 50, 25, 100
 DEEP = 0.03  # largest violation by the plan of smoothing with which the interior point begins, relative to a row's size
 GUIDED = 60  # iterations of smoothing before constraints act, with an ObstacleCost
-# The squares that the interior point's margins leave of a cost of zero, relative to those that rounding leaves.
-SETTLED = 1e8
 RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, relative to the cost
@@ -113,7 +111,21 @@ class Ladder:
                 self._best = None  # the given plan is better
             if self._budget.over:
                 break
+        if not self._budget.over and (self._best is None or not self._best.success):
+            self._free()
         return self._answer(start)
+
+    def _free(self) -> None:
+        """From the best plan, by Newton's method without the constraints: they may not act at the optimum."""
+        best = self._best
+        if best is None or not best.violation <= self._allowed or not np.isfinite(best.cost):
+            return
+        best = best.kept()
+        self._point.without_multipliers()
+        self._run.work.take(best.states, best.controls, best.cost)
+        found = self._run.newton(detail=best.detail)
+        if found.success and found.violation == 0:
+            self._remember(replace(found, multipliers=()))
 
     def _from_valley(self) -> RunResult | None:
         """From the plan of smoothing without the constraints."""
@@ -259,19 +271,8 @@ class Ladder:
         return found
 
     def _worse(self, found: RunResult) -> bool:
-        """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding.
-
-        What active constraints cost by ending inside, and the given plan saves by missing them within the tolerance, is
-        rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
-        is met, only the size of what cancels says what that is.
-        """
-        if self._given is None:
-            return False
-        memory, missed = self._run.work.memory, self._given.violation
-        rounding = ROUNDING * abs(self._given.cost) + SETTLED * float(memory["negligible"])
-        for own, pressing in zip(self._run.work.multipliers, found.multipliers, strict=False):
-            rounding += float(np.abs(pressing.values).sum()) * (own.margin + missed)
-        return found.cost > self._given.cost + rounding
+        """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding."""
+        return self._given is not None and self._run.costs_more(found, self._given)
 
     def _answer(self, start: RunResult) -> RunResult:
         """The best result, certified."""

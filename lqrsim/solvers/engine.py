@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
@@ -32,13 +33,15 @@ from lqrsim.kernels.records import (
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.certify import certified, no_value
+from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings
+from lqrsim.solvers.stages import Stages
 
 _METHODS = {
     declarations.SMOOTH: "smooth",
@@ -75,6 +78,8 @@ MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory is kept for l
 # range: smoothing is then near a local optimum. Damped iterations approach it slowly. They end when the cost falls by
 # less than NEARLY, twice, with a gap below NEAR.
 VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
+# The squares that the interior point's margins leave of a cost of zero, relative to those that rounding leaves.
+SETTLED = 1e8
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 _idle: "list[SolveRun]" = []
 _lending = threading.Lock()
@@ -216,6 +221,7 @@ class RunResult:
         `assemble`.
       final: whether no other start can do better.
       stuck: whether the violation no longer falls, however large the penalty.
+      remedy: a remedy that is known already; empty for the usual one.
       against: in words, the constraints and limits that conflict with the violated constraints, the strongest first.
     """
 
@@ -233,6 +239,7 @@ class RunResult:
     final: bool = False
     stuck: bool = False
     against: tuple[str, ...] = ()
+    remedy: str = ""
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
@@ -385,9 +392,12 @@ class SolveRun:
             self.problem, self.ending, self._rows["cost"][: self._row], start, control, refuse=self.budget.attentive
         )
 
-    def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
-        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints."""
-        self.work.begin_newton(added)
+    def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0) -> RunResult:
+        """Newton's method from the best plan so far; `added` is the part of its cost from the constraints.
+
+        What it promises is relative to the cost, or to `least` if that is more.
+        """
+        self.work.begin_newton(added, least)
         ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
@@ -411,6 +421,9 @@ class SolveRun:
             return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
         if self.second_order and damped.success:
             return found
+        if self.second_order and not self.budget.over:
+            # Newton's passes are about the plan, and need no inverse of the controls' weights.
+            return self.newton(detail=detail)
         status = damped.status
         if damped.outcome == declarations.STALLED:
             # The plan is finite, whatever the undamped method met on its way; the detail names it. What a user's
@@ -522,9 +535,10 @@ class SolveRun:
                 # As for iLQR, whose steps need neither of these.
                 values["cost_to_come"] = values["inverse_law"] = None
                 off, gap = gap, np.nan
-                detail += (
-                    f"; the states of least total cost are {off:.1g} off the plan, so the cost-to-come is left out"
-                )
+                why = f"the states of least total cost are {off:.1g} off the plan"
+                if not np.isfinite(off):
+                    why = "its pass needs a cost that is curved in every control"
+                detail += f"; the cost-to-come is left out: {why}"
         return RunResult(
             status=status, detail=detail.removeprefix("; "), states=states, controls=controls, law=law,
             cost=work.cost, violation=self._violation_of(work.best), gap=gap, values=values,
@@ -546,8 +560,22 @@ class SolveRun:
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
-            return found
+            return replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
+
+    def bend(self, found: RunResult) -> Bend:
+        """The curvature at a result, by exact second derivatives; with a direction along which a saddle bends down."""
+        problem = self.problem
+        if not (found.status is Status.CONVERGED and self.second_order) or problem.noise_term is not None:
+            return Bend(Curvature.NOT_CHECKED)
+        if not problem.constraints:
+            out = np.zeros(1, CERTIFICATE)
+            self._loop(*self._check_arguments(declarations.CURVE, found, no_value(found.states), out))
+            if out["curvature"][0] > FLAT:
+                return Bend(Curvature.MINIMUM)
+        stages = Stages(problem)
+        plan = Motion(*map(in_c_order, (found.states, found.controls)))
+        return curvature_at(stages, plan, stages.of_constraints([one.values for one in found.multipliers]))
 
     def _expected_cost(self, found: RunResult) -> float:
         """The expected cost of the policy without penalties of constraints, which the cost-to-go of the solver has."""
@@ -585,6 +613,41 @@ class SolveRun:
         if failed < 0:
             noise = self.work.model.noise
             noise.hessian[...], noise.gradient[...], noise.risk[2] = to_go.hessian, to_go.gradient, 1.0
+
+    def given(self) -> RunResult:
+        """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
+        self.roll_out()
+        work, law = self.work, self.work.arrays.last_policy
+        found = RunResult(
+            status=Status.STALLED, detail="", states=work.last.states, controls=work.last.controls, law=law,
+            cost=work.cost, violation=np.inf, gap=np.nan,
+        ).kept()  # fmt: skip
+        return self.certified(found) if np.isfinite(found.states).all() else found
+
+    def is_worse(self, found: RunResult, other: RunResult) -> bool:
+        """Whether a plan violates constraints more than another, or costs more if both violate them as much."""
+        if not np.isfinite(other.cost):
+            return False
+        missed, others = (self._missed(one) for one in (found, other))
+        return missed > others or (missed == others and self.costs_more(found, other))
+
+    def _missed(self, found: RunResult) -> float:
+        """The violation of a plan to two digits; 0 within the tolerances."""
+        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(found.states, found.controls)):
+            return 0.0
+        return float(f"{found.violation:.2g}")
+
+    def costs_more(self, found: RunResult, other: RunResult) -> bool:
+        """Whether a plan costs more than another, by more than rounding.
+
+        What active constraints cost by ending inside, and the other plan saves by missing them within the tolerance, is
+        rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
+        is met, only the size of what cancels says what that is.
+        """
+        rounding = ROUNDING * abs(other.cost) + SETTLED * float(self.work.memory["negligible"])
+        for own, pressing in zip(self.work.multipliers, found.multipliers, strict=False):
+            rounding += float(np.abs(pressing.values).sum()) * (own.margin + other.violation)
+        return not found.cost <= other.cost + rounding
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
         """This run as a candidate of a search; `found` is its result if it was run to its end."""
@@ -744,9 +807,10 @@ class Workspace:
         memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
 
-    def begin_newton(self, added: float = 0.0) -> None:
-        """The same for Newton's method, which begins with a pass about the plan."""
+    def begin_newton(self, added: float = 0.0, least: float = 0.0) -> None:
+        """The same for Newton's method, which begins with a pass about the plan; see `SolveRun.newton`."""
         self.memory["merit"], self.memory["share"] = self.memory["plan_cost"] + added, -1.0
+        self.memory["least"] = least
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""

@@ -133,12 +133,12 @@ class InteriorRun:
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(INTERIOR):
-            result = self._newton(lagrangian)
+            result = self._newton(lagrangian, found.scale)
             for _ in range(UPDATES):
                 if lagrangian.kept or not result.success:
                     break
                 lagrangian.update(growth=1.0)
-                result = self._newton(lagrangian)
+                result = self._newton(lagrangian, found.scale)
         detail = ""
         if self._run.settings.elastic is not None and result.violation > self.allowed:
             detail = f"elastic: {lagrangian.worst()}"
@@ -170,9 +170,9 @@ class InteriorRun:
             acts = np.isfinite(numbers) & (own.term.equality | presses)
             own.values[...] = np.where(acts, force, 0.0).ravel()
 
-    def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:
-        """Run Newton's method from the plan in memory, with these multipliers."""
-        result = self._run.newton(added=lagrangian.added())
+    def _newton(self, lagrangian: AugmentedLagrangian, scale: float) -> RunResult:
+        """Run Newton's method from the plan in memory, with these multipliers, to an optimality relative to `scale`."""
+        result = self._run.newton(added=lagrangian.added(), least=scale)
         lagrangian.evaluate(result.states, result.controls)
         return result
 

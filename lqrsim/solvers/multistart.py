@@ -5,16 +5,19 @@ obstacles' cost to its full weight. This ends in a good optimum far more often t
 Other paths, bent to the sides, lead to other optima. After a few iterations it becomes clear which start is best.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of, weighing_obstacles
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.solvers import compiled
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.parallel import workers
@@ -29,6 +32,9 @@ FOLD = 0.9  # bend for states that move collision spheres: an arm must fold up b
 # States that contacts hold, such as the tilt of a robot on a floor, are drawn to their start. HOLD is the weight,
 # relative to the path's, for a state that moves by 1. LEAST is the least range, relative to the largest of the unit.
 HOLD, LEAST = 0.01, 1e-3
+# Constant controls that are tried where the nominal ones lead out of the domain: fractions of the range between the
+# limits; where there is no limit, of this many units about the nominal control.
+LEVELS, UNLIMITED = (0.0, 0.25, 0.5, 0.75, 1.0), (1.0, 10.0, 100.0)
 HALVE, CHOOSE = 3, 4  # numbers of iterations after which half of the starts remain, and one start
 # Trajectories along paths, tried while no plan keeps the constraints: their number, the weight of the path relative to
 # a plan's cost, and the number of iterations in which the path acts.
@@ -171,6 +177,27 @@ def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     far = SWAY * np.where(np.isfinite(room), np.maximum(room, 0.0), 1.0)
     times = np.arange(problem.steps)[:, None] / problem.steps
     return nominal + far * np.sign(cycles) * np.sin(2 * np.pi * (abs(cycles) * times - np.arange(len(nominal)) / 4))
+
+
+def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
+    """Constant controls (m,) under which all states are finite, and the plans that they make.
+
+    Args:
+      problem: one that names a start.
+    """
+    space, nominal, start = problem.control_coordinates, problem.nominal_control, problem.start
+    assert start is not None
+    m, steps = len(nominal), problem.steps
+    shares = LEVELS if m < 3 else LEVELS[::2]
+    each = itertools.product(shares, repeat=m) if m < 5 else zip(*[shares] * m, strict=True)
+    limited = np.isfinite([space.low, space.high]).all()
+    for share, far in itertools.product(each, (1.0,) if limited else UNLIMITED):
+        low = np.where(np.isfinite(space.low), space.low, nominal - far)
+        high = np.where(np.isfinite(space.high), space.high, nominal + far)
+        control = low + np.array(share) * (high - low)
+        plan = compiled.rollout(problem, np.zeros((steps, m, len(start))), np.tile(control, (steps, 1)), start.copy())
+        if np.isfinite(plan[0]).all():
+            yield control, Motion(*plan)
 
 
 def check_starts(problem: Problem, count: int | None) -> None:

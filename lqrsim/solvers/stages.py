@@ -128,14 +128,30 @@ class Stages:
         plan, arrived = Motion(*map(in_c_order, plan)), np.empty((self.steps, self.n))
         return self._call("trial_cost", self.steps, self._soft, plan, self._model, arrived), arrived
 
-    def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> None:
+    def linearize(
+        self, plan: Motion, costates: Array, multipliers: Array, least: float, *, convex: bool = True
+    ) -> None:
         """Compute the models about a plan, with costates (T+1, n) and multipliers (T+1, R).
 
-        Constraints with multipliers up to `least` count as linear.
+        Constraints with multipliers up to `least` count as linear. `convex` is for the projected Hessians, too.
         """
         rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
         self._look(plan, costates, rows, self.active._replace(size=0))
-        self.convexify(plan)
+        if convex:
+            self.convexify(plan)
+
+    def least_curvatures(self, hessian: Array, held: Array) -> Array | None:
+        """The least curvature (m,) of each control along the plan; None unless the reduced Hessian is definite.
+
+        Args:
+          hessian: (T+1, n+m, n+m), with weights on rows that are held. held: (T, m) controls that stay at limits.
+        """
+        least = np.empty(self.m)
+        good = self._call(
+            "least_curvatures", self.steps, self.free, in_c_order(hessian), self.models.jacobian,
+            in_c_order(held.astype(np.float64)), least,
+        )  # fmt: skip
+        return least if good else None
 
     def convexify(self, plan: Motion) -> None:
         """Compute the projected Hessians about a plan."""

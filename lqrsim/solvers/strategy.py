@@ -35,13 +35,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory
+from lqrsim.solvers import compiled, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
 from lqrsim.solvers.budget import Budget, Callback, Stop
@@ -50,12 +51,13 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.infeasibility import Evidence, alike
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_run import MUCH, OPENING, InteriorRun, copied
+from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, InteriorRun, copied
 from lqrsim.solvers.multistart import (
     FOLLOW,
     SWAYS,
     along_paths,
     choose,
+    constant_controls,
     detours,
     guides,
     passable,
@@ -76,6 +78,13 @@ SOFT, LOOK, FEWER = 60, 25, 3
 # Rounds in which the best plan is softened again, with this number of softnesses, and then descends within its modes;
 # the relative decrease of cost that is worth another; by how much a softened plan may cost more before it descends.
 ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
+
+# Saddles that are left in turn; steps away from one along its direction of negative curvature, relative to the typical
+# sizes; and the relative decrease of cost that such a step must lead to.
+SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
+
+CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
+GIVEN = "the given start"  # name of the start that the caller gives
 
 Finish = Callable[[SolveRun, Known], RunResult]
 
@@ -103,7 +112,7 @@ def solve(
         stop = Stop()
         stop.begin(settings.time_limit)
     with stop.not_counting():  # compiling
-        given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
+        given = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
         first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
         check_functions(problem, start, first.offset[0].copy())
@@ -111,15 +120,19 @@ def solve(
             SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
             for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
         ]
+    is_plan = settings.start is not None and first.prior is None and first.found is None
+    kept = runs[0].given() if is_plan else None
     search = Search([name for name, _ in given], runs, callback, threads)
     with stop.reporting("smooth", attentive):
         with problem.dynamics.solving(threads if len(runs) == 1 else 1):
             search.run()
             search.widen()
             search.look_aside()
+            search.leave_saddles()
             search.retry_without_risk()
         search.soften()
         search.alternate()
+        search.keep(kept)
     solution = search.solution()
     for run in runs:
         run.give_back()
@@ -150,6 +163,28 @@ def refine(run: SolveRun, known: Known) -> RunResult:
     return replace(found, status=Status.INFEASIBLE) if one in alike(known.evidence) else found
 
 
+def from_states(run: SolveRun, known: Known) -> RunResult:
+    """The certified result of the interior point from the trajectory of a start, whatever its rollout does."""
+    assert run.initial_guess.trajectory is not None
+    point = InteriorRun(run)
+    found = point.solve(copied(run.initial_guess.trajectory), MUCH)
+    return run.certified(point.start() if found is None else found)
+
+
+def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
+    """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
+    point = InteriorRun(run)
+    if run.problem.constraints:
+        found = point.solve(copied(plan), LITTLE)
+        return None if found is None or not found.success else run.certified(found)
+    law = compiled.law_about(plan.states, plan.controls, saddle.law[0])
+    beside = point.result(*compiled.rollout(run.problem, *law, plan.states[0].copy()))
+    if not beside.cost < saddle.cost:
+        return None
+    run.work.take(beside.states, beside.controls, beside.cost)
+    return run.certified(run.newton())
+
+
 def _without_constraints(run: SolveRun) -> RunResult:
     """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
     problem, budget = run.problem, run.budget
@@ -170,7 +205,11 @@ def _without_constraints(run: SolveRun) -> RunResult:
     other = point.solve(copied(run.work.best if np.isfinite(found.cost) else point.start()), MUCH)
     if other is None or other.success or not other.cost < found.cost:
         return other if other is not None and other.success else found
-    return replace(other, status=found.status, detail=found.detail)
+    other = other.kept()
+    if budget.over:
+        return replace(other, status=found.status, detail=found.detail)
+    run.work.take(other.states, other.controls, other.cost)
+    return run.newton(detail=found.detail)
 
 
 class Search:
@@ -214,6 +253,7 @@ class Search:
 
     def widen(self) -> None:
         """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
+        self._try_finite()
         if not (self._is_poor and self._may_go_on):
             return
         self._try_past_constraints()
@@ -227,6 +267,30 @@ class Search:
         else:
             self._try_sinusoidal_controls()
         self._tried = not self._budget.stop.due
+
+    def _try_finite(self) -> None:
+        """While the states leave their domain: try constant controls under which they do not, and a line of states."""
+        problem, exact = self._problem, self.best[0].second_order
+        if np.isfinite(self.best[1].cost) or problem.start is None or self._budget.stop.due:
+            return
+        self._known.from_start = False
+        work, plans = self.best[0].work, list[tuple[float, float, Array]]()
+        for control, plan in constant_controls(problem):
+            missed = float(f"{work.violation(work.constraint_values(*plan)):.2g}")
+            plans.append((missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control))
+        plans = [one for one in plans if np.isfinite(one[:2]).all()]
+        for _, _, control in sorted(plans, key=lambda one: one[:2])[:CONSTANT]:
+            run = self._add(resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}")
+            self._offer(run, self._finish(run))
+            if self.best[1].success or self._budget.stop.due:
+                return
+        if np.isfinite(self.best[1].cost) or not exact:
+            return
+        end = problem.start if problem.goal is None else np.where(np.isnan(problem.goal), problem.start, problem.goal)
+        states = np.linspace(problem.start, end, problem.steps + 1)
+        controls = np.broadcast_to(problem.nominal_controls, (problem.steps, len(problem.control_coordinates)))
+        run = self._add(resolve(Trajectory(states, controls.copy(), problem.dt), problem), "a line of states")
+        self._offer(run, self._finish(run, from_states))
 
     def _try_reweighted(self, times: float) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
@@ -333,6 +397,56 @@ class Search:
                 if name not in tried and not self._budget.stop.due:
                     run = self._add(resolve(one, problem), name)
                     self._offer(run, self._finish(run))
+
+    def leave_saddles(self) -> None:
+        """While the best plan is a saddle: go down along a direction of negative curvature, and converge from there."""
+        for _ in range(SADDLES):
+            run, found = self.best
+            if found.certificate is None or found.certificate.curvature is not Curvature.SADDLE:
+                return
+            if not self._descend(run, found):
+                status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+                detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
+                self._finished[0] = run, replace(found, status=status, detail=detail)
+                return
+
+    def _descend(self, run: SolveRun, found: RunResult) -> bool:
+        """Leave a saddle; return whether a plan was found that costs less."""
+        bend = run.bend(found)
+        if bend.direction is None:
+            return False
+        kept, direction = found.kept(), bend.direction
+        for far, sign in itertools.product(AWAY, (1, -1)):
+            moved = Trajectory(
+                kept.states + sign * far * direction.states, kept.controls + sign * far * direction.controls,
+                self._problem.dt,
+            )  # fmt: skip
+            one = self._another(InitialGuess(*map(np.copy, kept.law), "a saddle"))
+            one.budget.report_to(self._callback)
+            result = from_beside(one, moved, kept)
+            if self._budget.stop.due:
+                break
+            if result is not None and result.success and result.cost < kept.cost - FELL_FROM * abs(kept.cost):
+                self._named.append(("beside a saddle", one))
+                self._offer(one, result, better=True)
+                return True
+        return False
+
+    def keep(self, given: RunResult | None) -> None:
+        """If the best plan is worse than the plan that the caller gave: descend from that plan, or return it."""
+        run, found = self.best
+        if given is None or not (run.is_worse(found, given) or reach.goal_left(self._problem, found, given)):
+            return
+        if not self._budget.stop.due:
+            run = self._add(policy_of(given, "descent from the given plan"))
+            other = self._finish(run, refine)
+            keeps = not run.is_worse(other, given)
+            self._offer(run, other, better=keeps and (run.is_worse(found, given) or other.rank < found.rank))
+        run, found = self.best
+        if run.is_worse(found, given):
+            status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+            detail = "no plan was found that is better than the given one, which is returned"
+            self._offer(run, replace(given, status=status, detail=detail), better=True)
 
     def retry_without_risk(self) -> None:
         """If the risk was too high for an intermediate plan: solve without risk, and continue from that plan."""
@@ -485,18 +599,39 @@ class Search:
         """The best result as a Solution."""
         chosen, found = self.best
         problem, settings, stop = self._problem, self._settings, self._budget.stop
-        if found.status is Status.INFEASIBLE and not self._tried and stop.error is None:
+        if not np.isfinite(found.states).all() and not found.success:
+            found = replace(found, status=Status.NOT_FINITE, detail=left_domain(problem, found))
+        elif found.status is Status.INFEASIBLE and not self._tried and stop.error is None:
             untried = "no time was left for other starts, which may keep the constraints"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
         elif self._cut_short and np.isfinite(found.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
+        elif not stop.due and np.isfinite(found.cost):
+            found = self._told_of_unmoved(found)
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
         return assemble(
             problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
             options=settings.options(chosen.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
+
+    def _told_of_unmoved(self, found: RunResult) -> RunResult:
+        """The result with the states that miss their goal and that no control changes; STALLED if others would."""
+        problem = self._problem
+        allowed = self._settings.violation_tolerance(problem)
+        places = reach.unmoved(problem, found.states, found.controls, found.cost, allowed)
+        if not places:
+            return found
+        detail = "; ".join(part for part in (reach.described(problem, found.states, places), found.detail) if part)
+        otherwise = reach.moved_otherwise(problem, found.states, places)
+        status = Status.STALLED if found.success and otherwise else found.status
+        names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
+        remedy = f"leave {names} out of the goal, which no control that was tried changes"
+        if otherwise:
+            what = "with which the robot touches that body" if problem.dynamics.discrete else f"that change {names}"
+            remedy = f"begin with start=[...], controls {what}"
+        return replace(found, status=status, detail=detail, remedy=remedy)
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
@@ -590,6 +725,19 @@ class Search:
     def _without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
+
+
+def left_domain(problem: Problem, found: RunResult) -> str:
+    """In words, when the states of a plan that is not finite leave their domain, and which; and what led there."""
+    names, finite = problem.dynamics.state_coordinates.names, np.isfinite(found.states)
+    step = int(np.argmin(finite.all(axis=1)))
+    left = [
+        f"{name} {'is not a number' if np.isnan(number) else 'grows beyond all numbers'}"
+        for name, number in zip(names, found.states[step], strict=True)
+        if not np.isfinite(number)
+    ]
+    place = f"at {step * problem.dt:.2f} s (step {step} of {problem.steps}) {' and '.join(left)}"
+    return "; ".join(part for part in (place, found.detail if "nan" not in found.detail else "") if part)
 
 
 def policy_of(found: RunResult, summary: str) -> InitialGuess:

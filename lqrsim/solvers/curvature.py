@@ -1,0 +1,138 @@
+"""Second-order optimality: whether a plan is a minimum, and a direction along which it can go down where it is a saddle.
+
+The Hessian of the Lagrangian is reduced to the changes that keep the dynamics and all rows that are at zero. Its
+inertia is that of the control blocks of a Riccati recursion, in which later controls respond at their best. If a block
+has a negative eigenvalue, its eigenvector and these responses are a direction of negative curvature.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.kernels.records import Motion
+from lqrsim.results.solution_parts import Curvature
+from lqrsim.solvers.stages import Sizes, Stages
+
+HELD = 1e6  # weight of a row that is at zero: of the plan's cost for a change by the row's size
+AT_ZERO = 1e-5  # value of a row, relative to its size, that counts as zero
+TANGENT = 1e-3  # change of a held row, relative to its size and that of the direction, that is only the weight's
+FLAT = 1e-6  # curvature of a direction that counts as zero, relative to its terms without cancellation
+FLATTER = 1e-10  # the same relative to the typical cost of a change
+CLEAR = 1e-7  # curvature of a control that is positive beyond doubt, relative to the typical cost of a change
+PRESSING = 1e-9  # cost of a change by a row's size, relative to the typical cost, from which on the row presses
+SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below which its direction is looked at
+
+
+class Bend(NamedTuple):
+    """The curvature at a plan, and for a saddle the direction of negative curvature, scaled to the typical sizes."""
+
+    curvature: Curvature
+    direction: Motion | None = None
+
+
+def curvature_at(stages: Stages, plan: Motion, multipliers: Array, sizes: Sizes | None = None) -> Bend:
+    """The curvature of the Lagrangian at a stationary plan.
+
+    Args:
+      stages: of the problem; their models are overwritten. multipliers: (T+1, R) of the constraints' rows; those of
+        limits are worked out here. sizes: typical sizes; by default those at the plan.
+    """
+    with np.errstate(all="ignore"):
+        return _Reduced(stages, plan, multipliers, sizes or stages.sizes(plan)).bend()
+
+
+class _Reduced:
+    """The models about a plan, and which rows are held."""
+
+    def __init__(self, stages: Stages, plan: Motion, multipliers: Array, sizes: Sizes) -> None:
+        self._stages, self._sizes = stages, sizes
+        # The costates need no multipliers of limits, which hold controls alone.
+        stages.linearize(plan, np.zeros_like(plan.states), multipliers, np.inf, convex=False)
+        costates, slopes = stages.adjoint(stages.models.gradient - stages.pull(multipliers[stages.live]))
+        stages.linearize(plan, costates, multipliers, 0.0, convex=False)
+        forces, limit = multipliers.copy(), stages.owners == -1
+        for row, (sign, i, _) in zip(np.flatnonzero(limit), stages.limits, strict=True):
+            forces[:-1, row] = sign * slopes[:, i]
+        numbers = stages.values(plan) / sizes.rows
+        at_zero = stages.live & (stages.equality | (numbers <= AT_ZERO) | ((forces > 0) & ~limit))
+        pressing = forces * sizes.rows / sizes.cost > PRESSING
+        self._all, self._strict = at_zero, at_zero & (stages.equality | pressing)
+
+    def bend(self) -> Bend:
+        """A saddle if it bends down with all rows held that are at zero; a minimum if it bends up with fewer held."""
+        if self._bends_up(self._strict):
+            return Bend(Curvature.MINIMUM)
+        kind, direction = self._recursion(self._all)
+        if kind is Curvature.MINIMUM and (self._all & ~self._strict).any():
+            kind = self._recursion(self._strict)[0]
+            kind = Curvature.SINGULAR if kind is Curvature.SADDLE else kind
+        return Bend(kind, direction)
+
+    def _weighed(self, held: Array) -> Array:
+        """The Hessians (T+1, n+m, n+m) with weights on these rows."""
+        weights = np.where(held, HELD * self._sizes.cost / self._sizes.rows**2, 0.0)
+        return self._stages.models.hessian + self._stages.curvature(weights[self._stages.live])
+
+    def _bends_up(self, held: Array) -> bool:
+        """Whether the curvature is positive beyond doubt: a compiled look, which most plans pass."""
+        stages, fixed = self._stages, np.zeros((self._stages.steps, self._stages.m), dtype=bool)
+        for row, (_, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
+            fixed[:, i] |= held[:-1, row]
+        least = stages.least_curvatures(self._weighed(held & (stages.owners >= 0)), fixed)
+        return least is not None and bool((least * self._sizes.controls**2 > CLEAR * self._sizes.cost).all())
+
+    def _recursion(self, held: Array) -> tuple[Curvature, Motion | None]:
+        stages, sizes, n = self._stages, self._sizes, self._stages.n
+        hessian, jacobian = self._weighed(held), stages.models.jacobian
+        curve, gains, singular = hessian[-1][:n, :n], np.zeros((stages.steps, stages.m, n)), False
+        for t in range(stages.steps - 1, -1, -1):
+            both = hessian[t] + jacobian[t].T @ curve @ jacobian[t]
+            terms = np.abs(hessian[t]) + np.abs(jacobian[t].T) @ np.abs(curve) @ np.abs(jacobian[t])
+            block = both[n:, n:] * sizes.controls[:, None] * sizes.controls
+            cross = sizes.controls[:, None] * both[n:, :n]
+            if not np.isfinite(block).all():
+                return Curvature.NOT_CHECKED, None
+            values, vectors = np.linalg.eigh((block + block.T) / 2)
+            size = float((sizes.controls**2 * np.diag(terms)[n:]).max(initial=0.0))
+            usable = values > 0
+            for k in np.flatnonzero(values <= max(SUSPECT * size, FLATTER * sizes.cost)):
+                bent, direction = self._along(t, sizes.controls * vectors[:, k], gains, held)
+                if bent < 0:
+                    return Curvature.SADDLE, direction
+                singular |= bent == 0
+                usable[k] &= bent > 0
+            kept = vectors[:, usable]
+            inverse = (kept / values[usable]) @ kept.T
+            gains[t] = -sizes.controls[:, None] * (inverse @ cross)
+            curve = both[:n, :n] - cross.T @ inverse @ cross
+            curve = (curve + curve.T) / 2
+        start = curve[np.ix_(stages.free > 0, stages.free > 0)]
+        if len(start):
+            scaled = start * sizes.states[stages.free > 0][:, None] * sizes.states[stages.free > 0]
+            singular |= bool(np.linalg.eigvalsh(scaled).min() <= FLATTER * sizes.cost)
+        return Curvature.SINGULAR if singular else Curvature.MINIMUM, None
+
+    def _along(self, begin: int, control: Array, gains: Array, held: Array) -> tuple[int, Motion]:
+        """The sign of the curvature along a change of the control (m,) at a step to which later controls respond.
+
+        1 also for a direction that leaves rows which are held; 0 where only rounding is left. And the direction.
+        """
+        stages, sizes, n = self._stages, self._sizes, self._stages.n
+        changes = np.zeros((stages.steps + 1, n + stages.m))
+        changes[begin, n:] = control
+        for t in range(begin, stages.steps):
+            if t > begin:
+                changes[t, n:] = gains[t] @ changes[t, :n]
+            changes[t + 1, :n] = stages.models.jacobian[t] @ changes[t]
+        typical = np.concatenate([sizes.states, sizes.controls])
+        largest = float((np.abs(changes) / typical).max())
+        changes /= largest
+        moved = np.abs(np.einsum("trw,tw->tr", stages.slopes, changes)) / sizes.rows
+        direction = Motion(changes[:, :n].copy(), changes[:-1, n:].copy())
+        if (moved[held] > TANGENT).any():
+            return 1, direction
+        along = float(np.einsum("ti,tij,tj->", changes, stages.models.hessian, changes))
+        terms = float(np.einsum("ti,tij,tj->", *(np.abs(one) for one in (changes, stages.models.hessian, changes))))
+        flat = max(FLAT * terms, FLATTER * sizes.cost)
+        return (0 if abs(along) <= flat else 1 if along > 0 else -1), direction
