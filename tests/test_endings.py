@@ -179,7 +179,7 @@ def test_lines_of_trials_name_the_worst_state_of_a_robot_without_a_position(
         name, unit = (("angle", "rad"), ("rate", "rad/s"))[state]
         said = f"max {relative[k].max():.3g} ({name} {off[k, knot, state]:+.3g} {unit} at {0.05 * knot:.2f} s), final"
         assert said in line
-        assert f" from the goal (angle {off[k, -1, 0]:+.3g} rad, within {way / 10:.3g} rad); " in line
+        assert f" from the goal (angle {off[k, -1, 0]:+.3g} rad, allowed {way / 10:.3g} rad); " in line
 
 
 @st.composite
@@ -217,7 +217,7 @@ def test_a_goal_is_reached_within_a_tenth_of_the_way_of_each_state(one: Any, dat
     off, allowed = plan[-1, worst] - end[worst], abs(end - start)[worst] / 10
     if sum(abs(left[i]) == abs(left[worst]) for i in weighed) == 1:
         unit = f" {units[worst]}".rstrip()
-        assert lines[0].endswith(f": s{worst} {off:+.3g}{unit}, within {allowed:.3g}{unit}")
+        assert lines[0].endswith(f": s{worst} {off:+.3g}{unit}, allowed {allowed:.3g}{unit}")
 
 
 @settings(max_examples=examples(60))

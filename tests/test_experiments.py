@@ -127,7 +127,9 @@ def test_robust_policies_reports_what_has_no_chance(measured: list[float] | None
     module = import_module("robust.emphasis")
     plan = {"cost": 1.0, "predicted": 1e-3, "measured": measured, "simulations": 20}
     row = {"query": 0, "asked": 1e-3, "margins": plan, "emphasis": plan}
-    counted = row | {name: plan | {"measured": [chance, 0.0, 1.0]} for name, chance in (("margins", 0.3), ("emphasis", 0.1))}  # fmt: skip
+    counted = row | {
+        name: plan | {"measured": [chance, 0.0, 1.0]} for name, chance in (("margins", 0.3), ("emphasis", 0.1))
+    }
     for rows, first in (([row], "no query of 1 in which"), ([row, counted], "1 queries: with emphasis")):
         text = module.report({"light": rows})
         assert text[0].startswith(f"Preset 'light', {first}")

@@ -46,7 +46,7 @@ def worst_of(space: Coordinates, off: Array, scale: Array, tolerance: float | No
         return ""
     worst = int(np.argmax(np.abs(off) / scale))
     unit = space.units[worst]
-    allowed = "" if tolerance is None else f", within {tolerance * scale[worst]:.3g} {unit}".rstrip()
+    allowed = "" if tolerance is None else f", allowed {tolerance * scale[worst]:.3g} {unit}".rstrip()
     return f"{space.names[worst]} {off[worst]:+.3g} {unit}".rstrip() + allowed
 
 

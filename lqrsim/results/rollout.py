@@ -194,7 +194,7 @@ class Rollout:
     balls: BallRecord | None = None
     obstacle_geoms: Annotated[npt.NDArray[np.int64], "obstacles", Bounds(at_least=0)] | None = None
     moving: MovingObstacles | None = None
-    warnings: Annotated[npt.NDArray[np.int64], "K W", Bounds(at_least=0)] | None = None
+    warnings: Annotated[npt.NDArray[np.int64], "K 7", Bounds(at_least=0)] | None = None
     undisturbed: Annotated[Array, "T+1 n"] | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
@@ -204,8 +204,6 @@ class Rollout:
 
     def __post_init__(self) -> None:
         sizes = check_fields(self)
-        if sizes.get("W", len(WARNINGS)) != len(WARNINGS):
-            raise InputError(f"Rollout: warnings: got {sizes['W']} kinds, want {len(WARNINGS)}")
         if not sizes["K"]:
             raise InputError("Rollout: states: got no trial, want at least one")
         if not self.plan.finite:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, couplings_of, loops_of, ranges
+from lqrsim.scenes.scene import unlogged
 
 _HELD = 1e-6  # largest missing force of a robot that counts as held, relative to the largest force
 _NEWTON, _HALVES, _NUDGE = 100, 12, 1e-7  # limits of steps and halvings; m or rad of difference quotients
@@ -74,6 +75,7 @@ class _Levels:
         data.act[self.places] = levels[self.activated]
 
 
+@unlogged()
 def holding(model: mujoco.MjModel, qpos: Array, act: Array, actuators: npt.NDArray[np.intp]) -> Holding:
     """The controls of actuators, in that order, with which nothing accelerates at rest once activations have settled.
 
@@ -127,6 +129,7 @@ def _without_force_limits(model: mujoco.MjModel) -> mujoco.MjModel:
     return free
 
 
+@unlogged()
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
@@ -193,6 +196,7 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
     return kept, moves[:, kept].T
 
 
+@unlogged()
 def efforts(model: mujoco.MjModel, actuators: npt.NDArray[np.intp]) -> Array:
     """The largest size of each control, (m,): from its own limits, else from its force's; 1 without limits."""
     found = np.ones(model.nu)

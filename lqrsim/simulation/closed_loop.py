@@ -157,6 +157,7 @@ class ClosedLoop:
       controller_run: the run of the controller.
     """
 
+    @unlogged()
     def __init__(self, settings: RunSettings) -> None:
         self.settings = settings
         plant, plan, trials = settings.plant, settings.trajectory, settings.trials
@@ -165,8 +166,7 @@ class ClosedLoop:
         first = self.effects.initial_states(np.tile(settings.whole.states[0], (trials, 1)), settings.starts)
         self.physics.place(first)
         self.effects.alter_models(self.physics)
-        with unlogged():
-            self.physics.prepare(altered=self.effects.alters_models)
+        self.physics.prepare(altered=self.effects.alters_models)
         name = f"{type(settings.law).__name__}.start"
         self.controller_run = check_kind(name, settings.law.start(trials), ControllerRun, "a ControllerRun returned")
         self.records = Recorder(plan, trials)

@@ -41,7 +41,7 @@ class Physics(abc.ABC):
       parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
       senses_contacts: whether contacts are sensed without a force. solidifies: whether obstacles may become solid.
       unstable: (K,) whether a simulation has become unstable.
-      warnings: (K, W) number of MuJoCo's warnings of each kind, as in a `Rollout`.
+      warnings: (K, 7) number of MuJoCo's warnings of each kind, as in a `Rollout`.
     """
 
     senses_contacts = False
@@ -52,7 +52,7 @@ class Physics(abc.ABC):
         self._every = part_of(plant, substeps) // part
         self.drawn_parts = self.parts // self._every
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
-        self.warnings = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
+        self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
 
     @abc.abstractmethod
     def place(self, states: Array) -> None:

@@ -20,7 +20,7 @@ from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
-from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
+from lqrsim.scenes.scene import Scene, compiled, free_name, obstacle_geoms, unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
@@ -60,6 +60,7 @@ class Plant:
         moved = "MuJoCo" if self.simulator is None else self.simulator.name
         return f"Plant({self.robot.name} in scene {self.scene.name}, moved by {moved})"
 
+    @unlogged()
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
@@ -303,7 +304,7 @@ class Plant:
         try:
             spec = mujoco.MjSpec.from_string(self.scene.xml)
             # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
-            again = spec.compile()
+            again = compiled(spec)
         except (ValueError, mujoco.FatalError) as error:
             raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
@@ -333,7 +334,7 @@ class Plant:
                 # The items to report, their order, and their number.
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
-        return spec.compile()
+        return compiled(spec)
 
 
 def extent(plant: Plant) -> float:
