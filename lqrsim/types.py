@@ -15,7 +15,7 @@ from lqrsim.results.export_c import ExportedC
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.plan import Replan
-from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Iteration, Multipliers
+from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Curvature, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.prepared import PreparedSolver
@@ -30,6 +30,7 @@ __all__ = [
     "ControllerRun",
     "Coordinates",
     "CostTerm",
+    "Curvature",
     "DerivativeCheck",
     "ExportedC",
     "Funnel",

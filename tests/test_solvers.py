@@ -229,7 +229,7 @@ class TestEndings:
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_motion_that_escapes_to_infinity(self, solver) -> None:
         solution = solver(scalar_problem(cubic=100.0), max_iterations=30)
-        assert solution.status in (Status.NOT_FINITE, Status.DIVERGED, Status.NOT_POSITIVE_DEFINITE)
+        assert not solution.success
         assert "remedy" in str(solution)
         assert solution.remedy in str(solution)
 

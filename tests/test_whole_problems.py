@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from oracle import planar_quadrotor
-from sampling import examples
-from whole_problems import draws, known
+from sampling import examples, rarely
+from whole_problems import dense, draws, families, known
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim.results.solution_parts import Status
+from lqrsim.results.solution_parts import Curvature, Status
 
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
@@ -61,6 +61,43 @@ def test_what_is_known_beforehand_is_found(kind: str) -> None:
         solution = ls.smooth(drawn.problem, start=drawn.start)
         assert known.false(drawn, solution) == [], f"{kind} {number}"
         assert solution.success == drawn.possible, f"{kind} {number}"
+
+
+# Contacts take seconds each.
+@pytest.mark.parametrize("kind", [*(one for one in families.KINDS if one != "contact"), *rarely("contact")])
+def test_no_family_misleads(kind: str) -> None:
+    """No plan is worse than its start, a saddle, improved by a step of iLQR though STALLED, or NaN without a word."""
+
+    @settings(
+        max_examples=examples(40) if kind != "time" else examples(12), suppress_health_check=[HealthCheck.too_slow]
+    )
+    @given(number=st.integers(0, 2**32 - 1))
+    def holds(number: int) -> None:
+        case = families.draw(kind, number)
+        solution = ls.smooth(case.problem, start=case.given, threads=1)
+        assert dense.contradictions(case, solution) == [], f"{case}: {solution}"
+
+    holds()
+
+
+def test_the_check_of_families_can_fail() -> None:
+    """iLQR keeps to a symmetric start, and so ends at the saddle; other claims are made false by hand."""
+    case = next(one for one in (families.draw("symmetric", i) for i in range(99)) if not one.problem.constraints)
+    saddle, minimum = ls.ilqr(case.problem), ls.smooth(case.problem)
+    assert saddle.success
+    assert minimum.curvature is Curvature.MINIMUM
+    assert minimum.cost < saddle.cost
+    assert ["a saddle" in one for one in dense.contradictions(case, saddle)] == [True]
+    worse = dataclasses.replace(case, given=minimum)
+    assert "worse than its start" in dense.contradictions(worse, dataclasses.replace(saddle, status=Status.STALLED))[0]
+    several = ((one, ls.smooth(one.problem)) for one in (families.draw("flat", i) for i in range(99)))
+    flat, plateau = next(pair for pair in several if pair[1].curvature is Curvature.SINGULAR)
+    claimed = dataclasses.replace(plateau.certificate, curvature=Curvature.MINIMUM)
+    assert "no minimum" in dense.contradictions(flat, dataclasses.replace(plateau, certificate=claimed))[0]
+    early = dataclasses.replace(ls.smooth(case.problem, max_iterations=1, safeguard=False), status=Status.STALLED)
+    assert "a step lowers the cost" in dense.contradictions(case, early)[0]
+    lost = np.full_like(early.trajectory.states, np.nan)
+    assert "not finite" in dense.contradictions(case, _with_plan(early, states=lost))[0]
 
 
 def test_what_is_known_otherwise_is_noticed() -> None:

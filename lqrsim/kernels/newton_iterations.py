@@ -29,8 +29,8 @@ from lqrsim.kernels.rollouts import copy_plan, differential_pass, ilqr_pass, ini
 # Fractions of the second-order terms, tried in this order until a pass has a minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
 ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
-# Smallest fractions of a step that the line search tries: with second-order terms, and without. A projected model knows
-# nothing of where a cost saturates, so its steps may be too long by orders of magnitude.
+# Smallest fractions of a step that the line search tries: usually, and of patient steps without second-order terms. A
+# projected model knows nothing of where a cost saturates, so its steps may be too long by orders of magnitude.
 SMALLEST, LEAST = 1e-3, 1e-8
 ROUNDING = 1e-12  # rounding error of a merit, relative to the merit
 SMALL, WEIGHTS = 1e-10, 8  # first weight on control changes, relative to the merit; number of weights, each times 1000
@@ -68,7 +68,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
             shift[i] = work.x_hat[i] - plan.states[0, i]
         bound, wanted = memory.merit + ROUNDING * abs(memory.merit), ARMIJO * memory.decrease
         smallest = SMALLEST
-        if memory.share == 0:
+        if memory.share == 0 and memory.patient > 0:
             wanted, smallest = 0.0, LEAST
         merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, smallest, work.last)
         outcome = RUNNING

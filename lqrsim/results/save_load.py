@@ -41,6 +41,7 @@ VERSIONS = dict(FORMATS.values())
 # Fields that older files of the same version lack.
 LATER = {
     (Certificate, "contacts"),
+    (Certificate, "curvature"),
     (FailureCertificate, "keep"),
     (Rollout, "moving"),
     (Rollout, "obstacle_geoms"),

@@ -105,7 +105,7 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
-    """The remedy for this case; if none is known, the usual remedy for the status. Empty for a success that needs none."""
+    """The remedy for this case; if none is known, the usual one for the status. Empty for a success that needs none."""
     status = found.status
     if status.success or found.remedy:
         return found.remedy

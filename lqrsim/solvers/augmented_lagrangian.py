@@ -198,7 +198,7 @@ def damped_from_rollout(run: SolveRun) -> RunResult:
             with run.budget.limited(REFINED):
                 damped = run.damped()
             if not run.budget.over:
-                return run.certified(run.newton())
+                return run.certified(run.newton(patient=True))
         return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
     lagrangian.evaluate(*run.work.best)

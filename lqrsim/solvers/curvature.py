@@ -1,4 +1,4 @@
-"""Second-order optimality: whether a plan is a minimum, and a direction along which it can go down where it is a saddle.
+"""Second-order optimality: whether a plan is a minimum, and a direction down from a plan that is a saddle.
 
 The Hessian of the Lagrangian is reduced to the changes that keep the dynamics and all rows that are at zero. Its
 inertia is that of the control blocks of a Riccati recursion, in which later controls respond at their best. If a block
@@ -8,6 +8,7 @@ has a negative eigenvalue, its eigenvector and these responses are a direction o
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
@@ -22,6 +23,8 @@ FLATTER = 1e-10  # the same relative to the typical cost of a change
 CLEAR = 1e-7  # curvature of a control that is positive beyond doubt, relative to the typical cost of a change
 PRESSING = 1e-9  # cost of a change by a row's size, relative to the typical cost, from which on the row presses
 SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below which its direction is looked at
+
+Flags = npt.NDArray[np.bool_]
 
 
 class Bend(NamedTuple):
@@ -56,8 +59,9 @@ class _Reduced:
             forces[:-1, row] = sign * slopes[:, i]
         numbers = stages.values(plan) / sizes.rows
         at_zero = stages.live & (stages.equality | (numbers <= AT_ZERO) | ((forces > 0) & ~limit))
-        pressing = forces * sizes.rows / sizes.cost > PRESSING
-        self._all, self._strict = at_zero, at_zero & (stages.equality | pressing)
+        pressing: Flags = forces * sizes.rows / sizes.cost > PRESSING
+        self._all: Flags = at_zero
+        self._strict: Flags = at_zero & (stages.equality | pressing)
 
     def bend(self) -> Bend:
         """A saddle if it bends down with all rows held that are at zero; a minimum if it bends up with fewer held."""
@@ -69,12 +73,12 @@ class _Reduced:
             kind = Curvature.SINGULAR if kind is Curvature.SADDLE else kind
         return Bend(kind, direction)
 
-    def _weighed(self, held: Array) -> Array:
+    def _weighed(self, held: Flags) -> Array:
         """The Hessians (T+1, n+m, n+m) with weights on these rows."""
         weights = np.where(held, HELD * self._sizes.cost / self._sizes.rows**2, 0.0)
         return self._stages.models.hessian + self._stages.curvature(weights[self._stages.live])
 
-    def _bends_up(self, held: Array) -> bool:
+    def _bends_up(self, held: Flags) -> bool:
         """Whether the curvature is positive beyond doubt: a compiled look, which most plans pass."""
         stages, fixed = self._stages, np.zeros((self._stages.steps, self._stages.m), dtype=bool)
         for row, (_, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
@@ -82,7 +86,7 @@ class _Reduced:
         least = stages.least_curvatures(self._weighed(held & (stages.owners >= 0)), fixed)
         return least is not None and bool((least * self._sizes.controls**2 > CLEAR * self._sizes.cost).all())
 
-    def _recursion(self, held: Array) -> tuple[Curvature, Motion | None]:
+    def _recursion(self, held: Flags) -> tuple[Curvature, Motion | None]:
         stages, sizes, n = self._stages, self._sizes, self._stages.n
         hessian, jacobian = self._weighed(held), stages.models.jacobian
         curve, gains, singular = hessian[-1][:n, :n], np.zeros((stages.steps, stages.m, n)), False
@@ -113,7 +117,7 @@ class _Reduced:
             singular |= bool(np.linalg.eigvalsh(scaled).min() <= FLATTER * sizes.cost)
         return Curvature.SINGULAR if singular else Curvature.MINIMUM, None
 
-    def _along(self, begin: int, control: Array, gains: Array, held: Array) -> tuple[int, Motion]:
+    def _along(self, begin: int, control: Array, gains: Array, held: Flags) -> tuple[int, Motion]:
         """The sign of the curvature along a change of the control (m,) at a step to which later controls respond.
 
         1 also for a direction that leaves rows which are held; 0 where only rounding is left. And the direction.

@@ -345,7 +345,7 @@ class SolveRun:
         if ending.outcome == declarations.TIMED_OUT or (self.settings.safeguard and not self.budget.left):
             return self.best(found) if look_back else found
         if found.success:
-            return self.newton()
+            return self.newton(patient=True)
         return self.safeguard(found) if self.settings.safeguard else found
 
     def smooth(self, last: int) -> None:
@@ -392,12 +392,14 @@ class SolveRun:
             self.problem, self.ending, self._rows["cost"][: self._row], start, control, refuse=self.budget.attentive
         )
 
-    def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0) -> RunResult:
+    def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
         """Newton's method from the best plan so far; `added` is the part of its cost from the constraints.
 
-        What it promises is relative to the cost, or to `least` if that is more.
+        What it promises is relative to the cost, or to `least` if that is more. If no other method can follow, it is
+        `patient`: it takes short steps, too.
         """
         self.work.begin_newton(added, least)
+        self.work.memory["patient"] = float(patient)
         ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
@@ -411,7 +413,7 @@ class SolveRun:
             damped = self.damped(least=least)
             if not (self.second_order and damped.success) or self.budget.over:
                 break
-            found = self.newton(detail=detail)
+            found = self.newton(detail=detail, patient=True)
             if found.success or self.budget.over:
                 return found
         assert damped is not None
@@ -423,7 +425,7 @@ class SolveRun:
             return found
         if self.second_order and not self.budget.over:
             # Newton's passes are about the plan, and need no inverse of the controls' weights.
-            return self.newton(detail=detail)
+            return self.newton(detail=detail, patient=True)
         status = damped.status
         if damped.outcome == declarations.STALLED:
             # The plan is finite, whatever the undamped method met on its way; the detail names it. What a user's
@@ -561,6 +563,8 @@ class SolveRun:
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
             return replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
+        if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
+            return replace(found, status=Status.NOT_POSITIVE_DEFINITE)
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
     def bend(self, found: RunResult) -> Bend:

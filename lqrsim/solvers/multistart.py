@@ -35,6 +35,8 @@ HOLD, LEAST = 0.01, 1e-3
 # Constant controls that are tried where the nominal ones lead out of the domain: fractions of the range between the
 # limits; where there is no limit, of this many units about the nominal control.
 LEVELS, UNLIMITED = (0.0, 0.25, 0.5, 0.75, 1.0), (1.0, 10.0, 100.0)
+# Pushes: fractions of the way from the nominal control to a limit, and of the time.
+PUSHED, PARTS = (0.03, 0.1, 0.3, 1.0), (0.2, 0.5, 1.0)
 HALVE, CHOOSE = 3, 4  # numbers of iterations after which half of the starts remain, and one start
 # Trajectories along paths, tried while no plan keeps the constraints: their number, the weight of the path relative to
 # a plan's cost, and the number of iterations in which the path acts.
@@ -198,6 +200,27 @@ def constant_controls(problem: Problem) -> Iterator[tuple[Array, Motion]]:
         plan = compiled.rollout(problem, np.zeros((steps, m, len(start))), np.tile(control, (steps, 1)), start.copy())
         if np.isfinite(plan[0]).all():
             yield control, Motion(*plan)
+
+
+def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
+    """Plans in which one control at a time is away from its nominal value, for a part of the time: names, controls.
+
+    Args:
+      problem: one that names a start.
+    """
+    space, actuators = problem.control_coordinates, problem.dynamics.control_coordinates
+    low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
+    start, steps = problem.start, problem.steps
+    nominal = np.broadcast_to(problem.nominal_controls, (steps, len(low)))
+    gain = np.zeros((steps, len(low), len(nominal[0]) if start is None else len(start)))
+    for i, side, share, part in itertools.product(range(len(low)), (high, low), PUSHED, PARTS):
+        far = share * np.where(np.isfinite(side[i]), side[i] - nominal[:, i], 1.0 if side is high else -1.0)
+        controls = nominal.copy()
+        controls[:, i] += np.where(np.arange(steps) < part * steps, far, 0.0)
+        if start is not None and far.any():
+            plan = Motion(*compiled.rollout(problem, gain, controls, start.copy()))
+            if np.isfinite(plan.states).all():
+                yield f"a push by {space.names[i]}", controls, plan
 
 
 def check_starts(problem: Problem, count: int | None) -> None:

@@ -6,6 +6,7 @@ Such a plan is stationary, but says nothing: a box that nothing touches does not
 import numpy as np
 
 from lqrsim.errors import Array
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers import compiled
@@ -13,7 +14,9 @@ from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.multistart import SWAYS, sinusoidal_controls
 
 LEFT = 1e-3  # slope of the final cost, relative to the slope at the end of a given plan, that has died away
-MOST_OF = 0.1  # part of the cost that a change of a state by its size would save, from which on its goal counts as missed
+MOST_OF = (
+    0.1  # part of the cost that a change of a state by its size would save, from which on its goal counts as missed
+)
 NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 
@@ -37,12 +40,18 @@ def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allow
     places = np.flatnonzero(missed)
     pull = np.eye(len(start))[places]
     for state, control in zip(states[-2::-1], controls[::-1], strict=True):
-        a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
+        with np.errstate(all="ignore"):
+            a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
         still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
         places, pull = places[still], (pull @ a)[still]
         if not len(places):
             break
     return places.tolist()
+
+
+def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
+    """Whether two plans end with different values of these states."""
+    return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
 
 
 def goal_left(problem: Problem, found: RunResult, given: RunResult) -> bool:

@@ -62,6 +62,7 @@ from lqrsim.solvers.multistart import (
     guides,
     passable,
     pull,
+    pushes,
     reweighted,
     sinusoidal_controls,
 )
@@ -83,6 +84,7 @@ ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 # sizes; and the relative decrease of cost that such a step must lead to.
 SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 
+PUSHES = 2  # plans of pushes from which a descent begins
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
 
@@ -129,10 +131,11 @@ def solve(
             search.widen()
             search.look_aside()
             search.leave_saddles()
+            search.move()
             search.retry_without_risk()
         search.soften()
-        search.alternate()
         search.keep(kept)
+        search.alternate()
     solution = search.solution()
     for run in runs:
         run.give_back()
@@ -182,7 +185,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     if not beside.cost < saddle.cost:
         return None
     run.work.take(beside.states, beside.controls, beside.cost)
-    return run.certified(run.newton())
+    return run.certified(run.newton(patient=True))
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
@@ -209,7 +212,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
     if budget.over:
         return replace(other, status=found.status, detail=found.detail)
     run.work.take(other.states, other.controls, other.cost)
-    return run.newton(detail=found.detail)
+    return run.newton(detail=found.detail, patient=True)
 
 
 class Search:
@@ -271,16 +274,21 @@ class Search:
     def _try_finite(self) -> None:
         """While the states leave their domain: try constant controls under which they do not, and a line of states."""
         problem, exact = self._problem, self.best[0].second_order
-        if np.isfinite(self.best[1].cost) or problem.start is None or self._budget.stop.due:
+        lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
+        if not lost or problem.start is None or self._budget.stop.due:
             return
         self._known.from_start = False
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in constant_controls(problem):
             missed = float(f"{work.violation(work.constraint_values(*plan)):.2g}")
-            plans.append((missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control))
+            plans.append(
+                (missed, float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), control)
+            )
         plans = [one for one in plans if np.isfinite(one[:2]).all()]
         for _, _, control in sorted(plans, key=lambda one: one[:2])[:CONSTANT]:
-            run = self._add(resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}")
+            run = self._add(
+                resolve(control, problem), f"the constant controls {', '.join(f'{u:.3g}' for u in control)}"
+            )
             self._offer(run, self._finish(run))
             if self.best[1].success or self._budget.stop.due:
                 return
@@ -421,7 +429,7 @@ class Search:
                 kept.states + sign * far * direction.states, kept.controls + sign * far * direction.controls,
                 self._problem.dt,
             )  # fmt: skip
-            one = self._another(InitialGuess(*map(np.copy, kept.law), "a saddle"))
+            one = self._another(InitialGuess(kept.law[0].copy(), kept.law[1].copy(), "a saddle"))
             one.budget.report_to(self._callback)
             result = from_beside(one, moved, kept)
             if self._budget.stop.due:
@@ -432,16 +440,46 @@ class Search:
                 return True
         return False
 
+    def move(self) -> None:
+        """If no control changes a state that misses its goal, such as a box that nothing touches: begin with pushes."""
+        found = self.best[1]
+        places = self._unmoved() if self._default and self._may_go_on else []
+        if not places:
+            return
+        problem, plans = self._problem, list[tuple[float, str, Array]]()
+        for name, controls, plan in pushes(problem):
+            if reach.differ(plan, found, places):
+                plans.append(
+                    (float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), name, controls)
+                )
+        for _, name, controls in sorted(plans, key=lambda one: one[0])[:PUSHES]:
+            run = self._add(resolve(controls, problem), name)
+            self._offer(
+                run,
+                other := self._finish(run, refine),
+                better=found.violation >= other.violation and other.cost < self.best[1].cost,
+            )
+
+    def _unmoved(self) -> list[int]:
+        """The states that miss their goal and that no control changes along the best plan."""
+        found, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
+        if not np.isfinite(found.cost):
+            return []
+        return reach.unmoved(self._problem, found.states, found.controls, found.cost, allowed)
+
     def keep(self, given: RunResult | None) -> None:
         """If the best plan is worse than the plan that the caller gave: descend from that plan, or return it."""
         run, found = self.best
-        if given is None or not (run.is_worse(found, given) or reach.goal_left(self._problem, found, given)):
+        if given is None:
+            return
+        still = reach.differ(found, given, self._unmoved())
+        if not (still or run.is_worse(found, given) or reach.goal_left(self._problem, found, given)):
             return
         if not self._budget.stop.due:
             run = self._add(policy_of(given, "descent from the given plan"))
             other = self._finish(run, refine)
-            keeps = not run.is_worse(other, given)
-            self._offer(run, other, better=keeps and (run.is_worse(found, given) or other.rank < found.rank))
+            wanted = run.is_worse(found, given) or (still and other.cost < found.cost) or other.rank < found.rank
+            self._offer(run, other, better=wanted and not run.is_worse(other, given))
         run, found = self.best
         if run.is_worse(found, given):
             status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
@@ -495,7 +533,7 @@ class Search:
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
         again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
         """
-        if not self._may_soften:
+        if self.best[1].success or not self._may_go_on:
             return
         optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
         for _ in range(ROUNDS):
@@ -607,20 +645,19 @@ class Search:
         elif self._cut_short and np.isfinite(found.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
-        elif not stop.due and np.isfinite(found.cost):
+        elif not stop.due:
             found = self._told_of_unmoved(found)
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
+        begun = self._named[0][1] if settings.start is not None else chosen
         return assemble(
             problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
-            options=settings.options(chosen.initial_guess) | tolerances, candidates=self._candidates(),
+            options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
         )  # fmt: skip
 
     def _told_of_unmoved(self, found: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
-        problem = self._problem
-        allowed = self._settings.violation_tolerance(problem)
-        places = reach.unmoved(problem, found.states, found.controls, found.cost, allowed)
+        problem, places = self._problem, self._unmoved()
         if not places:
             return found
         detail = "; ".join(part for part in (reach.described(problem, found.states, places), found.detail) if part)

@@ -10,6 +10,8 @@ drawn        Random systems with fixed and soft starts, limits, constraints, war
 planar       A planar quadrotor that has to get over a wall: 60 starts and goals, with a clearance and without, and for
              each sharpness of its ObstacleCost; to an optimality of 1e-8.
 known        Problems of which the answer is known beforehand, whole_problems/known.py: 100 of each kind.
+families     Families in which solvers mislead, whole_problems/families.py: given starts, saddles, saturating and flat
+             costs, overflow, scales, least time, contacts; against dense derivatives, whole_problems/dense.py.
 certificate  What the certificate costs of a solve, on the paper's queries and on warm starts.
 """
 
@@ -18,7 +20,7 @@ import statistics
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -36,13 +38,13 @@ sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runne
 
 from oracle import planar_quadrotor
 from runner import Result, Settings, at_most, opening, run
-from whole_problems import known
+from whole_problems import dense, families, known
 from whole_problems.claims import contradictions
 from whole_problems.draws import KINDS, draw, solve
 
 SHARPNESS = (5.0, 10.0, 20.0, 40.0)  # 1/m, of the cost of obstacles
 
-Section = Literal["drawn", "planar", "known", "certificate"]
+Section = Literal["drawn", "planar", "known", "families", "certificate"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,15 +57,18 @@ class Config(Settings):
     """Of random problems."""
     seed: int = 0
     """Of the random problems."""
+    members: int = 2_000
+    """How many problems of families at least, of all together; of each family as many."""
     queries: int = 100
     """How many of the quadrotor's for what the certificate costs."""
 
 
 def main(config: Config) -> Result:
-    config = at_most(config, problems=110, queries=10)
+    config = at_most(config, problems=110, members=80, queries=10)
+    sections = {"drawn": _drawn, "planar": _planar, "known": _known, "families": _families, "certificate": _certificate}
     result = opening(config)
     for name in config.sections:
-        result[name] = {"drawn": _drawn, "planar": _planar, "known": _known, "certificate": _certificate}[name](config)
+        result[name] = sections[name](config)
     return result
 
 
@@ -86,23 +91,49 @@ def _look_at(task: tuple[str, int, int]) -> tuple[str, list[str], list[str]]:
 def _drawn(config: Config) -> dict[str, Any]:
     each = -(-config.problems // len(config.kinds))  # at least as many as asked for, of each kind as many
     tasks = [(kind, number, config.seed) for number in range(each) for kind in config.kinds]
-    statuses: dict[str, Counter[str]] = {kind: Counter() for kind in config.kinds}
-    false: list[str] = []
+    statuses, false = {kind: Counter[str]() for kind in config.kinds}, list[str]()
     # One after the other, so that each kind is compiled once before all begin.
     for kind in tqdm(config.kinds, desc="compiling", leave=False, disable=None):
         draw(kind, 0, seed=config.seed)
         look(kind, 0, config.seed)
     with tqdm(total=len(tasks), desc="drawn", disable=None) as bar:
-        for kind, ended, wrong in _on_all_processors(tasks):
+        for kind, ended, wrong in _on_all_processors(_look_at, tasks):
             statuses[kind].update(ended)
             false += wrong
             bar.update()
     return {"problems": len(tasks), "statuses": statuses, "false": false}
 
 
-def _on_all_processors(tasks: list[tuple[str, int, int]]) -> Iterator[tuple[str, list[str], list[str]]]:
+Task = tuple[str, int, int]
+Judged = tuple[str, list[str], list[str]]
+
+
+def _on_all_processors(judge: Callable[[Task], Judged], tasks: list[Task]) -> Iterator[Judged]:
     with ProcessPoolExecutor(processors(), mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_look_at, tasks, chunksize=20)
+        yield from pool.map(judge, tasks, chunksize=20)
+
+
+def _judge(task: Task) -> Judged:
+    """The status and curvature of a member of a family, and what misleads."""
+    kind, number, seed = task
+    case = families.draw(kind, number, seed=seed)
+    solution = ls.smooth(case.problem, start=case.given, threads=1)
+    false = [f"{case} (seed {seed}): {wrong}" for wrong in dense.contradictions(case, solution)]
+    return kind, [f"{solution.status.name}, {solution.curvature}"], false
+
+
+def _families(config: Config) -> dict[str, Any]:
+    each = -(-config.members // len(families.KINDS))
+    tasks = [(kind, number, config.seed) for number in range(each) for kind in families.KINDS]
+    statuses, false = {kind: Counter[str]() for kind in families.KINDS}, list[str]()
+    for kind in tqdm(families.KINDS, desc="compiling", leave=False, disable=None):
+        _judge((kind, 0, config.seed))
+    with tqdm(total=len(tasks), desc="families", disable=None) as bar:
+        for kind, ended, wrong in _on_all_processors(_judge, tasks):
+            statuses[kind].update(ended)
+            false += wrong
+            bar.update()
+    return {"problems": len(tasks), "statuses": statuses, "false": false}
 
 
 def _planar(config: Config) -> dict[str, Any]:
@@ -189,12 +220,13 @@ def _certificate(config: Config) -> dict[str, Any]:
 
 def report(result: dict[str, Any]) -> str:
     lines = []
-    if drawn := result.get("drawn"):
-        lines.append(f"{drawn['problems']} problems drawn: {len(drawn['false'])} false claims")
-        for kind, counts in drawn["statuses"].items():
-            ended = ", ".join(f"{count} {status}" for status, count in Counter(counts).most_common())
-            lines.append(f"  {kind:<12} {ended}")
-        lines += [f"  FALSE: {wrong}" for wrong in drawn["false"]]
+    for section, what in (("drawn", "problems drawn"), ("families", "problems of families")):
+        if drawn := result.get(section):
+            lines.append(f"{drawn['problems']} {what}: {len(drawn['false'])} false claims")
+            for kind, counts in drawn["statuses"].items():
+                ended = "; ".join(f"{count} {status}" for status, count in Counter(counts).most_common())
+                lines.append(f"  {kind:<12} {ended}")
+            lines += [f"  FALSE: {wrong}" for wrong in drawn["false"]]
     for name, row in result.get("planar", {}).items():
         lines.append(
             f"planar quadrotor, {name}: {row['solved']} of {row['problems']} converged, {row['at_goal']} at the goal,"
@@ -213,7 +245,11 @@ def report(result: dict[str, Any]) -> str:
 
 
 def failures(result: Result) -> list[str]:
-    rows = [result.get("drawn", {"false": []}), *result.get("planar", {}).values(), *result.get("known", {}).values()]
+    rows = [
+        *(result.get(name, {"false": []}) for name in ("drawn", "families")),
+        *result.get("planar", {}).values(),
+        *result.get("known", {}).values(),
+    ]
     return [false for row in rows for false in row["false"]]
 
 

@@ -7,14 +7,20 @@ flat        Costs without curvature: u^4, no effort, pure feasibility.
 overflow    With the nominal control the state overflows or leaves its domain within the horizon.
 scales      Costs and states from 1e-8 to 1e8 of the usual size.
 time        Least time, without an effort.
+contact     A slide of an MJCF that is to push another, with controls that do so, or without.
 
 Each kind has few structures, so that little is compiled; all else is numbers.
 """
 
+import os
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import sympy
 from numpy.random import Generator
@@ -40,7 +46,7 @@ class Case:
 
     Attributes:
       rate: of x (n, ...) and u (m, ...). stage, final: costs of a knot. given: what is given as start, None for none.
-      least: a cost that some plan has, None where none is known.
+      model: that of an MJCF, whose steps are MuJoCo's and take neither complex numbers nor batches; None for formulas.
     """
 
     kind: str
@@ -51,6 +57,7 @@ class Case:
     final: Callable[[Array], Array]
     rows: tuple[Row, ...] = ()
     given: Any = None
+    model: mujoco.MjModel | None = None
 
     def __repr__(self) -> str:
         return f"draw({self.kind!r}, {self.number})"
@@ -65,6 +72,8 @@ class Case:
 
     def roll(self, controls: Array, dt: float | None = None) -> Array:
         """States (T+1, n, ...) under controls (T, m, ...), by RK4 with the controls held."""
+        if self.model is not None:
+            return _by_mujoco(self.model, controls, self.problem.dt)
         problem, h = self.problem, self.problem.dt if dt is None else dt
         assert isinstance(problem.initial, ls.FixedState)
         start = np.asarray(problem.initial.numbers)
@@ -89,12 +98,23 @@ class Case:
         states, found, shape = self.roll(controls, dt), {False: [], True: []}, controls.shape[2:]
         for row in self.rows:
             for t in range(len(states)):
-                if not row.final or t == len(states) - 1:
-                    if row.final or t > 0:
-                        u = controls[min(t, len(controls) - 1)]
-                        found[row.equality] += list(np.reshape(row.function(states[t], u), (-1, *shape)))
+                if t == len(states) - 1 or (t > 0 and not row.final):  # a fixed start keeps none
+                    u = controls[min(t, len(controls) - 1)]
+                    found[row.equality] += list(np.reshape(row.function(states[t], u), (-1, *shape)))
         shape = (0, *shape)
         return tuple(np.array(found[kind]) if found[kind] else np.zeros(shape) for kind in (False, True))  # type: ignore[return-value]
+
+
+def _by_mujoco(model: mujoco.MjModel, controls: Array, dt: float) -> Array:
+    """States (T+1, nq + nv) by MuJoCo's own steps, from its initial state, each from a fresh warm start."""
+    data = mujoco.MjData(model)
+    states = [np.concatenate([data.qpos - model.qpos0, data.qvel])]
+    for control in controls:
+        data.ctrl[:] = control
+        for _ in range(round(dt / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+        states.append(np.concatenate([data.qpos - model.qpos0, data.qvel]))
+    return np.array(states)
 
 
 def _rk4(rate: Callable[[Array, Array], Sequence[Array]], x: Array, u: Array, h: float) -> Array:
@@ -126,29 +146,34 @@ def _case(
     limits: tuple[Any, Any] | None = None, rows: Sequence[tuple[Formula, bool, bool]] = (),
     goal: dict[str, float] | None = None, given: Any = None, **others: Any,
 ) -> Case:  # fmt: skip
-    """A case of formulas of (x, u, p, library); `rows` are formulas, whether equalities, and whether at the end only."""
-    p, none = _Numbers(numbers), np.zeros(len(controls))
-    names = list(states)
+    """A case of formulas of (x, u, p, library); rows are formulas, whether equalities, and whether at the end only."""
+    p, none, names = _Numbers(numbers), np.zeros(len(controls)), list(states)
+
+    def stated(formula: Formula) -> Any:
+        return _named(lambda x, u, p: formula(x, u, p, sympy), formula.__name__)
+
+    def ended(x: Any, u: Any, p: Any, lib: Any) -> Any:
+        return final(x, none, p, lib)
+
     constraints: list[Any] = [
         ls.SymbolicConstraint(
-            _named(lambda x, u, p, row=row: row(x, u, p, sympy), "row"), parameters=numbers, equality=equality,
-            **({"at": "final"} if last else {}),
+            stated(row), parameters=numbers, equality=equality, **({"at": "final"} if last else {})
         )
         for row, equality, last in rows
     ]  # fmt: skip
     own = [Row(lambda x, u, row=row: row(x, u, p, np), equality, last) for row, equality, last in rows]
     if goal is not None:
         constraints.append(ls.GoalState(**goal))
-        places, values = [names.index(name) for name in goal], list(goal.values())
-        own.append(
-            Row(lambda x, u: np.array([x[i] - v for i, v in zip(places, values, strict=True)]), equality=True, final=True)
-        )
+        places = [names.index(name) for name in goal]
+        own += [
+            Row(lambda x, u, i=i, value=value: x[i] - value, equality=True, final=True)
+            for i, value in zip(places, goal.values(), strict=True)
+        ]
     problem = ls.Problem(
-        dynamics=ls.Dynamics(_named(lambda x, u, p: rate(x, u, p, sympy), rate.__name__), states=states, controls=controls, parameters=numbers),
-        dt=dt, steps=steps, initial=ls.FixedState(start),
-        stage_cost=ls.SymbolicCost(_named(lambda x, u, p: stage(x, u, p, sympy), stage.__name__), parameters=numbers),
-        final_cost=ls.SymbolicCost(_named(lambda x, u, p: final(x, none, p, sympy), final.__name__), parameters=numbers),
-        control_limits=limits, constraints=constraints, **others,
+        dynamics=ls.Dynamics(stated(rate), states=states, controls=controls, parameters=numbers), dt=dt, steps=steps,
+        initial=ls.FixedState(start), stage_cost=ls.SymbolicCost(stated(stage), parameters=numbers),
+        final_cost=ls.SymbolicCost(stated(ended), parameters=numbers), control_limits=limits, constraints=constraints,
+        **others,
     )  # fmt: skip
     return Case(
         kind="", number=0, problem=problem, rate=lambda x, u: rate(x, u, p, np),
@@ -312,8 +337,12 @@ def overflow(rng: Generator) -> Case:
     numbers["goal"] = float(rng.uniform(-0.5, 0.3))
     if rate is tank:
         empty = 2.0 / numbers["a"]  # seconds until it is, without an inflow
-        limits, horizon, numbers["goal"] = (0.0, 2.5), empty * float(rng.uniform(1.05, 2.0)), float(rng.uniform(0.3, 1.5))
-    steps = int(rng.integers(40, 110))
+        limits, horizon, numbers["goal"] = (
+            (0.0, 2.5),
+            empty * float(rng.uniform(1.05, 2.0)),
+            float(rng.uniform(0.3, 1.5)),
+        )
+    steps = int(rng.integers(30, 70))
     kind = rng.integers(3)
     rows = [(lambda x, u, p, lib: x[0] + (0.0 if rate is tank else 3.0), False, False)] if kind == 1 else []
     return _case(
@@ -360,7 +389,7 @@ def time(rng: Generator) -> Case:
         guess = float(np.sqrt(2 * np.hypot(far, deep) ** 2 / (g * deep)))
         return _case(
             bead, {"x": "m", "y": "m", "v": "m/s"}, {"slope": "rad"}, numbers=numbers, start=[0.0, 10.0, 0.0],
-            dt=guess / steps, steps=steps, stage=nothing, final=lambda x, u, p, lib: p.weight / 2 * (x[0] - p.goal) ** 2,
+            dt=guess / steps, steps=steps, stage=nothing, final=level,
             limits=(0.0, np.pi), goal={"x": far, "y": 10.0 - deep}, duration=(0.2 * guess, 4 * guess), time_weight=1.0,
         )  # fmt: skip
     way, push = float(rng.uniform(0.3, 5.0)), float(rng.uniform(0.5, 5.0))
@@ -396,12 +425,52 @@ def given(rng: Generator) -> Case:
         # A policy about the plan, with gains that are not those of an optimum.
         gain = 0.0 * rng.normal(size=(problem.steps, m, states.shape[1]))
         given = ls.AffinePolicy(
-            gain=gain, offset=controls, nominal=states[:-1], dt=problem.dt,
-            state_coordinates=problem.dynamics.state_coordinates, control_coordinates=problem.control_coordinates,
+            gain=gain,
+            offset=controls,
+            nominal=states[:-1],
+            dt=problem.dt,
+            state_coordinates=problem.dynamics.state_coordinates,
+            control_coordinates=problem.control_coordinates,
         )
     elif kind == 3:
         given = ls.ilqr(replace(problem, constraints=()), start=controls, max_iterations=int(rng.integers(1, 20)))
     return replace(base, given=given)
+
+
+def contact(rng: Generator) -> Case:
+    away, heavy, light = float(rng.uniform(0.03, 0.12)), float(rng.uniform(0.1, 1.0)), float(rng.uniform(0.1, 1.0))
+    xml = f"""<mujoco model="pushing"><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody>
+      <body name="pusher" pos="{-0.08 - away:.4f} 0 0"><joint name="a" type="slide" axis="1 0 0" damping="1"/>
+        <geom type="sphere" size="0.02" mass="{heavy:.4f}"/></body>
+      <body name="pushed"><joint name="b" type="slide" axis="1 0 0" damping="{rng.uniform(1, 4):.4f}"/>
+        <geom type="box" size="0.06 0.06 0.06" mass="{light:.4f}"/></body></worldbody>
+      <actuator><motor name="f" joint="a" ctrlrange="-4 4" ctrllimited="true"/></actuator></mujoco>"""
+    folder = Path(tempfile.gettempdir()) / f"lqrsim-pushing-{os.getpid()}"
+    folder.mkdir(exist_ok=True)
+    path = folder / "pushing.xml"
+    path.write_text(xml)
+    robot, goal = ls.MjcfRobot(path), float(rng.uniform(0.1, 0.4))
+    shutil.rmtree(folder)
+    numbers, steps = {"effort": 0.01, "weight": 1000.0, "rest": 10.0}, int(rng.integers(25, 50))
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.04, steps=steps, initial=ls.FixedState(np.zeros(4)),
+        stage_cost=ls.ControlCost([numbers["effort"]]),
+        final_cost=ls.QuadraticCost({"b": numbers["weight"], "b_velocity": numbers["rest"]}, about={"b": goal}),
+        control_limits=(-4, 4),
+    )  # fmt: skip
+    case = Case(
+        "", 0, problem, rate=lambda x, u: [], stage=lambda x, u: numbers["effort"] / 2 * u[0] ** 2,
+        final=lambda x: numbers["weight"] / 2 * (x[1] - goal) ** 2 + numbers["rest"] / 2 * x[3] ** 2,
+        model=mujoco.MjModel.from_xml_string(xml),
+    )  # fmt: skip
+    if rng.random() < 0.3:
+        return case
+    push = float(rng.uniform(0.3, 2.0))
+    controls = np.where(np.arange(steps)[:, None] < steps * rng.uniform(0.5, 1.0), push, 0.0)
+    given: Any = controls
+    if rng.random() < 0.5:
+        given = ls.Trajectory(case.roll(controls), controls, problem.dt)
+    return replace(case, given=given)
 
 
 def numbers_size(case: Case) -> float:
@@ -412,5 +481,5 @@ def numbers_size(case: Case) -> float:
 
 KINDS: dict[str, Callable[[Generator], Case]] = {
     "given": given, "symmetric": symmetric, "saturating": saturating, "flat": flat, "overflow": overflow,
-    "scales": scales, "time": time,
+    "scales": scales, "time": time, "contact": contact,
 }  # fmt: skip
