@@ -8,9 +8,10 @@ import pytest
 import lqrsim as ls
 
 # Machines may be busy, so examples have no time limit. Where long tests are left out, families are drawn less often
-# (tests/helpers/sampling.py) and the predictions of runs have fewer trials, unless a test says how many.
-hypothesis.settings.register_profile("whole", deadline=None)
-hypothesis.settings.register_profile("short", deadline=None, max_examples=25)
+# (tests/helpers/sampling.py) and always the same, and the predictions of runs have fewer trials, unless a test says how
+# many. The long run draws others each time, also on servers, and prints how to draw a failing one again.
+hypothesis.settings.register_profile("whole", deadline=None, derandomize=False, print_blob=True)
+hypothesis.settings.register_profile("short", deadline=None, derandomize=True, database=None, max_examples=25)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -16,10 +16,12 @@ from tracking import hover, track, weave
 from lqrsim.errors import InputError
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results import save_load
+from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenes.scene import load_scene, scene_from_xml
@@ -509,3 +511,97 @@ def test_a_pair_of_the_mjcf_is_no_wall_without_contacts(attributes, impulse, tmp
     assert runs[0].obstacles == runs[1].obstacles
     np.testing.assert_allclose(runs[1].states, runs[0].states, rtol=0, atol=1e-9)
     np.testing.assert_allclose(runs[1].collided_at, runs[0].collided_at, atol=plant.timestep)
+
+
+# Plans that their own undisturbed run leaves, and MuJoCo's warnings.
+
+BILLIARD = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
+  <body><joint name="x" type="slide" axis="1 0 0"/><geom type="sphere" size="0.05" mass="1"/></body>
+  <body pos="1 0 0"><joint name="y" type="slide" axis="1 0 0" ref="1"/><geom type="box" size=".05 .05 .05" mass="5"/>
+  </body></worldbody><actuator><motor name="push" joint="x" ctrlrange="-9 9"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plan_on_a_contact_switch_says_that_its_run_leaves_it_where_and_by_how_much(seed: int) -> None:
+    """A ball rolls to a block; it gets there a nanometre too late for the last physics step of a period, or in time."""
+    rng = np.random.default_rng(seed)
+    robot, speed, knot, dt = MjcfRobot(scene_from_xml(BILLIARD, "billiard")), *rng.uniform((0.5, 5), (2.0, 20)), 0.01
+    knot = int(knot)
+    first = np.array([1 - 0.1 - speed * dt * knot, 1.0, speed, 0.0])
+    late, early = (first + np.array([off, 0, 0, 0]) for off in (-1e-9, 1e-9))
+    solution = track(robot, late, np.zeros((30, 1)), dt, feedback=False)
+    plant, plan = Plant(robot, robot.scene), solution.trajectory
+    begun = replace(solution, trajectory=replace(plan, states=np.vstack([early, plan.states[1:]])))
+    for disturbances in ([], [ControlNoise(1e-6)]):
+        assert simulate(plant, solution, disturbances=disturbances).departure() == ""
+        assert "LEAVES" not in str(simulate(plant, solution, disturbances=disturbances))
+        run = simulate(plant, begun, disturbances=disturbances, trials=2)
+        assert run.undisturbed is not None
+        # What is said is where MuJoCo's own steps from that state first are off by a tenth of the range in a unit.
+        data = mujoco.MjData(plant.model)
+        data.qpos[:], data.qvel[:] = early[:2], early[2:]
+        ran = [early]
+        for _ in range(30):
+            mujoco.mj_step(plant.model, data, 2)
+            ran.append(np.array([*data.qpos, *data.qvel]))
+        allowed = 0.1 * np.repeat(np.ptp(plan.states, axis=0).reshape(2, 2).max(axis=1), 2)
+        t = int(np.argmax((np.abs(ran - plan.states) > allowed).any(axis=1)))
+        off = ran[t] - plan.states[t]
+        worst = int(np.argmax(np.abs(off) / allowed))
+        name, unit = (("x", "m"), ("y", "m"), ("x_velocity", "m/s"), ("y_velocity", "m/s"))[worst]
+        said = f"{name} {off[worst]:+.3g} {unit}, allowed {allowed[worst]:.3g} {unit}; a period before, no state was"
+        assert run.departure().startswith(f"LEAVES the plan at {t * dt:.4g} s: {said} off by more than ")
+        assert t == knot + 1
+        assert f"  undisturbed, the plan's policy {run.departure()}\n" in run.summary()
+
+
+def test_a_plan_of_another_model_is_left_gradually() -> None:
+    robot = MjcfRobot(scene_from_xml(BILLIARD, "billiard"))
+    solution = track(robot, [0.0, 1.0, 0.0, 0.0], np.full((30, 1), 1.0), 0.01, feedback=False)
+    other = replace(solution.trajectory, states=0.8 * solution.trajectory.states + np.array([0.0, 0.2, 0.0, 0.0]))
+    said = simulate(Plant(robot, robot.scene), replace(solution, trajectory=other)).departure()
+    assert re.fullmatch(r"LEAVES the plan at 0\.\d+ s: x\S* \+\S+ \S+, allowed \S+ \S+", said)
+
+
+JOINTS = {
+    "inertia": '<joint name="a" axis="0 1 0"/><joint name="b" axis="0 1 0"/><geom size=".05" pos=".2 0 0" mass="1"/>',
+    "memory": '<joint name="a" type="slide" axis="0 0 1"/>'
+    + "".join(f'<geom size=".051" pos="{0.2 * i} 0 0" mass="1"/>' for i in range(40)),
+}
+
+
+@pytest.mark.parametrize(("kind", "said"), [("inertia", "nearly singular"), ("memory", "too many contacts")])
+def test_warnings_of_mujoco_are_counted_and_neither_printed_nor_left_in_a_file(
+    kind: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Against the counters of MuJoCo's own loop. A handler of the user's stays."""
+    monkeypatch.chdir(tmp_path)
+    xml = f"""<mujoco><size memory="20K"/><option timestep="0.005"/><worldbody><geom type="plane" size="9 9 1"/>
+      <body pos="0 0 0.05">{JOINTS[kind]}</body></worldbody>
+      <actuator><motor name="push" joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
+    robot = MjcfRobot(scene_from_xml(xml, kind))
+    plan = track(robot, np.zeros(len(robot.dynamics.state_coordinates)), np.zeros((6, 1)), 0.01, feedback=False)
+    assert str(robot)
+    run = simulate(Plant(robot, robot.scene), plan, trials=3, threads=2)
+    assert run.warnings is not None
+    assert capfd.readouterr().err == ""
+    assert list(tmp_path.iterdir()) == []
+    messages: list[str] = []
+    mujoco.set_mju_user_warning(messages.append)
+    try:
+        again = simulate(Plant(robot, robot.scene), plan)
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 12)
+        assert mujoco.get_mju_user_warning() == messages.append
+    finally:
+        mujoco.set_mju_user_warning(None)
+    counted = [one.number for one in data.warning]
+    assert sum(counted) > 0
+    np.testing.assert_array_equal(run.warnings, [counted] * 3)
+    np.testing.assert_array_equal(again.warnings, [counted])
+    assert f"  MuJoCo warned {3 * sum(counted)} times in 3 of 3 trials: {said}" in run.summary()
+    path = save_load.save(run, tmp_path / "run.npz")
+    np.testing.assert_array_equal(save_load.load(path, Rollout).warnings, run.warnings)
+    older = replace(run, warnings=None, undisturbed=None)
+    assert older.warned() == older.departure() == ""

@@ -52,6 +52,7 @@ def test_demo_fails_when_an_undisturbed_run_leaves_its_plan(tmp_path: Path, caps
     assert not (tmp_path / "quadrotor" / "video.mp4").exists()
 
 
+@pytest.mark.long
 def test_demo_without_opengl_does_the_rest(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "lqrsim.cli", "demo", "--robots", "differential_drive", "--out", str(tmp_path)]
     environment = os.environ | {"MUJOCO_GL": "disable"}

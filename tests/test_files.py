@@ -279,7 +279,7 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
 def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some of what `tests/tools/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
     monkeypatch.setattr(fuzzer, "PATIENCE", 300.0)  # what hangs is found, and what a slow machine takes is no fault
-    found = list(fuzzer.verdicts(examples(250), seed=3))
+    found = list(fuzzer.verdicts(examples(120), seed=3))
     assert [verdict for verdict in found if verdict.kind in fuzzer.FAILURES] == []
     kinds = Counter(verdict.kind for verdict in found)
     assert min(kinds[kind] for kind in ("refused", "identical", "accepted")) > 0, kinds
@@ -532,7 +532,7 @@ def test_what_compresses_too_well_can_be_read_again(
     calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("displaced", "clearance", "frames")}
     ends: dict[str, Any] = {name: np.full(400, np.inf) for name in ("collided_at", "diverged_at", "failed_at")}
     ends |= {"obstacles": ("",) * 400, "reasons": ("",) * 400}
-    whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), **ends)
+    whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), warnings=None, **ends)
     path = ls.save(whole, tmp_path / "calm.npz")
     assert path.stat().st_size > 1 << 22
     assert same(ls.load(path, ls.Rollout), whole)

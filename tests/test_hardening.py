@@ -302,7 +302,7 @@ def test_the_command_keeps_what_there_is_and_says_if_it_is_not_enough(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
-@pytest.mark.parametrize(("at", "kept"), [*rarely((1, 0)), (3, 1)])
+@pytest.mark.parametrize(("at", "kept"), rarely((1, 0), (3, 1)))
 def test_ctrl_c_in_a_process_of_its_own_keeps_the_plans_that_are_measured(
     own: str, tmp_path: Path, at: int, kept: int
 ) -> None:

@@ -312,6 +312,7 @@ def test_the_quadrotor_tilts_in_the_gap() -> None:
     assert np.degrees(roll[np.abs(x - y).argmin()]) == pytest.approx(-45.0, abs=30.0)
 
 
+@pytest.mark.long
 def test_the_rocket_burns_as_little_or_as_much_as_it_can() -> None:
     """Least fuel is a matter of switching: no more than three steps are in between. Its price is the cost."""
     problem, start = problems.FAMILIES["rocket"].make(0)

@@ -232,7 +232,7 @@ def arm_file(folder: Path, kind: str = "mesh", more: str = "", gravity: float = 
     return file
 
 
-@pytest.mark.parametrize("kind", ["mesh", *rarely("ellipsoid")])
+@pytest.mark.parametrize("kind", rarely("mesh", "ellipsoid"))
 def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> None:
     """The plan keeps its margin, and the run has the clearance of the bindings; a plan through the post collides."""
     robot = ls.MjcfRobot(arm_file(tmp_path, kind), obstacles=("post",))

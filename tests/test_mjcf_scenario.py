@@ -151,7 +151,8 @@ def test_solve_and_simulate_on_the_command_line(
 ) -> None:
     """Also by a reference of thousands of characters, as one of a robot with many states is."""
     monkeypatch.chdir(cart.parent)
-    assert main(["solve", f"{cart.name},start={{'pole': 2.9}},goal={{'pole': 3.14159{'0' * 5000}}},steps=40"]) == 0
+    start, goal, weights = "{'pole': 2.9}", f"{{'pole': 3.14159{'0' * 5000}}}", "{'m': 1e4, 'rad': 1e3}"
+    assert main(["solve", f"{cart.name},start={start},goal={goal},weights={weights},steps=40"]) == 0
     assert main(["simulate", "runs/cart/solution.npz"]) == 0
     assert "1 of 1 trials reached the goal" in capsys.readouterr().out
 

@@ -97,7 +97,7 @@ def test_of_plans_that_miss_something_the_best_is_returned_and_says_it(x: float,
         assert missed[0] <= 1.05 * missed[1]
 
 
-@pytest.mark.parametrize("number", [13, *rarely(133)])
+@pytest.mark.parametrize("number", rarely(13, 133))
 def test_what_has_no_plan_is_infeasible(number: int) -> None:
     found = outcomes.look(number)
     assert (found.verdict, found.status) == ("right", "INFEASIBLE"), found.said

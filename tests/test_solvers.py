@@ -120,7 +120,7 @@ def test_converged_means_locally_optimal(differential_drive: ls.Scenario, solver
         return drive_cost(drive_rollout(start, controls), controls)
 
     z = np.concatenate([plan.states[0] if soft else [], plan.controls.ravel()])
-    found = minimize(cost, z, method="L-BFGS-B", options={"maxiter": 6, "maxfun": 6 * (len(z) + 1)})
+    found = minimize(cost, z, method="L-BFGS-B", options={"maxiter": 3, "maxfun": 3 * (len(z) + 1)})
     assert found.fun > solution.cost * (1 - 1e-3)
 
 

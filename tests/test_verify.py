@@ -356,7 +356,9 @@ def verified_as_rod(
     return ls.verify_run(dataclasses.replace(run, radius=0.08) if seed is None else run)
 
 
-@pytest.mark.parametrize(("thickness", "seed"), [(0.3, 0), (0.8, 1), (2.3, None), (5.0, 3), (7.4, None), (17.0, None)])
+@pytest.mark.parametrize(
+    ("thickness", "seed"), [(0.3, 0), (2.3, None), (17.0, None), *rarely((0.8, 1), (5.0, 3), (7.4, None))]
+)
 def test_a_thin_rod_is_seen_as_well_as_a_ball(
     thickness: float, seed: int | None, short: ls.Rollout, monkeypatch: pytest.MonkeyPatch
 ) -> None:

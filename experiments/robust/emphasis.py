@@ -64,9 +64,14 @@ def report(found: dict[str, Any]) -> list[str]:
     lines = []
     for preset, rows in found.items():
         ratios = [ratio for row in rows if np.isfinite(ratio := ratio_of(row))]
+        less = (
+            f"{len(ratios)} queries: with emphasis, the quadrotor collides less often by a factor of"
+            f" {np.median(ratios):.3g} in the median, {min(ratios):.3g} to {max(ratios):.3g}"
+            if ratios
+            else f"no query of {len(rows)} in which both plans collide in what was run"
+        )
         lines += [
-            f"Preset '{preset}', {len(ratios)} queries: with emphasis, the quadrotor collides less often by a factor of"
-            f" {np.median(ratios):.3g} in the median, {min(ratios):.3g} to {max(ratios):.3g}.",
+            f"Preset '{preset}', {less}.",
             table(head, [cells(row) for row in rows]),
         ]
     return lines

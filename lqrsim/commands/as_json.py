@@ -85,6 +85,8 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     return {
         **_fields(rollout, "robot scene disturbances seed tracking_unit versions"),
         "goal": {"is": target.name, "radius": rollout.goal_radius, "unit": target.unit},
+        "departure": rollout.departure() or None,
+        "warned": rollout.warned() or None,
         "tube": rollout.tube is not None,
         "collision_chance": None if chance is None else chance.max(),
         "reached": rollout.reached.sum(),

@@ -63,7 +63,7 @@ GoalRadius = Annotated[
 GoalTolerance = Annotated[
     float | None,
     optional(
-        "SHARE", "The same for goals without a position, relative to each state's range along the plan. By default 0.1."
+        "SHARE", "The same for goals without a position, relative to each state's way to the goal. By default 0.1."
     ),
 ]
 Seed = Annotated[int, arg(help="Seed of all random numbers. The same seed gives the same output.")]

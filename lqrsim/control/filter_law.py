@@ -184,7 +184,8 @@ class FilterRun(ControllerRun):
 
     def _predict(self, estimates: Array, commands: Array) -> None:
         """Predict estimates by one control period."""
-        self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
+        with self.model.dynamics.quiet():
+            self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
 
 
 def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:

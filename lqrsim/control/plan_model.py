@@ -312,7 +312,8 @@ class PlanModel:
         ahead, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
         states, controls = in_c_order(plan.states), in_c_order(plan.controls)
         dynamics = self.compiled_dynamics
-        self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, ahead, jacobian)
+        with self.dynamics.quiet():
+            self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, ahead, jacobian)
         return jacobian
 
     @cached_property
@@ -325,9 +326,10 @@ class PlanModel:
             values = np.array([self.dynamics.parameters[name] for name in self.parameters])
             changes = STEP * np.maximum(np.abs(values), 1.0)
             states, controls = in_c_order(plan.states), in_c_order(plan.controls)
-            self.compiled.parameter_slopes(
-                plan.steps, states, controls, self.compiled_dynamics, plan.dt, self.places, changes, slopes
-            )
+            with self.dynamics.quiet():
+                self.compiled.parameter_slopes(
+                    plan.steps, states, controls, self.compiled_dynamics, plan.dt, self.places, changes, slopes
+                )
         return np.concatenate([slopes, B * plan.controls[:, None, :], B], axis=2)
 
     @cached_property

@@ -167,6 +167,7 @@ class _Robots:
         lost = self.rng.random((self._trials, 1)) < told.command_loss
         self._applied = np.where(lost, self._applied, self._late_commands.popleft())
         np.clip(self._applied + self._normal(model.m) * self._shaken, *self.limits, out=self._command)
-        self._predict()
+        with model.dynamics.quiet():
+            self._predict()
         self.z += self._normal(model.size) @ self._roots[t].T
         return self._command

@@ -34,7 +34,7 @@ from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import LoopArrays, LoopMoments
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
-from lqrsim.results.goal import Target, scale_of
+from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.solvers.compiled import law_about, rollout
@@ -227,7 +227,7 @@ def _miss(mean: Array, covariance: Array, solution: Solution) -> Array:
         return np.zeros(off.shape) if radius is None else _beyond(radius, off, widest)
     radius = target.radius(None, None, None) if radius is None else radius
     counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
-    bounds, std = radius * scale_of(solution.trajectory.states), np.sqrt(np.maximum(variance, 0.0))
+    bounds, std = radius * target.scale, np.sqrt(np.maximum(variance, 0.0))
     return 1 - np.prod(1 - _beyond(bounds, np.abs(mean), std)[..., counts], axis=-1)
 
 

@@ -602,8 +602,8 @@ def _row(*names: str) -> np.dtype[np.void]:
 # smoothed states and plan at the end.
 # For Newton's method: fraction of second-order terms in the next pass; the step at which the last pass failed; its
 # predicted slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible
-# cost, and the least cost to which that is relative; and the damping without which the pass has no minimum. patient: 1 if short steps
-# are taken, too, because no other method follows.
+# cost, and the least cost to which that is relative; the damping without which the pass has no minimum; and 1 if short
+# steps are taken, too, because no other method follows (patient).
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "idle", "ilqr_left", "ilqr_next", "since_ilqr",
     "final_gap", "started", "watched", "share", "failed", "decrease", "promised", "negligible", "least", "damping",

@@ -410,6 +410,10 @@ class Dynamics:
         check_count("threads", threads)
         return contextlib.nullcontext()
 
+    def quiet(self) -> contextlib.AbstractContextManager[None]:
+        """A context in which their steps print nothing, for those that call compiled code outside of a solve."""
+        return contextlib.nullcontext()
+
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
         """`xdot` (n,) at one state (n,) and control (m,), in plain Python.
 

@@ -1,11 +1,12 @@
 """The goal of a trial, its distance from goal and plan, and how it ended, for every robot. NumPy only.
 
 Distances are in metres for robots with a position. For other robots they are a scaled error: the largest difference
-among the states that count, each relative to the state's range along the plan (at least 1 unit). Whole turns are left
-out.
+among the states that count, from the goal relative to the way from the start (`Target.scale`), from the plan relative
+to the state's range along it (at least 1 unit). Whole turns are left out.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,10 @@ OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 TOLERANCE = 0.1  # default tolerance of the scaled error
 NEAR = 4.0  # robot radii within which a start is so near its goal that the radius says little
 STAYS = 1e-3  # fraction of a radius; a plan that begins closer to its goal is to stay there
-OF_RANGE = "of the plan's range"
+NEGLIGIBLE = 1e-6  # in the units of a state; a shorter way is rounding
+ABRUPT = 1e-4  # of the ranges, in `departure`
+ASIDE = 0.01  # of the longest way in a unit; a state with a shorter way starts at its goal
+OF_RANGE, OF_WAY = "of the plan's range", "of the way"
 
 
 def scale_of(plan: Array) -> Array:
@@ -33,15 +37,44 @@ def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
     return np.max(np.abs(space.difference(states, plan)) / scale_of(plan), axis=-1)
 
 
-def worst_of(space: Coordinates, off: Array, scale: Array) -> str:
+def worst_of(space: Coordinates, off: Array, scale: Array, tolerance: float | None = None) -> str:
     """The state with the largest of the differences (n,), relative to their scale (n,), as text: "elbow -0.1 rad".
 
-    Empty if none differs.
+    Empty if none differs. With a tolerance, which is relative to the scale, also what it allows that state.
     """
     if not off.any():
         return ""
     worst = int(np.argmax(np.abs(off) / scale))
-    return f"{space.names[worst]} {off[worst]:+.3g} {space.units[worst]}".rstrip()
+    unit = space.units[worst]
+    allowed = "" if tolerance is None else f", allowed {tolerance * scale[worst]:.3g} {unit}".rstrip()
+    return f"{space.names[worst]} {off[worst]:+.3g} {unit}".rstrip() + allowed
+
+
+def departure(space: Coordinates, states: Array, plan: Array, dt: float) -> str:
+    """Where a run (T+1, n) leaves a plan (T+1, n), as text: "LEAVES the plan at 0.4 s: ..."; empty if it does not.
+
+    It leaves the plan where a state is not finite, or off by more than TOLERANCE of the largest range along the plan in
+    its unit. A run that was still on the plan a period before, to within ABRUPT of that, met a step that jumps.
+    """
+    units, ranges = np.array(space.units), np.ptp(plan, axis=0)
+    alike = (units[:, None] == units) & (units != "") | np.eye(len(units), dtype=bool)
+    scale = (alike * ranges).max(axis=1)
+    scale = np.where(scale > NEGLIGIBLE, scale, 1.0)
+    off = space.difference(states, plan)
+    share = np.max(np.abs(off) / scale, axis=1)
+    beyond = ~(share <= TOLERANCE)
+    if not beyond.any():
+        return ""
+    knot = int(np.argmax(beyond))
+    if not np.isfinite(share[knot]):
+        return f"does not get beyond {(knot - 1) * dt:.4g} s of the plan"
+    text = f"LEAVES the plan at {knot * dt:.4g} s: {worst_of(space, off[knot], scale, TOLERANCE)}"
+    if knot and share[knot - 1] <= ABRUPT:
+        text += (
+            f"; a period before, no state was off by more than {share[knot - 1]:.1g} of its range: that step jumps, as"
+            " where a contact or a limit begins, and a rounding error decides which way"
+        )
+    return text
 
 
 def tracking_unit(space: Coordinates) -> str:
@@ -95,19 +128,46 @@ class Target:
 
     @property
     def unit(self) -> str:
-        """Unit of `distance`: m, or OF_RANGE."""
-        return "m" if self.places else OF_RANGE
+        """Unit of `distance`: m, or OF_WAY."""
+        return "m" if self.places else OF_WAY
+
+    @cached_property
+    def scale(self) -> Array:
+        """What the scaled error divides the difference of each state by, (n,).
+
+        It is the state's way, from the start of the plan to the goal. A state whose way is within TOLERANCE of its
+        range along the plan, or ASIDE of the longest way in its unit, starts at its goal: it has its range, and at
+        least the longest way in its unit. If no state in that unit has a way, it has at least their largest range, and
+        1 rad. If all states start at their goals there is nothing to be relative to, and each has at least 1 unit.
+        """
+        counts, start, ranges = np.isfinite(self.state), self.plan[0], np.ptp(self.plan, axis=0)
+        way = np.abs(self._off(start)) * (np.abs(self._off(start)) > NEGLIGIBLE)
+        units = np.array(self.space.units)
+        alike = (units[:, None] == units) & (units != "") & counts | np.eye(len(units), dtype=bool)
+        moves = counts & (way > np.maximum(TOLERANCE * ranges, ASIDE * (alike * way).max(axis=1)))
+        longest = (alike * np.where(moves, way, 0.0)).max(axis=1)
+        least = np.where(longest > 0, longest, (alike * ranges).max(axis=1))
+        least = np.where((longest == 0) & (units == "rad"), np.maximum(least, 1.0), least)
+        if (way <= STAYS * ranges).all():
+            least = np.maximum(least, 1.0)
+        scale = np.where(moves, way, np.maximum(ranges, least))
+        return np.where(scale > NEGLIGIBLE, scale, 1.0)
+
+    def _off(self, states: Array) -> Array:
+        """Differences (..., n) of states from the target, zero in the states that do not count.
+
+        Those keep their value in between, because the turns of a rotation vector follow from all three entries.
+        """
+        counts = np.isfinite(self.state)
+        return np.where(counts, self.space.difference(states, np.where(counts, self.state, states)), 0.0)
 
     def distance(self, states: Array) -> Array:
         """Distance (...) of states (..., n) from the target; NaN for states that are not finite."""
         state = self.state
         if self.places:
             return np.linalg.norm(states[..., self.places] - state[self.places], axis=-1)
-        counts = np.isfinite(state)
-        # States that do not count keep their value, because the turns of a rotation vector follow from all three
-        # entries.
-        apart = self.space.difference(states, np.where(counts, state, states)) / scale_of(self.plan)
-        return np.max(np.abs(apart[..., counts]), axis=-1)
+        apart = np.max(np.abs(self._off(states)) / self.scale, axis=-1)
+        return np.where(np.isfinite(states).all(axis=-1), apart, np.nan)
 
     def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: float | None) -> float:
         """The distance within which the target counts as reached.
@@ -133,7 +193,7 @@ class Target:
         if goal_radius is not None:
             names = ", ".join(self.space.names)
             raise InputError(
-                f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, relative to the plan's range: the"
+                f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, relative to the way: the"
                 f" {self.name} has no position among {names}"
             )
         if goal_tolerance is not None:
@@ -170,28 +230,24 @@ class Target:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
         within = "" if radius is None else f", which is reached within {radius:.3g}{' m' if self.places else ''}"
-        worst = self.worst(self.plan[-1])
-        lines = [f"the plan ends {self.describe(away)}{within}{f': {worst} off' if worst else ''}"]
+        worst = self.worst(self.plan[-1], radius)
+        lines = [f"the plan ends {self.describe(away)}{within}{f': {worst}' if worst else ''}"]
         if self.misses(TOLERANCE * float(self.distance(self.plan[0])) if radius is None else radius):
             by = "" if radius is not None else f" by more than {TOLERANCE:.0%} of the way"
             mend = "raise the weights of the final cost or the number of steps"
             lines.append(f"the plan MISSES the goal{by}; to mend that, {mend}")
         return lines
 
-    def worst(self, state: Array) -> str:
-        """The state that counts and is farthest from the target, and by how much.
+    def worst(self, state: Array, radius: float | None) -> str:
+        """The state that counts and is farthest from the target, by how much, and how far it may be.
 
         Empty for a target with a position, and for a state that is at the target.
 
         Args:
           state: (n,), finite.
+          radius: the scaled error within which the target counts as reached; None if it is not known.
         """
-        if self.places:
-            return ""
-        counts = np.isfinite(self.state)
-        # As in `distance`: a rotation vector whose entries count in part may be off in the others.
-        off = np.where(counts, self.space.difference(state, np.where(counts, self.state, state)), 0.0)
-        return worst_of(self.space, off, scale_of(self.plan))
+        return "" if self.places else worst_of(self.space, self._off(state), self.scale, radius)
 
 
 def endings(

@@ -13,11 +13,17 @@ from lqrsim.errors import Array, InputError, check_count, check_symmetric, excer
 from lqrsim.results import notebook
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.fields import Bounds, Line, check_fields, repr_of
-from lqrsim.results.goal import OUTCOMES, Target, endings, scale_of, tracking_error, tracking_unit, worst_of
+from lqrsim.results.goal import OUTCOMES, Target, departure, endings, scale_of, tracking_error, tracking_unit, worst_of
 from lqrsim.results.solution_parts import Trajectory
 
 LISTED = 10  # largest number of trials in a summary, as in a notebook
 MOVED = "goal moved during the run"  # among the disturbances of a run
+
+# MuJoCo's warnings, in the order of mjtWarning.
+WARNINGS = (
+    "nearly singular inertia matrix", "too many contacts for its memory", "too many constraints for its memory",
+    "position not finite", "velocity not finite", "acceleration not finite", "control not finite",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,6 +151,9 @@ class Rollout:
       balls: positions of the robot's balls, if it has balls and frames were recorded; else None.
       obstacle_geoms: (obstacles,) numbers of the geoms of `model` that are displaced by `displaced`; None if unknown.
       moving: further obstacles, which moved; None without any.
+      warnings: (K, 7) how often MuJoCo warned of each of WARNINGS, until the trial was unstable; None if unknown.
+      undisturbed: (T+1, n) states of the plan's own policy in an undisturbed run; NaN once it has ended. None if that
+        was not run: with a controller of another kind where the plan is of a model, and not of MuJoCo's own steps.
       controller_run: the controller's run (`ControllerRun`) with its records: the estimates of an `OffsetFree`, the log
         of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
@@ -185,6 +194,8 @@ class Rollout:
     balls: BallRecord | None = None
     obstacle_geoms: Annotated[npt.NDArray[np.int64], "obstacles", Bounds(at_least=0)] | None = None
     moving: MovingObstacles | None = None
+    warnings: Annotated[npt.NDArray[np.int64], "K 7", Bounds(at_least=0)] | None = None
+    undisturbed: Annotated[Array, "T+1 n"] | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -394,12 +405,34 @@ class Rollout:
             lines.append("  trials are to reach the goal where it was last; the plan was made for another")
         else:
             lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
+        if self.undisturbed is not None and (left := self.departure()):
+            lines.append(f"  undisturbed, the plan's policy {left}")
+        if warned := self.warned():
+            lines.append(f"  MuJoCo warned {warned}")
         if self.trials > 1:
             counted = Counter(self.outcome)
             each = ", ".join(f"{counted[one]} {one}" for one in OUTCOMES if counted[one])
             lines.append(f"  {self.trials} trials: {each}")
         lines += [f"  {self._line(k)}" for k in range(min(self.trials, LISTED))]
         return "\n".join([*lines, f"  and {self.trials - LISTED} more"] if self.trials > LISTED else lines)
+
+    def departure(self) -> str:
+        """Where the undisturbed run of the plan's own policy leaves the plan, as text; empty if it does not.
+
+        It leaves the plan where a state is off by more than a tenth of the largest range along the plan in its unit.
+        """
+        if self.undisturbed is None:
+            return ""
+        return departure(self.state_coordinates, self.undisturbed, self.plan.states, self.plan.dt)
+
+    def warned(self) -> str:
+        """How often MuJoCo warned, in how many trials and of what, as text; empty if it did not."""
+        if self.warnings is None or not self.warnings.any():
+            return ""
+        each = [f"{what} ({n})" for what, n in zip(WARNINGS, self.warnings.sum(axis=0), strict=True) if n]
+        trials = f" in {(self.warnings > 0).any(axis=1).sum()} of {self.trials} trials" if self.trials > 1 else ""
+        count = int(self.warnings.sum())
+        return f"{count} time{'s' if count > 1 else ''}{trials}: {', '.join(each)}"
 
     def _line(self, k: int) -> str:
         outcome, counts, name = self.outcome[k], self.counts[k], f"trial {self.first_trial + k}"
@@ -412,7 +445,7 @@ class Rollout:
             what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
             how, final = f"{outcome}{what} {when}", ""
         else:
-            worst = self.target.worst(self.states[k, -1])
+            worst = self.target.worst(self.states[k, -1], self.goal_radius)
             how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}{f' ({worst})' if worst else ''}"
             final = f", final {self.tracking_error[k, -1]:.3g}"
         error, unit = self.tracking_error[k, counts], self.tracking_unit

@@ -45,6 +45,8 @@ LATER = {
     (FailureCertificate, "keep"),
     (Rollout, "moving"),
     (Rollout, "obstacle_geoms"),
+    (Rollout, "undisturbed"),
+    (Rollout, "warnings"),
     (Solution, "problem_parts"),
 }
 

@@ -214,6 +214,9 @@ class MjcfDynamics(Dynamics):
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 
+    def quiet(self) -> contextlib.AbstractContextManager[None]:
+        return unlogged()
+
     @contextlib.contextmanager
     def solving(self, threads: int) -> Iterator[None]:
         """In this context, that many threads linearise together, and MuJoCo does not print what statuses report.

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, input_names, ranges
+from lqrsim.scenes.scene import unlogged
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
 _STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients
@@ -20,10 +21,8 @@ _HEAVY = 1e2  # weight of the force that a limit cuts off: actuators do not push
 _FAR = 2.0 ** np.arange(-3, 20)  # distances at which an activation may be at rest
 _DRIFTS = 2  # mode of an activation that cannot rest
 _REST, _TIGHT = 1e-7, 1e-4  # what is no rate, relative; weight of rates that may be left over
-_SCALES, _NEAR = (
-    10.0 ** np.arange(13),
-    0.1,
-)  # relative lengths of a step that bounds make; 1 / (1 + square) of a right one
+_SCALES = 10.0 ** np.arange(13)  # relative lengths of a step that bounds make
+_NEAR = 0.1  # 1 / (1 + square) of a right one
 _END = 1e-9  # relative distance from the end of its range within which an activation is there
 _RATHER, _RANK = 1e3, 1e-6  # preference for joints without actuators as those that follow, and what is no slope
 _NEWTON, _SMALL = 100, 1e-7  # largest number of steps to a settled position; m or rad of difference quotients
@@ -174,6 +173,7 @@ class _AtRest:
         return np.asarray((self.moments.T @ linear.forces_by).any(axis=1))
 
 
+@unlogged()
 def holding(model: mujoco.MjModel, qpos: Array) -> Holding:
     """The controls with which nothing accelerates at rest and activations stay, at positions (nq,).
 
@@ -457,6 +457,7 @@ def _owners(size: int, first: npt.NDArray[np.int32], count: npt.NDArray[np.int32
     return found
 
 
+@unlogged()
 def settled(model: mujoco.MjModel, qpos: Array) -> tuple[Array, float]:
     """Positions (nq,) nearby at which the undriven joints are at rest, and the largest force (N, N m) left on them.
 
@@ -509,6 +510,7 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
     return kept, moves.T
 
 
+@unlogged()
 def efforts(model: mujoco.MjModel) -> Array:
     """The largest size of each control, (nu,): from its own limits, else from its force's; 1 without limits."""
     found = np.ones(model.nu)

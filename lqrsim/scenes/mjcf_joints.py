@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_name
+from lqrsim.scenes.scene import unlogged
 
 _KINDS = {
     mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",
@@ -238,6 +239,7 @@ def posed(model: mujoco.MjModel, positions: Iterable[Array]) -> Iterator[mujoco.
         yield data
 
 
+@unlogged()
 def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
     """The names of the bodies that touch, each pair once."""
     data = placed(model, qpos)
@@ -271,6 +273,7 @@ class Equalities:
         self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
         self._data = mujoco.MjData(self.model)
 
+    @unlogged()
     def at(self, qpos: Array) -> tuple[Array, Array]:
         """How far they are off at positions (nq,), (k,) in m or rad, and the derivatives by the velocities, (k, nv)."""
         data = self._data

@@ -13,7 +13,7 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.scenes.scene import model_from_xml
+from lqrsim.scenes.scene import model_from_xml, unlogged
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
@@ -192,7 +192,8 @@ def _placed(model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:
     for state in states:
         data.qpos[:] = unturned
         mujoco.mj_integratePos(model, data.qpos, state[: model.nv], 1.0)
-        mujoco.mj_fwdPosition(model, data)
+        with unlogged():
+            mujoco.mj_fwdPosition(model, data)
         yield data
 
 

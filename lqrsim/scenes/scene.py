@@ -21,6 +21,7 @@ import math
 import os
 import re
 import threading
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -254,6 +255,14 @@ def unlogged() -> Iterator[None]:
             _count -= 1
             if _count == 0 and _before is not None:
                 _before.set()
+
+
+@unlogged()
+def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a spec, which has been compiled before: warnings about it were given, or are counted in runs."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return spec.compile()
 
 
 def free_name(name: str, taken: Collection[str]) -> str:

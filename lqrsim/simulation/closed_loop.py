@@ -72,7 +72,7 @@ def simulate(
       first_trial: number of the first trial. Trial `i` of a seed is bit-identical, whatever other trials run with it.
       goal_radius: distance in metres within which the goal counts as reached; by default the robot's radius, or a tenth
         of the distance to the goal if the plan starts within the radius.
-      goal_tolerance: the tolerance for goals without a position, relative to the plan's range; 0.1 by default.
+      goal_tolerance: the tolerance for goals without a position, relative to each state's way; 0.1 by default.
         `results/goal.py` has the details.
       frames: whether to record the data for drawing, including times between the control periods; needed for a video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on. If False, the robot
@@ -121,7 +121,29 @@ def _run(settings: RunSettings) -> Rollout:
     loop = ClosedLoop(settings)
     with unlogged():
         loop.run()
-    return loop.rollout()
+    return loop.rollout(undisturbed=_undisturbed(loop))
+
+
+def _undisturbed(loop: "ClosedLoop") -> Array | None:
+    """States (T+1, n) of the plan's own policy without disturbances, NaN once that run has ended; None if unknown.
+
+    A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
+    plant repeats, there is a further run; the plant remembers it until another plan runs there.
+    """
+    settings, plant, plan = loop.settings, loop.settings.plant, loop.settings.followed
+    if settings.starts is not None or settings.moving is not None:
+        return None
+    if not settings.acting and settings.law.digest == plan.policy.digest:
+        loop.records.turn_to_plan(settings.states)
+        ended = min(loop.collisions.at[0], loop.records.time_of(loop.records.lost_since)[0])
+        return np.where(plan.trajectory.times[:, None] < ended, loop.records.states[0], np.nan)
+    if not plant.robot.dynamics.discrete or plant.simulator is not None:
+        return None
+    which = plan.policy.digest, plan.trajectory.states.tobytes()
+    if plant.ran is None or plant.ran[:2] != which:
+        alone = RunSettings(plant=plant, plan=plan, controller=plan.policy, frames=False, threads=1)
+        plant.ran = (*which, _run(alone).undisturbed)
+    return plant.ran[2]
 
 
 class ClosedLoop:
@@ -135,6 +157,7 @@ class ClosedLoop:
       controller_run: the run of the controller.
     """
 
+    @unlogged()
     def __init__(self, settings: RunSettings) -> None:
         self.settings = settings
         plant, plan, trials = settings.plant, settings.trajectory, settings.trials
@@ -143,8 +166,7 @@ class ClosedLoop:
         first = self.effects.initial_states(np.tile(settings.whole.states[0], (trials, 1)), settings.starts)
         self.physics.place(first)
         self.effects.alter_models(self.physics)
-        with unlogged():
-            self.physics.prepare(altered=self.effects.alters_models)
+        self.physics.prepare(altered=self.effects.alters_models)
         name = f"{type(settings.law).__name__}.start"
         self.controller_run = check_kind(name, settings.law.start(trials), ControllerRun, "a ControllerRun returned")
         self.records = Recorder(plan, trials)
@@ -280,8 +302,8 @@ class ClosedLoop:
             twin.records.fail(self.step, np.ones(trials, dtype=bool), ["went no further"] * trials)
         return twin.rollout()
 
-    def rollout(self) -> Rollout:
-        """A Rollout of all records."""
+    def rollout(self, *, undisturbed: Array | None = None) -> Rollout:
+        """A Rollout of all records, with the states of an undisturbed run."""
         settings, records, collisions = self.settings, self.records, self.collisions
         plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
         moved = self.controller_run.moved_goal()
@@ -327,6 +349,8 @@ class ClosedLoop:
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
             obstacle_geoms=plant.obstacle_geoms,
+            warnings=self.physics.warnings if plant.simulator is None else None,
+            undisturbed=undisturbed,
             moving=_record_of(settings.moving, settings.knot * plan.dt),
             controller_run=self.controller_run,
         )

@@ -118,6 +118,7 @@ class MujocoPhysics(Physics):
         self._wrench[:, self.plant.body] = wrench
         if self.solidifies:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
+            self._had_warned = self.warnings.copy()
         return self._run(None)
 
     def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
@@ -140,8 +141,7 @@ class MujocoPhysics(Physics):
 
     def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
         self.simulations.state[rows] = self._before[rows]
-        self.simulations.warning[rows] = 0
-        self.unstable[rows] = self._was_unstable[rows]
+        self.unstable[rows], self.warnings[rows] = self._was_unstable[rows], self._had_warned[rows]
         for values, ids, solid in self._inactive:
             values[np.ix_(rows, ids)] = solid[rows]
         if self.senses_contacts:
@@ -170,7 +170,9 @@ class MujocoPhysics(Physics):
             # MuJoCo resets an unstable simulation and continues; only its warnings show it.
             warned = self.simulations.warning[..., 1]
             if warned.any():
+                self.warnings += np.where(self.unstable[:, None], 0, warned)
                 self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
+                self.simulations.warning[:] = 0
             if self.unstable.any():
                 period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
             period.states.append(self.state())

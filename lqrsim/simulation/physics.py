@@ -9,6 +9,7 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.errors import Array, InputError
+from lqrsim.results.rollout import WARNINGS
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator, states_of
 
@@ -40,6 +41,7 @@ class Physics(abc.ABC):
       parts: S, parts of a control period. drawn_parts: number of parts that end with a frame to draw.
       senses_contacts: whether contacts are sensed without a force. solidifies: whether obstacles may become solid.
       unstable: (K,) whether a simulation has become unstable.
+      warnings: (K, 7) number of MuJoCo's warnings of each kind, as in a `Rollout`.
     """
 
     senses_contacts = False
@@ -50,6 +52,7 @@ class Physics(abc.ABC):
         self._every = part_of(plant, substeps) // part
         self.drawn_parts = self.parts // self._every
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
+        self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
 
     @abc.abstractmethod
     def place(self, states: Array) -> None:

@@ -20,7 +20,7 @@ from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
-from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
+from lqrsim.scenes.scene import Scene, compiled, free_name, obstacle_geoms, unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
@@ -61,6 +61,7 @@ class Plant:
         moved = "MuJoCo" if self.simulator is None else self.simulator.name
         return f"Plant({self.robot.name} in scene {self.scene.name}, moved by {moved})"
 
+    @unlogged()
     def __init__(self, robot: Robot, scene: Scene, simulator: Simulator | None = None) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
@@ -71,6 +72,8 @@ class Plant:
         plant_validation.check_names(robot, scene)
         self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, in place of the timestep of the MJCF
+        # The last undisturbed run of a plan's own policy: hash of the policy, the plan's states, and the run's.
+        self.ran: tuple[str, bytes, Array | None] | None = None
         if robot.geoms is not None and not robot.geoms.of_scene(scene):
             raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
@@ -304,7 +307,7 @@ class Plant:
         try:
             spec = mujoco.MjSpec.from_string(self.scene.xml)
             # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
-            again = spec.compile()
+            again = compiled(spec)
         except (ValueError, mujoco.FatalError) as error:
             raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
         had, has = self.scene.model, again
@@ -340,7 +343,7 @@ class Plant:
                 # The items to report, their order, and their number.
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
-        return spec.compile()
+        return compiled(spec)
 
 
 def extent(plant: Plant) -> float:

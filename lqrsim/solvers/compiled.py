@@ -225,7 +225,8 @@ def rollout(
     steps = len(gain)
     states, controls = np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1]))
     policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Motion(states, controls)
-    core(problem).rollout(steps, in_c_order(state), policy, model, plan)
+    with problem.dynamics.quiet():
+        core(problem).rollout(steps, in_c_order(state), policy, model, plan)
     return states, controls
 
 

@@ -24,7 +24,7 @@ from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
-from lqrsim.scenes.scene import free_name
+from lqrsim.scenes.scene import compiled, free_name
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
@@ -95,7 +95,7 @@ def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, st
     kind = mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE
     size = np.array([radius, 0.1 * radius if flat else 0.0, 0.0])
     body.add_geom(type=kind, size=size, rgba=GOAL_RGBA, contype=0, conaffinity=0)
-    return spec.compile(), name
+    return compiled(spec), name
 
 
 class ViewedReplanner(Controller):
