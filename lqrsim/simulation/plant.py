@@ -152,6 +152,7 @@ class Plant:
         period = check_number("control period", period, above=0.0)
         other = copy.copy(self)
         vars(other).pop("without_contacts", None)
+        other.ran = None
         other._step = period / max(1, math.ceil(period / self.timestep - 1e-6))
         other.model = other._compile()
         return other
