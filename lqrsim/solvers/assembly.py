@@ -10,7 +10,7 @@ from lqrsim.errors import Array, printable
 from lqrsim.problem.collision_shape import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.fields import LINE
-from lqrsim.results.goal import Target
+from lqrsim.results.goal import Target, departure
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
@@ -20,6 +20,8 @@ from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.settings import can_be_exact
 from lqrsim.versions import versions
 
+# The policies of plans through contacts are run from this many starts that differ by this much in each state.
+BESIDE, LITTLE = 8, 1e-9
 FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
@@ -58,7 +60,7 @@ def assemble(
     return Solution._assembled(
         later,
         status=found.status,
-        detail="; ".join(part for part in (found.detail, _usable(found, options)) if part),
+        detail="; ".join(part for part in (found.detail, _usable(found, options), _fragile(problem, found)) if part),
         remedy=remedy_of(problem, found, log, options),
         policy=policy(*law, nominal[:-1]),
         cost_to_go=copy_of(found.values.get("cost_to_go")),
@@ -102,6 +104,22 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
         "the plan can be used, for it keeps dynamics, limits and constraints; its cost could still fall by a relative"
         f" {plan.optimality:.1e}{wanted}"
     )
+
+
+def _fragile(problem: Problem, found: RunResult) -> str:
+    """Where the policy leaves the plan from a start that differs by rounding, in words; or empty.
+
+    Where a contact begins or ends, a step may jump, and rounding decides which way. Only then is it looked at.
+    """
+    states, space = found.states, problem.dynamics.state_coordinates
+    if not problem.dynamics.discrete or not np.isfinite(states).all() or not problem.dynamics.touches(states):
+        return ""
+    for draw in range(BESIDE):
+        signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))
+        run, _ = compiled.rollout(problem, *found.law, states[0] + LITTLE * signs)
+        if said := departure(space, run, states, problem.dt):
+            return f"from a start that differs by {LITTLE:g} in each state, the policy {said}"
+    return ""
 
 
 def remedy_of(problem: Problem, found: RunResult, log: Sequence[Iteration], options: dict[str, object]) -> str:
