@@ -10,11 +10,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from actuated import Rest, draw
 
 import lqrsim as ls
 from lqrsim.errors import InputError
 from lqrsim.scenes.scene import scene_from_xml, unlogged
-from tests.helpers.actuated import Rest, draw
 
 STAYS = 1e-4  # rad or m within which a held robot stays for 2 s
 MORE = 1.02  # ratio of the norms of what two searches leave, of which the larger is no least

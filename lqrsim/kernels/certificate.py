@@ -25,9 +25,9 @@ from lqrsim.kernels.rollouts import larger
 # A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
 # that an optimal cost of zero leaves.
 SQUARES = 1e-28
-# Where a control block has no curvature, a weight on changes of controls takes its place: this part of the typical cost
-# for a change by a control's size. A block has none if it is definite only by this part of the largest so far.
-WEIGHT, NO_CURVATURE = 1e-2, 1e-9
+# A control block that is definite by less than this part of its own largest curvature gets as much more. If that is less
+# than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
+OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-24, 1e-2
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
@@ -36,7 +36,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
     The predicted decrease is `1/2 sum e' E^-1 e`, with the gradients e of the cost in the offsets of the policy while
     later controls respond with its gains, and E = R + B'SB with the Hessians S of the cost-to-go. It equals the
     prediction of a Riccati pass about the plan if the gains are from that pass. Controls go no further than their
-    limits. Where E is singular, as for a control that costs nothing, a weight on changes takes its place. Cost and
+    limits. Where E is singular, as for a control that costs nothing, it gets a little more. Cost and
     decrease include the expected cost of noise; the decrease includes the augmented Lagrangian, the cost does not.
 
     Args:
@@ -178,8 +178,8 @@ def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
       costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
 
     Returns:
-      The decrease, 0 where E has no curvature; there the squares of the slopes along changes by the controls' sizes,
-      else 0; and the largest curvature.
+      The decrease, 0 if E has no curvature; then the squares of the slopes along changes by the controls' sizes, else 0;
+      and the largest curvature.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
     slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
@@ -205,9 +205,14 @@ def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
     copy(before, N, costate)
+    own = 0.0
     for i in range(M):
-        largest = larger(largest, 0.5 * factor[i, i] * sizes[N + i] * sizes[N + i])
-    if is_curved(factor, sizes, NO_CURVATURE * largest):
+        own = larger(own, 0.5 * factor[i, i] * sizes[N + i] * sizes[N + i])
+    largest = larger(largest, own)
+    if own > OF_PLAN * largest:
+        if not is_curved(factor, sizes, OF_BLOCK * own):
+            for i in range(M):
+                factor[i, i] += 2 * OF_BLOCK * own / (sizes[N + i] * sizes[N + i])
         return box_decrease(factor, slope, room.low, room.high, moved), 0.0, largest
     squares = 0.0
     for i in range(M):

@@ -30,6 +30,7 @@ HOOKS |= {
     "solving",
     "softened",
     "touches",
+    "untouched_body",
     "contact_modes",
     "check_period",
     "ControllerRun.control",
