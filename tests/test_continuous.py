@@ -228,6 +228,7 @@ def test_costs_that_are_not_quadratic_at_the_ends() -> None:
     np.testing.assert_allclose(found.u_hat(1.0), np.polynomial.chebyshev.chebval(0.0, best.x[2:]), rtol=0, atol=5e-3)
 
 
+@pytest.mark.long
 def test_converged_means_what_it_says(differential_drive: ls.Scenario) -> None:
     """Sec. V-C: at convergence to 1e-9, Eq. (22) holds to 1e-5, and the total cost is the true cost at all times."""
     seen: list[ls.types.Iteration] = []

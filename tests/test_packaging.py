@@ -85,6 +85,7 @@ assert ls.load("solution.npz", ls.Solution).cost == solution.cost
 """
 
 
+@pytest.mark.long
 def test_solves_without_optional_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From formulas to a file, with nothing cached; some 5 s."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

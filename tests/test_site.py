@@ -50,6 +50,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_site_is_whole_without_a_network(site: Path) -> None:
     for page in site.rglob("*.html"):
         assert not FETCHED.search(page.read_text(encoding="utf-8")), page
@@ -67,6 +68,7 @@ def test_site_is_whole_without_a_network(site: Path) -> None:
     assert "lqrsim.simulate" in index
 
 
+@pytest.mark.long
 def test_every_link_of_the_site_leads_somewhere(site: Path) -> None:
     pages = {page: page.read_text(encoding="utf-8") for page in site.rglob("*.html")}
     ends = {page: set(re.findall(r'\bid="?([^"\s>]+)', text)) for page, text in pages.items()}

@@ -25,8 +25,8 @@ from lqrsim.kernels.rollouts import larger
 # A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
 # that an optimal cost of zero leaves.
 SQUARES = 1e-28
-# A control block that is definite by less than this part of its own largest curvature gets as much more. If that is less
-# than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
+# A control block that is definite by less than this part of its own largest curvature gets as much more. If its own is
+# less than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-24, 1e-2
 
 
@@ -178,8 +178,8 @@ def predicted_decrease(step, stage, gain, S, room, sizes, largest, costate):
       costate: (N,) at t + 1, overwritten by the costate at t; controls respond with the gain, but not at a limit.
 
     Returns:
-      The decrease, 0 if E has no curvature; then the squares of the slopes along changes by the controls' sizes, else 0;
-      and the largest curvature.
+      The decrease, 0 if E has no curvature; the squares of the slopes along changes by the controls' sizes, 0 if E has
+      curvature; and the largest curvature.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
     slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
