@@ -27,7 +27,7 @@ from lqrsim.kernels.rollouts import larger
 SQUARES = 1e-28
 # A control block that is definite by less than this part of its own largest curvature gets as much more. If its own is
 # less than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
-OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-24, 1e-2
+OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
