@@ -123,7 +123,7 @@ class Ladder:
         best = best.kept()
         self._point.without_multipliers()
         self._run.work.take(best.states, best.controls, best.cost)
-        found = self._run.newton(detail=best.detail)
+        found = self._run.newton(detail=best.detail, patient=True)
         if found.success and found.violation == 0:
             self._remember(replace(found, multipliers=()))
 
