@@ -205,21 +205,6 @@ class WeightedStep(NamedTuple):
     weights: Arrays
 
 
-class ConstraintRows(NamedTuple):
-    """All values of all constraints, `size` rows at each step.
-
-    Attributes:
-      first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
-      multipliers: ((T+1) size,); multipliers up to `least` count as zero.
-    """
-
-    size: int
-    least: float
-    first: Arrays
-    support: Arrays
-    multipliers: Arrays
-
-
 class StageModels(NamedTuple):
     """Models of all stages at a plan, which need not satisfy the dynamics.
 
@@ -237,24 +222,165 @@ class StageModels(NamedTuple):
     slopes: Arrays
 
 
-class ActiveRows(NamedTuple):
-    """An active set: the rows of all constraints and control limits, `size` at each step.
+class StageRows(NamedTuple):
+    """The rows of all constraints, then those of the control limits, `size` at each step.
 
     Attributes:
-      table: (size, 6) properties of each row; see `stages.py`.
-      live, held: ((T+1) size,) 1 for rows that act, and for rows in the active set, else 0.
-      numbers: their values. force: their multipliers. pressing: their multipliers after a step.
-      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
+      table: (size, 7) properties of each row; see `stages.py`.
+      first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
+      live, held: ((T+1) size,) 1 for rows that act, and for rows that are fixed at their target, else 0.
+      numbers: ((T+1) size,) values. force: ((T+1) size,) multipliers.
     """
 
     size: int
     table: Arrays
+    first: Arrays
+    support: Arrays
     live: Arrays
     held: Arrays
     numbers: Arrays
     force: Arrays
+
+
+class PlanStages(NamedTuple):
+    """A problem as stages about a plan: its numbers, its models and rows, and the last step.
+
+    Attributes:
+      steps: T. soft: 1 if there is an initial cost. free: (N,) 0 for the states that the start fixes, else 1.
+      reach: (N,) distances from the start to the goal. state_size, control_size: (N,) and (M,) typical sizes.
+      projected: (1,) 1 if the projected Hessians are those of the last plan.
+      values: a vector for each constraint.
+      policy, to_go, changes: see `direction` of `stages.py`.
+    """
+
+    steps: int
+    soft: int
+    free: Arrays
+    reach: Arrays
+    state_size: Arrays
+    control_size: Arrays
+    projected: Arrays
+    model: ProblemModel
+    values: Any
+    rows: StageRows
+    models: StageModels
+    policy: Policy
+    to_go: CostToGo
+    changes: Motion
+
+
+class RowWork(NamedTuple):
+    """Numbers of rows, ((T+1) size,) each, while an active set is sought.
+
+    Attributes:
+      curves, forces: see `direction` of `stages.py`. pressing: multipliers after a step.
+      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
+    """
+
+    curves: Arrays
+    forces: Arrays
     pressing: Arrays
     wrong: Arrays
+
+
+class Slacks(NamedTuple):
+    """The two slacks of each row d, or numbers that belong to these: `d = slack - excess`, ((T+1) size,) each.
+
+    A row without a price has no excess, and an equality without a price has neither.
+    """
+
+    slack: Arrays
+    excess: Arrays
+
+
+class PlanPoint(NamedTuple):
+    """A plan, the states at which its steps arrive (T, N), the values of its rows ((T+1) size,), and their slacks."""
+
+    plan: Motion
+    arrived: Arrays
+    numbers: Arrays
+    slacks: Slacks
+
+
+class PlanStep(NamedTuple):
+    """A step in plan, slacks and multipliers ((T+1) size,), and the costates (T+1, N) after it."""
+
+    changes: Motion
+    slacks: Slacks
+    force: Arrays
+    costates: Arrays
+
+
+class PlanBeginning(NamedTuple):
+    """What an interior point begins with.
+
+    Attributes:
+      plan: within the limits of its controls. known: ((T+1) size,) multipliers. informed: whether these are known.
+      barrier: the first barrier parameter of each row, as a fraction of the cost divided by the number of rows.
+      room: the least first slack, relative to a row's size.
+    """
+
+    plan: Motion
+    known: Arrays
+    informed: bool
+    barrier: float
+    room: float
+
+
+class InteriorArrays(NamedTuple):
+    """All arrays of an interior point, with K = (T+1) size rows.
+
+    Attributes:
+      now: the iterate. costates: (T+1, N) there. gaps: (T, N) there.
+      tried, closer: trials of a line search. kept, kept_force, kept_costates: a point to go back to.
+      step: the step of an iteration. other: another that may take its place.
+      curves, forces: (K,) see `direction` of `stages.py`.
+      corrections, others: corrections of the products of slacks and multipliers.
+      beyond: (K,) further residuals of the rows. wider: (T, N) further gaps.
+      filter: (any, 2) violations and merits that a trial must not both exceed. errors: (LATELY,) the last errors.
+    """
+
+    now: PlanPoint
+    costates: Arrays
+    gaps: Arrays
+    tried: PlanPoint
+    closer: PlanPoint
+    kept: PlanPoint
+    kept_force: Arrays
+    kept_costates: Arrays
+    step: PlanStep
+    other: PlanStep
+    curves: Arrays
+    forces: Arrays
+    corrections: Slacks
+    others: Slacks
+    beyond: Arrays
+    wider: Arrays
+    filter: Arrays
+    errors: Arrays
+
+
+class RestorationArrays(NamedTuple):
+    """All arrays of a restoration, with K = (T+1) size rows.
+
+    Attributes:
+      plan: the iterate, a trajectory. trial: of the line search. limits: of the controls in one step, (T, M) each.
+      costates: (T+1, N). gaps: (T, N) zero. arrived: (T, N) and numbers: (K,) of the trial.
+      curves: (K,) see `direction` of `stages.py`. duals, aims: (K,) multipliers, and those after the whole step.
+      shares: (K,) multipliers relative to the price.
+    """
+
+    plan: Motion
+    trial: Motion
+    limits: Limits
+    costates: Arrays
+    gaps: Arrays
+    arrived: Arrays
+    numbers: Arrays
+    curves: Arrays
+    duals: Arrays
+    aims: Arrays
+    shares: Arrays
 
 
 class EliminatedControl(NamedTuple):
@@ -609,6 +735,44 @@ MEMORY = _row(
     "final_gap", "started", "watched", "share", "failed", "decrease", "promised", "negligible", "least", "damping",
     "patient",
 )  # fmt: skip
+
+# The state of an interior point between calls.
+# cost, stationarity, violation, gap, complementarity: the measures of the iterate; see `interior_point.Measures` of the
+# solvers. miss: largest difference of a row's value and its slacks, relative to the row's size. product: largest product
+# of a slack and its multiplier. scale: the cost to which measures are relative. typical: the typical cost of a change.
+# parameter, highest, barrier: the barrier parameter; its largest value; and that as a fraction of the cost of a row.
+# pairs: number of slacks. elastic: 1 if a row has a price.
+# rung: that of the step's models on the ladder of regularisation. share: fraction of the projected Hessian in these.
+# soft: softness of equalities. part: the fraction of the last step that was taken. forced: number of steps that were
+# taken although the filter rejected them. filtered, failed: numbers of rows of the filter and of the last errors.
+# farthest, farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the
+# cost of its trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier
+# falls. since: number of iterations since the last attempt to cross over. short: number of short steps in a row.
+# before: cost at the first of these. kept, kept_scale: cost and scale of the point to go back to.
+INTERIOR = _row(
+    "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
+    "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed", "farthest",
+    "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before", "kept",
+    "kept_scale",
+)  # fmt: skip
+
+# The measures of an iteration of the interior point.
+MEASURES = _row("cost", "stationarity", "violation", "gap", "complementarity")
+
+# The state of a restoration between calls.
+# rows: number of rows that act. parameter, least: the barrier parameter, and its least value. damping: of the steps.
+# level: the predicted decrease that is negligible. cost, merit, decrease: of the iterate, and the predicted slope of its
+# merit. promised: its predicted decrease, relative to the merit. part: the fraction of the step that was accepted; 0 for
+# none. violation, near: of the iterate, and whether it is nearly feasible. close: number of times in a row that it was,
+# and its cost `before` hardly different. informed: 1 once multipliers are known. looking: 1 if the last iteration is not
+# yet completed.
+RESTORATION = _row(
+    "rows", "parameter", "least", "damping", "level", "cost", "merit", "decrease", "promised", "part", "violation",
+    "near", "close", "before", "informed", "looking",
+)  # fmt: skip
+
+# An iteration of a restoration.
+RESTORED = _row("cost", "violation", "promised")
 
 # A row of the log; NaN where something was not computed.
 LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")

@@ -1,13 +1,11 @@
-"""Models of all stages of a plan, and the step to their minimum, with or without an active set.
+"""Models of all stages of a plan, which need not satisfy the dynamics, and the step to their minimum.
 
-Written in the kernels' subset.
-
-The plan need not satisfy the dynamics. The gap between the end of a step and the next state is closed by the
-iterations. The rows are those of all constraints, then the limits of the controls. An active set fixes some of them at
-zero. `solvers/interior_point.py`, `solvers/active_set.py` and `solvers/restoration.py` describe the methods.
+Written in the kernels' subset. The gap between the end of a step and the next state is closed by the iterations. The
+rows are those of all constraints, then the limits of the controls. What a method does with the rows is a curvature
+across each, and a force along it: see `interior_point.py`, `active_set.py` and `solvers/restoration.py`.
 """
 
-from math import inf
+from math import inf, sin, sqrt
 
 from lqrsim.kernels.certificate import reduce_stage
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
@@ -38,49 +36,86 @@ from lqrsim.kernels.rollouts import larger
 
 TINY = 1e-12  # least curvature that a control block must have, relative to the control's own
 STEP = 6e-6  # step for differences of gradients, relative to a number or to 1: the cube root of the precision
+ASIDE = 1e-3  # distance from a plan at which slopes are looked at, too: at the plan itself some may vanish
+SMALLEST = 1e-3  # least motion of a state that is its typical size
+SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
-# Columns of `ActiveRows.table`: the kind of a row; its typical size; its target value in the active set; and for a
-# limit, the control, 1 for a lower or -1 for an upper limit, and its value.
-KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
+# The ladder of regularisation, tried in turn until the models have a minimum: fractions of the projected Hessian of the
+# cost; then that Hessian with weights on changes of the controls, relative to the cost.
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)
+WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
+
+# Columns of `StageRows.table`: the kind of a row; its typical size; its target value in the active set; for a limit,
+# the control, 1 for a lower or -1 for an upper limit, and its value; and the largest multiplier, infinite unless the
+# row is elastic.
+KIND, SIZE, AIM, CONTROL, SIGN, SIDE, PRICE = 0, 1, 2, 3, 4, 5, 6
 INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
-ROUNDING = 1e-10  # allowed violation by a model, relative to a row's size
 
 
-def stage_models(t, steps, plan, costates, model, rows, out):
-    """Write the models of cost, step and constraints at t; return the cost.
+def look(stages, plan, costates, least):
+    """Write the models of all stages at a plan, and return its cost.
 
     Args:
-      costates: (T+1, N). rows: ConstraintRows.
-      out: StageModels; it contains the constraints' gradients from `constraint_slopes`.
+      stages: PlanStages. costates: (T+1, N). least: multipliers up to this count as zero in the Hessians.
     """
-    none = zeros(M)
-    x, u = plan.states[t], plan.controls[min(t, steps - 1)]
-    if t < steps:
+    constraint_slopes(stages, plan)
+    stages.projected[0] = 0.0
+    total = 0.0
+    for t in range(stages.steps, -1, -1):
+        total += stage_models(t, stages, plan, costates, least)
+    if stages.soft == 1:
+        total += add_initial(plan.states[0], stages)
+    return total
+
+
+def look_with_own_costates(stages, plan, costates):
+    """As `look`, but write the costates: those of this plan and the forces of its rows."""
+    constraint_slopes(stages, plan)
+    stages.projected[0] = 0.0
+    total, slope = 0.0, stack(W)
+    for t in range(stages.steps, -1, -1):
+        total += stage_models(t, stages, plan, costates, 0.0)
+        if t > 0:
+            lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
+            copy(slope, N, costates[t])
+    if stages.soft == 1:
+        total += add_initial(plan.states[0], stages)
+    return total
+
+
+def stage_models(t, stages, plan, costates, least):
+    """Write the models of cost, step and constraints at t, after `constraint_slopes`; return the cost."""
+    none, model, out = zeros(M), stages.model, stages.models
+    x, u = plan.states[t], plan.controls[min(t, stages.steps - 1)]
+    if t < stages.steps:
         total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
         step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
     else:
         total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
-    subtract_curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
+    subtract_curvatures(x, u, t, stages, least, out.hessian[t])
     return total
 
 
-def convex_models(steps, soft, plan, model, out):
-    """Write the projected Hessians (T+1, W, W) of the cost at a plan; `soft` is 1 if there is an initial cost."""
-    gradient, none, hessian = stack(W), zeros(M), stack(W, W)
-    for t in range(steps):
-        cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, out.convex[t], gradient)
-    cost_quadratic(plan.states[steps], none, steps, model.final, out.convex[steps], gradient)
-    if soft == 1:
+def project(stages, plan):
+    """Write the projected Hessians (T+1, W, W) of the cost at a plan, unless they are known."""
+    if stages.projected[0] != 0:
+        return
+    gradient, none, hessian, model, convex = stack(W), zeros(M), stack(W, W), stages.model, stages.models.convex
+    for t in range(stages.steps):
+        cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, convex[t], gradient)
+    cost_quadratic(plan.states[stages.steps], none, stages.steps, model.final, convex[stages.steps], gradient)
+    if stages.soft == 1:
         cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
         for i in range(N):
             for j in range(N):
-                out.convex[0, i, j] += hessian[i, j]
+                convex[0, i, j] += hessian[i, j]
+    stages.projected[0] = 1.0
 
 
-def add_initial(x, model, out):
+def add_initial(x, stages):
     """Add the initial cost to the first stage; return its value."""
-    hessian, gradient, none = stack(W, W), stack(W), zeros(M)
-    cost = cost_of_order(x, none, 0, model.initial, 1.0, hessian, gradient)
+    hessian, gradient, none, out = stack(W, W), stack(W), zeros(M), stages.models
+    cost = cost_of_order(x, none, 0, stages.model.initial, 1.0, hessian, gradient)
     for i in range(N):
         out.gradient[0, i] += gradient[i]
         for j in range(N):
@@ -88,15 +123,16 @@ def add_initial(x, model, out):
     return cost
 
 
-def constraint_slopes(steps, plan, constraints, rows, out):
+def constraint_slopes(stages, plan):
     """Write the gradients ((T+1) size, W) of all constraints, and the entries that they depend on."""
-    for t in range(steps + 1):
-        x, u = plan.states[t], plan.controls[min(t, steps - 1)]
+    constraints, rows = stages.model.stage.constraints, stages.rows
+    for t in range(stages.steps + 1):
+        x, u = plan.states[t], plan.controls[min(t, stages.steps - 1)]
         for k in range(constraints.size):
-            acts = acts_at(k, t, steps, constraints)
+            acts = acts_at(k, t, stages.steps, constraints)
             for row in range(int(constraints.multipliers[k][ROWS])):
                 place = int(rows.first[k]) + row
-                slope = out.slopes[rows.size * t + place]
+                slope = stages.models.slopes[rows.size * t + place]
                 fill(slope, W, 0.0)
                 if acts:
                     slope_of_constraint(k, row, x, u, t, constraints, slope)
@@ -110,20 +146,21 @@ def acts_at(k, t, steps, constraints):
     return t >= constraints.multipliers[k][FIRST] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
 
 
-def subtract_curvatures(x, u, t, steps, constraints, rows, hessian):
+def subtract_curvatures(x, u, t, stages, least, hessian):
     """Subtract from a Hessian (W, W) the Hessians of all constraints at a step, times their multipliers."""
+    constraints, rows = stages.model.stage.constraints, stages.rows
     for k in range(constraints.size):
-        if not acts_at(k, t, steps, constraints):
+        if not acts_at(k, t, stages.steps, constraints):
             continue
         for row in range(int(constraints.multipliers[k][ROWS])):
-            if abs(rows.multipliers[rows.size * t + int(rows.first[k]) + row]) > rows.least:
+            if abs(rows.force[rows.size * t + int(rows.first[k]) + row]) > least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
 
 def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
     """Subtract the Hessian of one value of a constraint times its multiplier, by differences of its gradient."""
     place = int(rows.first[k]) + row
-    weight = rows.multipliers[rows.size * t + place]
+    weight = rows.force[rows.size * t + place]
     y, v, above, below = stack(N), stack(M), stack(W), stack(W)
     copy(x, N, y)
     copy(u, M, v)
@@ -145,35 +182,268 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
             hessian[j, i] -= half
 
 
-def trial_cost(steps, soft, plan, model, arrived):
+def trial(stages, plan, arrived):
     """Write the state after each step of a plan, (T, N), and return the plan's cost."""
-    for t in range(steps):
-        advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
-    return cost_of_plan(steps, soft, plan, model)
+    for t in range(stages.steps):
+        advance(plan.states[t], plan.controls[t], stages.model, stages.model.dt, arrived[t])
+    return cost_of_plan(stages, plan)
 
 
-def cost_of_plan(steps, soft, plan, model):
-    """The cost of a plan; `soft` is 1 if there is an initial cost."""
-    none = zeros(M)
-    total = cost_value(plan.states[0], none, 0, model.initial) if soft == 1 else 0.0
+def cost_of_plan(stages, plan):
+    """The cost of a plan."""
+    none, steps, model = zeros(M), stages.steps, stages.model
+    total = cost_value(plan.states[0], none, 0, model.initial) if stages.soft == 1 else 0.0
     for t in range(steps):
         total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
     return total + cost_value(plan.states[steps], none, steps, model.final)
 
 
-def adjoint(steps, gradient, jacobian, costates, slopes):
-    """Write the costates (T+1, N) and the gradient in the controls (T, M) of a sum of stages.
+def read_rows(stages, plan, numbers):
+    """Write the values of all rows, ((T+1) size,); those of rows that do not act are undefined."""
+    constraints, rows, values = stages.model.stage.constraints, stages.rows, stages.values
+    evaluate_constraints(stages.steps, plan.states, plan.controls, constraints, values)
+    for t in range(stages.steps + 1):
+        u = plan.controls[min(t, stages.steps - 1)]
+        for k in range(constraints.size):
+            count = int(constraints.multipliers[k][ROWS])
+            for row in range(count):
+                numbers[rows.size * t + int(rows.first[k]) + row] = values[k][count * t + row]
+        for row in range(rows.size):
+            if rows.table[row, KIND] == LIMIT:
+                number = u[int(rows.table[row, CONTROL])] - rows.table[row, SIDE]
+                numbers[rows.size * t + row] = rows.table[row, SIGN] * number
+
+
+def survey(stages, plan):
+    """Determine which rows act, and typical sizes, from a plan and the models about it; return the cost of such changes.
+
+    Which entries a row depends on is determined from slopes at the plan and near it.
+    """
+    rows, beside = stages.rows, stages.changes
+    read_rows(stages, plan, rows.numbers)
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.numbers[at] == inf:  # the constraint does not act at that step
+            rows.live[at] = 0.0
+        rows.force[at] = 0.0
+    for t in range(stages.steps + 1):
+        for i in range(N):
+            beside.states[t, i] = plan.states[t, i] + ASIDE * sin(1.0 + i)
+        if t < stages.steps:
+            for i in range(M):
+                beside.controls[t, i] = plan.controls[t, i] + ASIDE * sin(1.0 + N + i)
+        fill(stages.to_go.gradient[t], N, 0.0)
+    constraint_slopes(stages, beside)
+    look(stages, plan, stages.to_go.gradient, inf)
+    project(stages, plan)
+    return typical_sizes(stages, plan, stages.models.convex)
+
+
+def typical_sizes(stages, plan, hessian):
+    """Write typical sizes of states, controls and rows, and return the cost of such changes.
+
+    The size of a control without limits is the change that moves a state by its typical size.
 
     Args:
-      gradient: (T+1, W) of the stages. jacobian: (T, N, W) of the steps.
+      hessian: (T+1, W, W) of the cost.
     """
-    copy(gradient[steps], N, costates[steps])
-    for t in range(steps - 1, -1, -1):
-        for j in range(W):
-            total = gradient[t, j]
+    steps, rows, models = stages.steps, stages.rows, stages.models
+    for i in range(N):
+        least, most = plan.states[0, i], plan.states[0, i]
+        for t in range(1, steps + 1):
+            least, most = min(least, plan.states[t, i]), max(most, plan.states[t, i])
+        far = max(most - least, stages.reach[i])
+        stages.state_size[i] = far if far > SMALLEST else 1.0
+    for j in range(M):
+        stages.control_size[j] = stages.model.limits.high[j] - stages.model.limits.low[j]
+        if stages.control_size[j] < inf:
+            continue
+        effect, largest = SLOWEST, 0.0
+        for i in range(N):
+            moved = 0.0
+            for t in range(steps):
+                moved += abs(models.jacobian[t, i, N + j])
+            effect = max(effect, moved / stages.state_size[i])
+        for t in range(steps):
+            largest = max(largest, abs(plan.controls[t, j]))
+        stages.control_size[j] = max(1 / effect, largest)
+    for row in range(rows.size):
+        total, count = 0.0, 0.0
+        for t in range(steps + 1):
+            at = rows.size * t + row
+            count += rows.live[at]
+            for i in range(W):
+                far = models.slopes[at, i] * size_of(i, stages)
+                total += far * far
+        rows.table[row, SIZE] = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
+    cost = 0.0
+    for t in range(steps + 1):
+        for i in range(W):
+            cost += 0.5 * abs(hessian[t, i, i]) * size_of(i, stages) * size_of(i, stages)
+    return cost if 0 < cost and cost < inf else 1.0
+
+
+def size_of(i, stages):
+    """The typical size of an entry of (x, u)."""
+    return stages.state_size[i] if i < N else stages.control_size[i - N]
+
+
+def lagrangian_slope(t, stages, after, slope):
+    """Write the gradient (W,) of the Lagrangian in state and control at t, given the costate (N,) at t + 1."""
+    models, rows = stages.models, stages.rows
+    copy(models.gradient[t], W, slope)
+    if t < stages.steps:
+        for j in range(N):
+            for i in range(W):
+                slope[i] += models.jacobian[t, j, i] * after[j]
+    for row in range(rows.size):
+        at = rows.size * t + row
+        if rows.force[at] != 0:
+            for i in range(W):
+                slope[i] -= rows.force[at] * models.slopes[at, i]
+
+
+def adjoint(stages, costates, slopes):
+    """Write the costates (T+1, N) and the gradient in the controls (T, M) of the Lagrangian."""
+    slope = stack(W)
+    for t in range(stages.steps, -1, -1):
+        lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
+        copy(slope, N, costates[t])
+        if t < stages.steps:
+            for i in range(M):
+                slopes[t, i] = slope[N + i]
+
+
+def measure(stages, plan, numbers, gaps):
+    """Measure the optimality of the plan of the models, whose rows have these values; write its gaps (T, N).
+
+    Returns:
+      The largest derivative of the Lagrangian in a control or a free start, times its size; the largest violation of
+      an inequality, negative if all are satisfied; the largest violation of an equality; the largest gap, relative to
+      the state's size; and the largest product of a multiplier and the value of its inequality.
+    """
+    slope, after, rows = stack(W), stack(N), stages.rows
+    steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
+    for t in range(stages.steps, -1, -1):
+        lagrangian_slope(t, stages, after, slope)
+        copy(slope, N, after)
+        if t < stages.steps:
+            for i in range(M):
+                steepest = larger(steepest, abs(slope[N + i]) * stages.control_size[i])
             for i in range(N):
-                total += jacobian[t, i, j] * costates[t + 1, i]
-            set_entry(costates[t], slopes[t], j, total)
+                gaps[t, i] = stages.models.arrived[t, i] - plan.states[t + 1, i]
+                widest = larger(widest, abs(gaps[t, i]) / stages.state_size[i])
+        for row in range(rows.size):
+            at = rows.size * t + row
+            if rows.live[at] == 0:
+                continue
+            if rows.table[row, KIND] == EQUALITY:
+                unequal = larger(unequal, abs(numbers[at]))
+            else:
+                missed = larger(missed, -numbers[at])
+                product = larger(product, abs(numbers[at]) * rows.force[at])
+    for i in range(N):
+        steepest = larger(steepest, abs(after[i]) * stages.state_size[i] * stages.free[i])
+    return steepest, missed, unequal, widest, product
+
+
+def direction(stages, plan, gaps, share, weight, base, curves, forces):
+    """The step to the minimum of the stages' models, with weights on their rows.
+
+    The change of the plan is written to `stages.changes`, the policy relative to the plan to `stages.policy`, and the
+    costates after the step to the gradient of `stages.to_go`.
+
+    Args:
+      plan: that of the models. gaps: (T, N), to be closed. share: fraction of the projected Hessian of the cost.
+      weight: twice the cost of a change of a control by its typical size. base: 1, or 0 to leave out the gradient of
+        the cost.
+      curves, forces: ((T+1) size,) for each row d that acts, `1/2 curve d^2 - force d` is added; zero for others.
+
+    Returns:
+      The step whose control block is not positive definite; T + 1 for the start, -1 if there is a minimum.
+    """
+    stage, slope, steps, models, to_go = stack(W, W), stack(W), stages.steps, stages.models, stages.to_go
+    if share > 0:
+        project(stages, plan)
+    for t in range(steps, -1, -1):
+        for i in range(W):
+            slope[i] = base * models.gradient[t, i]
+        blend(share, models.hessian[t], models.convex[t], stage)
+        for i in range(M):
+            size = stages.control_size[i]
+            stage[N + i, N + i] += weight / (size * size)
+        add_rows(t, stages, curves, forces, stage, slope)
+        if t == steps:
+            copy(slope, N, to_go.gradient[steps])
+            copy_matrix(stage, N, N, to_go.hessian[steps])
+        elif not riccati_step(t, stage, slope, models.jacobian[t], gaps[t], stages.policy, to_go):
+            return t
+    return -1 if forward_sweep(stages, gaps) else steps + 1
+
+
+def regularised_direction(begin, stages, plan, gaps, weight, scale, curves, forces):
+    """The first step of the ladder of regularisation that exists, from one of its rungs on.
+
+    Args:
+      weight: weight on changes of the controls, which is added to those of the ladder. scale: the cost to which these
+        are relative. The others are as in `direction`.
+
+    Returns:
+      The rung; or -1 if none has a minimum.
+    """
+    for rung in range(begin, len(MIXES) + len(WEIGHTS)):
+        more = weight + weight_of(rung) * scale
+        if direction(stages, plan, gaps, share_of(rung), more, 1.0, curves, forces) == -1:
+            return rung
+    return -1
+
+
+def share_of(rung):
+    """The fraction of the projected Hessian at a rung of the ladder."""
+    return MIXES[rung] if rung < len(MIXES) else 1.0
+
+
+def weight_of(rung):
+    """The weight on changes of the controls at a rung of the ladder, relative to the cost."""
+    return WEIGHTS[rung - len(MIXES)] if rung >= len(MIXES) else 0.0
+
+
+def blend(share, one, other, out):
+    """Write (1 - share) one + share other, (W, W)."""
+    for i in range(W):
+        for j in range(W):
+            if share == 0:
+                out[i, j] = one[i, j]
+            elif share == 1:
+                out[i, j] = other[i, j]
+            else:
+                out[i, j] = (1 - share) * one[i, j] + share * other[i, j]
+
+
+def add_rows(t, stages, curves, forces, stage, slope):
+    """Add what `direction` says of the rows at a step to its model."""
+    slopes = stages.models.slopes
+    for row in range(stages.rows.size):
+        at = stages.rows.size * t + row
+        curve, force = curves[at], forces[at]
+        if curve == 0 and force == 0:
+            continue
+        for i in range(W):
+            entry = slopes[at, i]
+            if entry != 0:
+                slope[i] -= force * entry
+                for j in range(W):
+                    stage[i, j] += curve * entry * slopes[at, j]
+
+
+def moved(t, row, stages):
+    """The change of a row's value by the step in `stages.changes`."""
+    slope, changes, total = stages.models.slopes[stages.rows.size * t + row], stages.changes, 0.0
+    for i in range(N):
+        total += slope[i] * changes.states[t, i]
+    if t < stages.steps:
+        for i in range(M):
+            total += slope[N + i] * changes.controls[t, i]
+    return total
 
 
 def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
@@ -196,18 +466,16 @@ def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
     return minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) >= 0
 
 
-def forward_sweep(steps, free, jacobian, gaps, policy, to_go, changes):
-    """Write the changes of the plan that a policy makes, and the costates after them, as gradients of the cost-to-go.
-
-    Args:
-      free: (N,) 0 for the states that the start fixes, else 1. jacobian: (T, N, W). gaps: (T, N). changes: Motion.
+def forward_sweep(stages, gaps):
+    """Write the changes of the plan that the policy makes, and the costates after them, as gradients of the cost-to-go.
 
     Returns:
       Whether the change of the start has a minimum.
     """
-    if not start_change(free, to_go, changes.states[0]):
+    policy, to_go, changes, jacobian = stages.policy, stages.to_go, stages.changes, stages.models.jacobian
+    if not start_change(stages.free, to_go, changes.states[0]):
         return False
-    for t in range(steps):
+    for t in range(stages.steps):
         affine(policy.gain[t], policy.offset[t], changes.states[t], M, N, changes.controls[t])
         for i in range(N):
             total = gaps[t, i]
@@ -216,7 +484,7 @@ def forward_sweep(steps, free, jacobian, gaps, policy, to_go, changes):
             for j in range(M):
                 total += jacobian[t, i, N + j] * changes.controls[t, j]
             changes.states[t + 1, i] = total
-    for t in range(steps + 1):
+    for t in range(stages.steps + 1):
         for i in range(N):
             for j in range(N):
                 to_go.gradient[t, i] += to_go.hessian[t, i, j] * changes.states[t, j]
@@ -264,22 +532,26 @@ def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
         advance(out.states[t], out.controls[t], model, model.dt, out.states[t + 1])
 
 
-def least_curvatures(steps, free, hessian, jacobian, held, least):
+def least_curvatures(stages, curves, held, least):
     """Write the least curvatures (M,) of the controls along a plan, while later controls respond at their best.
 
     Args:
-      free: (N,) 0 for the states that the start fixes, else 1. hessian: (T+1, W, W) of the Lagrangian, with weights on
-      rows that are held. jacobian: (T, N, W). held: (T, M), not 0 for a control that stays at its limit.
+      stages: PlanStages; the Hessians of their models are used. curves: ((T+1) size,) weights on rows that are held.
+      held: (T, M), not 0 for a control that stays at its limit.
 
     Returns:
       Whether the reduced Hessian is positive definite.
     """
-    S, stage, none = stack(N, N), stack(W, W), zeros(W)
-    copy_matrix(hessian[steps], N, N, S)
+    S, stage, none, steps, models = stack(N, N), stack(W, W), zeros(W), stages.steps, stages.models
+    slope = zeros(W)
     fill(least, M, inf)
-    for t in range(steps - 1, -1, -1):
-        copy_matrix(hessian[t], W, W, stage)
-        congruence(jacobian[t], S, none, stage, zeros(W))
+    for t in range(steps, -1, -1):
+        copy_matrix(models.hessian[t], W, W, stage)
+        add_rows(t, stages, curves, curves, stage, slope)
+        if t == steps:
+            copy_matrix(stage, N, N, S)
+            continue
+        congruence(models.jacobian[t], S, none, stage, zeros(W))
         for i in range(M):
             if held[t, i] != 0:
                 for j in range(W):
@@ -289,241 +561,7 @@ def least_curvatures(steps, free, hessian, jacobian, held, least):
             return False
     for i in range(N):
         for j in range(N):
-            S[i, j] *= free[i] * free[j]
-        if free[i] == 0:
+            S[i, j] *= stages.free[i] * stages.free[j]
+        if stages.free[i] == 0:
             S[i, i] = 1.0
     return cholesky(S, N)
-
-
-# With an active set.
-
-
-def linearize_plan(steps, soft, own, plan, costates, model, values, rows, out, active):
-    """Write the models of all stages at a plan, and the values of the active set's rows, if there are any.
-
-    Args:
-      soft: 1 if there is an initial cost.
-      own: 1 to compute the costates here, for this plan and the forces of its rows. costates: (T+1, N).
-      values: a vector for each constraint, written. rows: ConstraintRows. out: StageModels, written.
-      active: ActiveRows; rows that do not act leave the active set.
-
-    Returns:
-      The cost.
-    """
-    if active.size > 0:
-        evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
-        read_row_values(steps, plan, model.stage.constraints, values, rows, active)
-    constraint_slopes(steps, plan, model.stage.constraints, rows, out)
-    total, slope = 0.0, stack(W)
-    for t in range(steps, -1, -1):
-        total += stage_models(t, steps, plan, costates, model, rows, out)
-        if own == 1 and t > 0:
-            lagrangian_slope(t, steps, costates[min(t + 1, steps)], out, active, slope)
-            copy(slope, N, costates[t])
-    if soft == 1:
-        total += add_initial(plan.states[0], model, out)
-    return total
-
-
-def read_row_values(steps, plan, constraints, values, rows, active):
-    """Write the values of all rows, and remove those that do not act from the active set."""
-    for t in range(steps + 1):
-        u = plan.controls[min(t, steps - 1)]
-        for k in range(constraints.size):
-            count = int(constraints.multipliers[k][ROWS])
-            for row in range(count):
-                active.numbers[active.size * t + int(rows.first[k]) + row] = values[k][count * t + row]
-        for row in range(active.size):
-            at = active.size * t + row
-            if active.table[row, KIND] == LIMIT:
-                number = u[int(active.table[row, CONTROL])] - active.table[row, SIDE]
-                active.numbers[at] = active.table[row, SIGN] * number
-            if active.numbers[at] == inf:  # the constraint does not act
-                active.live[at] = 0.0
-            if active.live[at] == 0:
-                active.force[at], active.held[at] = 0.0, 0.0
-
-
-def lagrangian_slope(t, steps, after, models, active, slope):
-    """Write the gradient (W,) of the Lagrangian in state and control at t, given the costate (N,) at t + 1."""
-    copy(models.gradient[t], W, slope)
-    if t < steps:
-        for j in range(N):
-            for i in range(W):
-                slope[i] += models.jacobian[t, j, i] * after[j]
-    for row in range(active.size):
-        at = active.size * t + row
-        if active.force[at] != 0:
-            for i in range(W):
-                slope[i] -= active.force[at] * models.slopes[at, i]
-
-
-def optimality_measures(steps, plan, models, gaps, active, state_size, control_size):
-    """Measure the optimality of a plan; write its gaps (T, N).
-
-    Args:
-      models: StageModels. active: ActiveRows. state_size: (N,) and control_size: (M,), typical sizes.
-
-    Returns:
-      The largest derivative of the Lagrangian in a control, times its size; the largest violation of an inequality,
-      negative if all are satisfied; the largest violation of an equality; the largest gap, relative to the state's
-      size; and the largest product of a multiplier and its row's value.
-    """
-    slope, after = stack(W), stack(N)
-    steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
-    for t in range(steps, -1, -1):
-        lagrangian_slope(t, steps, after, models, active, slope)
-        copy(slope, N, after)
-        if t < steps:
-            for i in range(M):
-                steepest = larger(steepest, abs(slope[N + i]) * control_size[i])
-            for i in range(N):
-                gaps[t, i] = models.arrived[t, i] - plan.states[t + 1, i]
-                widest = larger(widest, abs(gaps[t, i]) / state_size[i])
-        for row in range(active.size):
-            at = active.size * t + row
-            if active.live[at] == 0:
-                continue
-            number = active.numbers[at]
-            if active.table[row, KIND] == EQUALITY:
-                unequal = larger(unequal, abs(number))
-            else:
-                missed = larger(missed, -number)
-                product = larger(product, abs(number) * active.force[at])
-    return steepest, missed, unequal, widest, product
-
-
-def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy, to_go, changes):
-    """The step to the minimum of the stages' models with the active set fixed, and the rows that are wrong there.
-
-    Args:
-      free: (N,) 0 for the states that the start fixes, else 1. share: fraction of the projected Hessian of the cost.
-      scale: the cost to which multipliers are relative.
-      weight: weight on the distance of a fixed row from its target, relative to its size; times `price` for
-        constraints.
-      models: StageModels. gaps: (T, N). active: ActiveRows, written.
-      policy, to_go: as in `riccati_step`; gradients become the costates after the step. changes: Motion, written.
-
-    Returns:
-      The step whose control block is not positive definite (T + 1 for the start, -1 for none), and the number of rows
-      with the wrong state.
-    """
-    stage, slope = stack(W, W), stack(W)
-    for t in range(steps, -1, -1):
-        copy(models.gradient[t], W, slope)
-        blend(share, models.hessian[t], models.convex[t], stage)
-        add_held_rows(t, weight, price, models, active, stage, slope)
-        if t == steps:
-            copy(slope, N, to_go.gradient[steps])
-            copy_matrix(stage, N, N, to_go.hessian[steps])
-        elif not riccati_step(t, stage, slope, models.jacobian[t], gaps[t], policy, to_go):
-            return t, 0
-    if not forward_sweep(steps, free, models.jacobian, gaps, policy, to_go, changes):
-        return steps + 1, 0
-    return -1, predict_rows(steps, scale, weight, price, models, active, changes)
-
-
-def blend(share, one, other, out):
-    """Write (1 - share) one + share other, (W, W)."""
-    for i in range(W):
-        for j in range(W):
-            if share == 0:
-                out[i, j] = one[i, j]
-            elif share == 1:
-                out[i, j] = other[i, j]
-            else:
-                out[i, j] = (1 - share) * one[i, j] + share * other[i, j]
-
-
-def add_held_rows(t, weight, price, models, active, stage, slope):
-    """Add the penalties of the fixed rows at a step to its model."""
-    for row in range(active.size):
-        at = active.size * t + row
-        if active.held[at] == 0:
-            continue
-        own = held_weight(row, weight, price, active)
-        pull = own * (active.numbers[at] - active.table[row, AIM]) - active.force[at]
-        for i in range(W):
-            entry = models.slopes[at, i]
-            if entry != 0:
-                slope[i] += pull * entry
-                for j in range(W):
-                    stage[i, j] += own * entry * models.slopes[at, j]
-
-
-def held_weight(row, weight, price, active):
-    """The penalty on a fixed row."""
-    size = active.table[row, SIZE]
-    return (weight if active.table[row, KIND] == LIMIT else price * weight) / (size * size)
-
-
-def predict_rows(steps, scale, weight, price, models, active, changes):
-    """Write the multipliers after a step, and which rows are wrong there; return the number of wrong rows."""
-    count = 0
-    for t in range(steps + 1):
-        for row in range(active.size):
-            at = active.size * t + row
-            active.pressing[at], active.wrong[at] = 0.0, 0.0
-            if active.live[at] == 0:
-                continue
-            size, ahead = active.table[row, SIZE], active.numbers[at] - active.table[row, AIM]
-            for i in range(N):
-                ahead += models.slopes[at, i] * changes.states[t, i]
-            if t < steps:
-                for i in range(M):
-                    ahead += models.slopes[at, N + i] * changes.controls[t, i]
-            if active.held[at] != 0:
-                active.pressing[at] = active.force[at] - held_weight(row, weight, price, active) * ahead
-                missed = 0.0 if active.table[row, KIND] == EQUALITY else active.pressing[at] * size / scale
-            else:
-                missed = ahead / size
-            if missed < -ROUNDING:
-                active.wrong[at] = missed
-                count += 1
-    return count
-
-
-def update_active_set(steps, worst, active):
-    """Add violated rows to the active set, and remove rows with a negative multiplier.
-
-    Args:
-      worst: 1 for all rows that are worse than at the neighbouring steps; 0 for the last wrong row alone.
-    """
-    last = -1
-    for row in range(active.size):
-        before, was_held = 0.0, 0.0
-        for t in range(steps + 1):
-            at = active.size * t + row
-            here, held = active.wrong[at], active.held[at]
-            if here < 0:
-                last = max(last, at)
-                after = at + active.size
-                no_worse_before = was_held != held or here <= before
-                worse_after = t == steps or active.held[after] != held or here < active.wrong[after]
-                if worst == 1 and no_worse_before and worse_after:
-                    active.held[at] = 1 - held
-            before, was_held = here, held
-    if worst == 0 and last >= 0:
-        active.held[last] = 1 - active.held[last]
-
-
-def rollout_of_active_set(steps, soft, plan, policy, limits, active, model, values, out):
-    """Roll out a policy about a plan, and evaluate the constraints there; return the cost.
-
-    Args:
-      soft: 1 if there is an initial cost. plan: its controls are clamped, and set to the limits that are fixed.
-      policy: its offsets are set to zero, and so are its gains at limits. limits: (T, M) each.
-      values: a vector for each constraint, written. out: Motion, written.
-    """
-    for t in range(steps):
-        for i in range(M):
-            policy.offset[t, i] = 0.0
-            plan.controls[t, i] = min(max(plan.controls[t, i], limits.low[t, i]), limits.high[t, i])
-        for row in range(active.size):
-            if active.table[row, KIND] == LIMIT and active.held[active.size * t + row] != 0:
-                i = int(active.table[row, CONTROL])
-                plan.controls[t, i] = active.table[row, SIDE]
-                fill(policy.gain[t, i], N, 0.0)
-    closed_loop_rollout(steps, 0.0, plan, policy, limits, model, out)
-    evaluate_constraints(steps, out.states, out.controls, model.stage.constraints, values)
-    return cost_of_plan(steps, soft, out, model)

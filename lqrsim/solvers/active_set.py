@@ -16,11 +16,13 @@ from collections.abc import Callable
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Motion
-from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
-from lqrsim.solvers.interior_point import AT_LIMIT, REGULARISATION, Measures
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.kernels.interior_point import AT_LIMIT, REGULARISATION
+from lqrsim.kernels.records import Limits, Motion, RowWork
+from lqrsim.kernels.stages import AIM, INEQUALITY, KIND, MIXES, SIZE
+from lqrsim.solvers.interior_point import Measures
 from lqrsim.solvers.settings import INSIDE
-from lqrsim.solvers.stages import FIRMNESS, MIXES, Stages
+from lqrsim.solvers.stages import FIRMNESS, Stages
 
 STEPS = 12  # largest number of steps: a solve that needs more does not converge
 PIVOTS, FEW = 15, 4  # largest number of pivots of a convex problem, and of a problem that may be nonconvex
@@ -44,26 +46,22 @@ class ActiveSet:
     """
 
     def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
-        self.stages, self.plan, self._violation = stages, plan, violation
+        self.stages, self.plan, self._violation = stages, Motion(*map(in_c_order, plan)), violation
+        plan = self.plan
         self.hopeless = False
-        shape, limit, rows = stages.live.shape, stages.owners == -1, stages.active
-        live, self.held, numbers, self.force, self._pressing = (one.reshape(shape) for one in rows[2:-1])
-        live[...], self.held[...], self.force[...] = stages.live, 0.0, stages.of_constraints(multipliers)
+        limit, table = stages.owners == -1, stages.about.rows.table
+        self.held, self.force = stages.held, stages.force
+        self.held[...], self.force[...] = 0.0, stages.of_constraints(multipliers)
         self._equality = stages.equality
-        kind = np.where(self._equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
-        rows.table[:, KIND], rows.table[:, SIZE] = kind, 1.0
-        rows.table[:, AIM] = np.where(kind == INEQUALITY, INSIDE * violation, 0.0)
-        for row, (sign, i, side) in zip(np.flatnonzero(limit), stages.limits, strict=True):
-            rows.table[row, CONTROL:] = i, sign, side
+        table[:, AIM] = np.where(table[:, KIND] == INEQUALITY, INSIDE * violation, 0.0)
+        self._work = RowWork(*(np.zeros(stages.live.size) for _ in range(4)))
         self._gaps, self._costates = np.empty((stages.steps, stages.n)), np.zeros((stages.steps + 1, stages.n))
         clock = time.perf_counter()
-        cost = stages.look(plan, self._costates, own=True)
+        cost = stages.call("begin_active_set", stages.about, plan, self._costates)
         self.looking = time.perf_counter() - clock
-        self._convex, stages.live[...] = False, live > 0
         self.sizes = stages.sizes_of(plan, stages.models.hessian)
-        rows.table[:, SIZE] = self.sizes.rows
-        begun = self._equality | (self.force > 0) | (limit & (numbers <= AT_LIMIT * self.sizes.rows))
-        self.held[...] = begun & (live > 0)
+        begun = self._equality | (self.force > 0) | (limit & (stages.numbers <= AT_LIMIT * self.sizes.rows))
+        self.held[...] = begun & stages.live
         self._measure(cost)
 
     def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
@@ -97,10 +95,13 @@ class ActiveSet:
             if self._solve(share, price=FIRMNESS * REGULARISATION)[0]:
                 break
         else:
-            stages.policy.gain[...] = 0.0
-        gain = stages.policy.gain.copy()
-        plan, cost, values = stages.carry_out(Motion(self.plan.states, self.plan.controls.copy()), gain)
-        return plan, gain, cost, values
+            stages.about.policy.gain[...] = 0.0
+        out = Motion(np.empty_like(self.plan.states), np.empty_like(self.plan.controls))
+        limits = Limits(*(np.tile(side, (stages.steps, 1)) for side in (stages.low, stages.high)))
+        plan = Motion(self.plan.states, self.plan.controls.copy())
+        cost = stages.call("rollout_of_active_set", stages.about, plan, limits, out)
+        values = [one.reshape(stages.steps + 1, -1) for one in stages.about.values]
+        return out, stages.about.policy.gain.copy(), cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Multipliers (T+1, rows) and penalty of each constraint."""
@@ -112,7 +113,10 @@ class ActiveSet:
     def _measure(self, cost: float) -> None:
         """Compute the measures of the plan about which the models are made."""
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
-        steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._gaps, self.sizes)
+        stages = self.stages
+        steepest, missed, unequal, gap, product = stages.call(
+            "measure", stages.about, self.plan, stages.about.rows.numbers, self._gaps
+        )
         self._kept = missed <= 0 and unequal <= self._violation
         self.measures = Measures(
             cost=cost, stationarity=steepest / self._scale, violation=max(missed, unequal, 0.0), gap=gap,
@@ -130,13 +134,12 @@ class ActiveSet:
         if (self._pivoted(0.0, 0) != 0 and not self._from_convex()) or self._due():
             self.held[...] = before
             return False
-        stages = self.stages
-        self.force[...] = np.where(self._equality, self._pressing, np.maximum(self._pressing, 0.0))
-        self._costates = stages.to_go.gradient.copy()
-        self.plan = Motion(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
+        stages, pressing = self.stages, self._work.pressing.reshape(self.force.shape)
+        self.force[...] = np.where(self._equality, pressing, np.maximum(pressing, 0.0))
+        changes, self._costates = stages.about.changes, stages.about.to_go.gradient.copy()
+        self.plan = Motion(self.plan.states + changes.states, self.plan.controls + changes.controls)
         clock = time.perf_counter()
-        cost = stages.look(self.plan, self._costates)
-        self._convex = False
+        cost = stages.call("look_at_rows", stages.about, self.plan, self._costates)
         self._measure(cost)
         self.looking = time.perf_counter() - clock
         return True
@@ -177,13 +180,13 @@ class ActiveSet:
             if wrong == 0 or pivot == most:
                 return wrong
             fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
-            self.stages.change(worst=patience > 0)
+            self.stages.call("update_active_set", self.stages.about, int(patience > 0), self._work)
         return None
 
     def _solve(self, share: float, price: float = 1.0) -> tuple[bool, int]:
         """Solve the problem with the fixed rows; return whether there is a minimum, and the number of wrong rows."""
-        if share > 0 and not self._convex:
-            self.stages.convexify(self.plan)
-            self._convex = True
-        weight = self._scale / REGULARISATION
-        return self.stages.pivot(self._gaps, share=share, scale=self._scale, weight=weight, price=price)
+        failed, wrong = self.stages.call(
+            "pivot", self.stages.about, self.plan, self._gaps, float(share), float(self._scale),
+            float(self._scale / REGULARISATION), float(price), self._work,
+        )  # fmt: skip
+        return failed == -1, wrong

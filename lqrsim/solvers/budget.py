@@ -16,6 +16,7 @@ from lqrsim.results.solution_parts import Iteration, Status
 Callback = Callable[[Iteration], object]
 
 _log = logging.getLogger("lqrsim")
+ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C
 SILENT = 2.0  # s without a message after which a solve reports its progress; later reports come at growing intervals
 SELDOM = 60.0  # s
 NOTED = 10.0  # compiling is mentioned if it takes longer than the time limit divided by this
@@ -142,6 +143,11 @@ class Budget:
         """Whether there is a callback."""
         return self._callback is not None
 
+    @property
+    def hurried(self) -> bool:
+        """Whether compiled code must return after each iteration: for a callback, or for a deadline."""
+        return self.watched or self.stop.deadline < np.inf
+
     def record(self, iteration: Iteration) -> None:
         """Add an iteration to the log, and tell the callback."""
         self.log.append(iteration)
@@ -216,10 +222,13 @@ class Laps:
     def __init__(self, budget: Budget, cost: float = np.inf) -> None:
         self._budget, self._cost, self.ended = budget, cost, time.perf_counter()
 
-    def record(self, method: str, cost: float, *, optimality: float, gap: float = 0.0, violation: float = 0.0) -> None:
-        """Record an iteration that ends now."""
+    def record(
+        self, method: str, cost: float, *, optimality: float, gap: float = 0.0, violation: float = 0.0,
+        seconds: float | None = None,
+    ) -> None:  # fmt: skip
+        """Record an iteration; by default it took all the time since the last one."""
         now, improvement = time.perf_counter(), (self._cost - cost) / max(abs(cost), 1e-300)
-        seconds, self._cost, self.ended = now - self.ended, cost, now
+        seconds, self._cost, self.ended = now - self.ended if seconds is None else seconds, cost, now
         self._budget.record(Iteration(cost, improvement, gap, optimality, gap, violation, seconds, method))
 
 

@@ -42,7 +42,6 @@ GUIDED = 60  # iterations of smoothing before constraints act, with an ObstacleC
 RESTORED = 150  # iterations of a descent at one price
 RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, relative to the cost
-SLOW, PATIENCE = 1e-2, 3  # change of cost, and number of times in a row, that end the descent of a feasible plan
 
 
 @dataclass(eq=False)
@@ -224,14 +223,11 @@ class Ladder:
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
         """Run the descent; its iterations go to the log."""
-        budget, laps, slow, restored = self._budget, Laps(self._budget), 0, None
+        budget, laps, restored = self._budget, Laps(self._budget), None
 
-        def watch(cost: float, violation: float, promised: float) -> bool:
-            nonlocal slow
-            laps.record(RESTORATION, cost, optimality=promised, violation=violation)
-            settled = violation <= self._allowed and abs(budget.log[-1].improvement) < SLOW
-            slow = slow + 1 if settled else 0
-            return budget.stop.due or slow == PATIENCE
+        def watch(cost: float, violation: float, promised: float, seconds: float) -> bool:
+            laps.record(RESTORATION, cost, optimality=promised, violation=violation, seconds=seconds)
+            return budget.stop.due
 
         sizes = self._stages.sizes(plan)
         if self._known.rows is None:
@@ -239,10 +235,10 @@ class Ladder:
         sizes = sizes._replace(rows=self._known.rows)
         if budget.left < 2 or budget.stop.due:
             return None
-        with budget.stop.heeding(), np.errstate(all="ignore"):
+        with budget.stop.heeding():
             restored = restore(
                 self._stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), watch=watch,
-                stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
+                stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes), hurried=budget.hurried,
             )  # fmt: skip
         return restored
 

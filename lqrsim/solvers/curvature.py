@@ -51,9 +51,9 @@ class _Reduced:
     def __init__(self, stages: Stages, plan: Motion, multipliers: Array, sizes: Sizes) -> None:
         self._stages, self._sizes = stages, sizes
         # The costates need no multipliers of limits, which hold controls alone.
-        stages.linearize(plan, np.zeros_like(plan.states), multipliers, np.inf, convex=False)
-        costates, slopes = stages.adjoint(stages.models.gradient - stages.pull(multipliers[stages.live]))
-        stages.linearize(plan, costates, multipliers, 0.0, convex=False)
+        stages.linearize(plan, np.zeros_like(plan.states), multipliers, np.inf)
+        costates, slopes = stages.adjoint()
+        stages.linearize(plan, costates, multipliers, 0.0)
         forces, limit = multipliers.copy(), stages.owners == -1
         for row, (sign, i, _) in zip(np.flatnonzero(limit), stages.limits, strict=True):
             forces[:-1, row] = sign * slopes[:, i]
@@ -73,22 +73,23 @@ class _Reduced:
             kind = Curvature.SINGULAR if kind is Curvature.SADDLE else kind
         return Bend(kind, direction)
 
-    def _weighed(self, held: Flags) -> Array:
-        """The Hessians (T+1, n+m, n+m) with weights on these rows."""
-        weights = np.where(held, HELD * self._sizes.cost / self._sizes.rows**2, 0.0)
-        return self._stages.models.hessian + self._stages.curvature(weights[self._stages.live])
+    def _weights(self, held: Flags) -> Array:
+        """Weights (T+1, R) on these rows."""
+        return np.where(held & self._stages.live, HELD * self._sizes.cost / self._sizes.rows**2, 0.0)
 
     def _bends_up(self, held: Flags) -> bool:
         """Whether the curvature is positive beyond doubt: a compiled look, which most plans pass."""
         stages, fixed = self._stages, np.zeros((self._stages.steps, self._stages.m), dtype=bool)
         for row, (_, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             fixed[:, i] |= held[:-1, row]
-        least = stages.least_curvatures(self._weighed(held & (stages.owners >= 0)), fixed)
+        least = stages.least_curvatures(self._weights(held & (stages.owners >= 0)), fixed)
         return least is not None and bool((least * self._sizes.controls**2 > CLEAR * self._sizes.cost).all())
 
     def _recursion(self, held: Flags) -> tuple[Curvature, Motion | None]:
         stages, sizes, n = self._stages, self._sizes, self._stages.n
-        hessian, jacobian = self._weighed(held), stages.models.jacobian
+        weighed = self._weights(held)[:, :, None] * stages.slopes
+        hessian = stages.models.hessian + np.matmul(weighed.transpose(0, 2, 1), stages.slopes)
+        jacobian = stages.models.jacobian
         curve, gains, singular = hessian[-1][:n, :n], np.zeros((stages.steps, stages.m, n)), False
         for t in range(stages.steps - 1, -1, -1):
             both = hessian[t] + jacobian[t].T @ curve @ jacobian[t]

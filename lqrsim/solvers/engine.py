@@ -36,7 +36,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Candidate, Certificate, Curvature, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import certified, no_value
 from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
@@ -72,7 +72,7 @@ _DETAILS = {
     declarations.NO_PROGRESS: "the least cost so far no longer falls",
     declarations.STALLED: "the line search found no lower cost",
 }
-ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C
+
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory is kept for later solves, and largest size in bytes
 # Newton's method takes over when the states of least total cost are within VALLEY of the rollout, relative to its
 # range: smoothing is then near a local optimum. Damped iterations approach it slowly. They end when the cost falls by

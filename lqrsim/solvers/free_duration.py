@@ -162,18 +162,19 @@ def find_duration(
     stages.free[n] = 1.0
     laps = Laps(budget)
 
-    def watch(measures: Measures) -> bool:
-        measures.record(laps)
+    def watch(measures: Measures, seconds: float) -> bool:
+        measures.record(laps, seconds=seconds)
         return budget.stop.due
 
     states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
-    with np.errstate(all="ignore"):
-        # The bounds of the duration hold at any price.
-        prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
-        point = InteriorPoint(freed, plan, price=prices, stages=stages)
-        found = point.run(tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch)
-        cost = found.measures.cost + _paid(stages, found.plan, prices)
+    # The bounds of the duration hold at any price.
+    prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, price)
+    found = InteriorPoint(stages, plan, price=prices).run(
+        tolerance=tolerance, violation=violation, most=min(MOST, most), watch=watch, hurried=budget.hurried
+    )
+    cost = found.measures.cost + _paid(stages, found.plan, prices)
+    duration = float(np.clip(found.plan.states[0, n], *problem.duration))
     # Remove everything that belongs to the duration.
     rows = found.sizes.rows[stages.owners != len(problem.constraint_terms)]
     found = replace(
@@ -182,7 +183,6 @@ def find_duration(
         measures=found.measures._replace(cost=cost),
         sizes=found.sizes._replace(rows=rows),
     )  # fmt: skip
-    duration = float(np.clip(point.point.plan.states[0, n], *problem.duration))
     return settled(problem, duration), found
 
 

@@ -17,7 +17,8 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import AT_LIMIT, INTERIOR, Found, InteriorPoint, Measures
+from lqrsim.kernels.interior_point import AT_LIMIT
+from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
 from lqrsim.solvers.stages import FIRMNESS, Stages
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
@@ -67,18 +68,18 @@ class InteriorRun:
             return None
         laps = Laps(budget)
 
-        def watch(measures: Measures) -> bool:
-            measures.record(laps)
+        def watch(measures: Measures, seconds: float) -> bool:
+            measures.record(laps, seconds=seconds)
             return budget.stop.due
 
-        with budget.stop.heeding(), np.errstate(all="ignore"):
+        with budget.stop.heeding():
             point = InteriorPoint(
-                self._problem, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
-                multipliers=multipliers, stages=self.stages,
+                self.stages, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
+                multipliers=multipliers,
             )  # fmt: skip
             found = point.run(
                 tolerance=run.final, violation=self.allowed, most=min(MOST, budget.left - 1), near=barrier.near,
-                watch=watch,
+                watch=watch, hurried=budget.hurried,
             )  # fmt: skip
         return None if found is None else self.finish(found)
 
@@ -132,7 +133,7 @@ class InteriorRun:
         work.take(states, controls, self.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
-        with self._budget.joined_with_last(INTERIOR):
+        with self._budget.joined_with_last(NAME):
             result = self._newton(lagrangian, found.scale)
             for _ in range(UPDATES):
                 if lagrangian.kept or not result.success:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError, check_kind, check_number
-from lqrsim.kernels.records import Motion
+from lqrsim.kernels.records import Motion, RowWork
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
@@ -110,10 +110,9 @@ class PreparedSolver:
             stages, plan = Stages(self.problem), Motion(*run.work.best)
             _Neighbour(run, stages, plan, _Best(run)).find()
             # Another solve may need code that this solve did not need.
-            stages.convexify(plan)
-            stages.change(worst=False)
+            stages.call("update_active_set", stages.about, 0, RowWork(*(np.zeros(stages.live.size) for _ in range(4))))
             with np.errstate(all="ignore"):
-                InteriorPoint(self.problem, plan, stages=stages).run(
+                InteriorPoint(stages, plan).run(
                     tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
                 )
                 restore(
@@ -292,12 +291,12 @@ class _Neighbour:
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    run.problem, copied(self._best.plan), barrier=LITTLE.parameter,
-                    room=LITTLE.room, multipliers=known, stages=self._stages,
-                )  # fmt: skip
+                    self._stages, copied(self._best.plan), barrier=LITTLE.parameter, room=LITTLE.room,
+                    multipliers=known,
+                )
 
-                def watch(measures: Measures) -> bool:
-                    measures.record(self.laps)
+                def watch(measures: Measures, seconds: float) -> bool:
+                    measures.record(self.laps, seconds=seconds)
                     return self._late(budget.log[-1].seconds) or not budget.left
 
                 found = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)

@@ -1,0 +1,972 @@
+"""Constraints by a primal-dual interior point with exact second derivatives, on states and controls at once.
+
+Written in the kernels' subset. Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a
+logarithmic barrier, subject to the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are
+closed on the way. The barrier parameter is reduced by Mehrotra's rule if the last step was long and the measures
+decrease. Otherwise it is reduced when the barrier problem is nearly solved. A filter decides how much of a step is taken
+(Waechter and Biegler, 2006). Corrections with the same models then reduce the residuals of a long step. If a model has
+no minimum, the ladder of `stages.py` gives it one.
+
+A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
+row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the
+barrier parameter, and so is the product of p and upper - y. For an inequality, the lower bound is 0. Without an upper
+bound there is no p. An upper bound is the price of a violation, in cost per unit: the constraint is then elastic. An
+equality without a price has no slacks, and is regularised.
+"""
+
+from math import copysign, inf, isfinite, isnan, log, nan
+
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N
+from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.rollouts import copy_plan, larger
+from lqrsim.kernels.stages import (
+    EQUALITY,
+    INEQUALITY,
+    KIND,
+    LIMIT,
+    PRICE,
+    SIZE,
+    adjoint,
+    direction,
+    look,
+    measure,
+    moved,
+    read_rows,
+    regularised_direction,
+    share_of,
+    survey,
+    trial,
+)
+
+REGULARISATION = 1e-8  # relative regularisation of equalities
+# Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
+# must exceed 1e-9 of its weight; the kernel treats less as rounding.
+CROSSING = 1e-6
+LONG = 0.3  # fraction of a step above which the next step uses Mehrotra's rule
+LATELY = 4  # number of iterations with that rule; to continue, the measures must be below the worst of these
+# Largest number of corrections after a long step, and the largest fraction of the violation that each may leave.
+CLOSINGS, CLOSER = 3, 0.3
+# If a step is not long: the longer fraction for which centring aims, the part of this gain that is required, and the
+# factor by which products may then differ from the barrier parameter.
+REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
+BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
+LEVELS = 4  # largest number of reductions of the barrier parameter at once
+NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
+LOWER, POWER = 0.2, 1.5  # factor by which the parameter then falls at least, and power of the parameter, if that is less
+HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
+LEAST = 0.1  # least barrier parameter, relative to the tolerance
+NOTHING, FAR = 1e-4, 1e-2  # least scale of the first plan, relative to the typical cost of a change; if infinite
+CANCELLED = 1e-6  # least scale later, relative to the same: the cost's terms may cancel
+SHORTEST = 1e-7  # fraction of a step below which the line search gives up
+MARGIN = 1e-5  # improvement that the filter requires
+ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
+SWITCH, SWITCHED = 2.3, 1.1  # powers of the predicted decrease and of the violation in the switching condition
+FORCED, SOME = 6, 0.1  # largest number of steps that are taken although the filter rejects them; the fraction of these
+WIDE = 1e10  # factor by which slack times multiplier may differ from the barrier parameter
+CROSSINGS = 8  # largest number of final steps without a barrier
+SETTLED = 1e-3  # fraction of the tolerances at which these end
+FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
+INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the tolerance
+AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
+CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
+SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
+STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
+ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
+FARTHEST = 10.0  # largest violation relative to the first plan's
+SMALL, PER_GAP = 1e-4, 1e-2  # violation below which a step may be judged by its merit alone; the same for each gap
+AT_REST, HUGE = 1e-9, 1e100  # violation below which the merit may stay as it is; the most that a power can take
+ROUNDING, RESTING = 1e-12, 1e-11  # relative differences of merits that may be rounding, in these two tests
+PER_ROW = 0.05  # that may be taken for the first plan's, relative to sizes: even rows far from active count in a sum
+EDGE = 0.05  # distance of the first controls from their limits, relative to the range
+BARELY = 1e-3  # least first excess, relative to the least first slack
+WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
+CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
+NEGLIGIBLE = 1e-10  # multiplier that counts as zero in the Hessians, relative to the cost
+
+# Tasks of `interior_point`: to choose slacks and multipliers at a plan; to take steps without a barrier from there; to
+# iterate; and to cross over, because no iteration follows.
+BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3
+
+# What the rows of an active set do: nothing, stay at their target, or, at a price, stay violated.
+FREE, HELD, PAID = 0.0, 1.0, 2.0
+
+
+def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
+    """Begin an interior point, settle at a known optimum, or run the iterations `first` to `last` - 1.
+
+    All code that a solve can need is compiled together, before it begins.
+
+    Args:
+      task: one of BEGIN, SETTLE, ITERATE and CLOSE. tolerance: tolerance of stationarity, gaps and complementarity.
+      violation: tolerance of the constraints, in their units.
+      begun: PlanBeginning. stages: PlanStages. work: InteriorArrays. memory: (1,) row of INTERIOR.
+      log: rows of MEASURES, written.
+
+    Returns:
+      The number of iterations so far; and CONVERGED if the crossover succeeded, STALLED if nothing helps any more,
+      otherwise RUNNING. `memory.solved` says whether the measures were within tolerance.
+    """
+    if task == BEGIN:
+        begin(begun, stages, work, memory[0])
+        return 0, RUNNING
+    if task == SETTLE:
+        return first, CONVERGED if settle(tolerance, violation, begun, stages, work, memory[0]) else RUNNING
+    return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
+
+
+def begin(begun, stages, work, mem):
+    """Begin from a plan: compute typical sizes, slacks, multipliers and measures."""
+    rows, now, steps, limits = stages.rows, work.now, stages.steps, stages.model.limits
+    copy_plan(steps, begun.plan, now.plan)
+    for i in range(M):
+        low, high = limits.low[i], limits.high[i]
+        edge = EDGE * (high - low) if high - low < inf else 0.0
+        for t in range(steps):
+            now.plan.controls[t, i] = min(max(now.plan.controls[t, i], low + edge), high - edge)
+    mem.typical = survey(stages, now.plan)
+    mem.cost = trial(stages, now.plan, now.arrived)
+    read_rows(stages, now.plan, now.numbers)
+    # A cost near zero, as when standing still, says nothing about the scale of the problem.
+    mem.scale = max(mem.cost, NOTHING * mem.typical) if mem.cost < inf else FAR * mem.typical
+    mem.pairs, mem.elastic = 0.0, 0.0
+    for at in range(rows.size * (steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            if has_slack(row, rows):
+                mem.pairs += 1
+            if has_excess(row, rows):
+                mem.pairs += 1
+                mem.elastic = 1.0
+    mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
+    mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
+    mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for at in range(rows.size * (steps + 1)):
+        now.slacks.slack[at], now.slacks.excess[at], rows.force[at] = 0.0, 0.0, 0.0
+        if rows.live[at] != 0:
+            begin_row(at, begun, stages, work, mem)
+    adjoint(stages, work.costates, work.other.changes.controls)
+    take_measures(stages, work, mem)
+    violated = off(now, stages)
+    mem.before = mem.cost
+    mem.farthest_gap = FARTHEST * max(PER_ROW * steps, violated)
+    mem.farthest = FARTHEST * max(PER_ROW * max(float(steps), mem.pairs), violated)
+
+
+def begin_row(at, begun, stages, work, mem):
+    """Choose the first slacks and the multiplier of a row."""
+    rows = stages.rows
+    row = at % rows.size
+    equality, size, price = rows.table[row, KIND] == EQUALITY, rows.table[row, SIZE], rows.table[row, PRICE]
+    number, force, least = work.now.numbers[at], 0.0, begun.room * size
+    if begun.informed:
+        force = begun.known[at]
+    if force > 0 and not equality:
+        least = min(least, mem.parameter / force)
+    slack = 0.0
+    if has_slack(row, rows):
+        slack = max(number, 0.0) + least if equality else max(number, least)
+        middle = mem.parameter / slack
+        if begun.informed and not equality:
+            force = min(max(force, middle / AROUND), AROUND * middle)
+        elif not begun.informed:
+            force = 0.0 if equality else middle
+        work.now.slacks.slack[at] = slack
+    if has_excess(row, rows):
+        work.now.slacks.excess[at] = max(slack - number, BARELY * least)
+    far = WITHIN * price if price < inf else inf
+    rows.force[at] = min(max(force, -far if equality else 0.0), far)
+
+
+def has_slack(row, rows):
+    """Whether a row has the slack of its lower side: all but equalities without a price."""
+    return rows.table[row, KIND] != EQUALITY or rows.table[row, PRICE] < inf
+
+
+def has_excess(row, rows):
+    """Whether a row has the slack of its upper side: rows with a price."""
+    return rows.table[row, PRICE] < inf
+
+
+def regularised(row, rows):
+    """Whether a row is an equality without a price."""
+    return rows.table[row, KIND] == EQUALITY and not rows.table[row, PRICE] < inf
+
+
+def above(at, rows):
+    """Distance of a row's multiplier from its lower bound."""
+    row = at % rows.size
+    return rows.force[at] + rows.table[row, PRICE] if rows.table[row, KIND] == EQUALITY else rows.force[at]
+
+
+def below(at, rows):
+    """Distance of a row's multiplier from its upper bound."""
+    return rows.table[at % rows.size, PRICE] - rows.force[at]
+
+
+# The loop.
+
+
+def iterations(first, last, closing, tolerance, violation, stages, work, mem, log):
+    """Run the iterations `first` to `last` - 1, until the measures are within tolerance or no step helps.
+
+    Then a crossover to the active set makes controls end exactly at their limits. If it fails, the barrier falls
+    further, which shows which rows are active even if most of the cost is constant.
+
+    With `closing`, no iteration follows.
+    """
+    done, ended = first, closing
+    if isnan(mem.target):  # the first call
+        mem.target = tolerance
+    while True:
+        if within(tolerance, violation, mem):
+            mem.solved = 1.0
+        close = max(mem.complementarity, mem.stationarity) < mem.target
+        if mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
+            if not within(tolerance, violation, mem):
+                go_back(stages, work, mem)
+                return done, STALLED
+            if cross(tolerance, violation, stages, work, mem):
+                return done, CONVERGED
+            ended = ended or mem.target <= FINEST
+            mem.target *= FINER
+            mem.since = 0.0
+        if ended:
+            return done, STALLED
+        if done >= last:
+            return done, RUNNING
+        if not isfinite(mem.cost) or not iterate(done, stages, work, mem):
+            ended = True
+            continue
+        row = log[done]
+        row.cost, row.stationarity, row.violation = mem.cost, mem.stationarity, mem.violation
+        row.gap, row.complementarity = mem.gap, mem.complementarity
+        done += 1
+        mem.since += 1
+        ended = creeping(violation, mem)
+
+
+def creeping(violation, mem):
+    """Whether the steps are short, and have been for long."""
+    falls = mem.violation <= violation and mem.cost < mem.before - SLOW * abs(mem.before)
+    if mem.part >= CREEP or falls or mem.solved != 0:
+        mem.short, mem.before = 0.0, mem.cost
+    else:
+        mem.short += 1
+    return mem.short >= CREEPING
+
+
+def within(tolerance, violation, mem):
+    """Whether the measures are within tolerance. The violation of elastic rows is in their slacks."""
+    missed = mem.miss < tolerance if mem.elastic != 0 else mem.violation <= violation
+    return mem.stationarity < tolerance and mem.gap < tolerance and mem.complementarity < tolerance and missed
+
+
+def iterate(done, stages, work, mem):
+    """Do one iteration; return whether a step was found."""
+    least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
+    lower_barrier(done, least, free, stages, work, mem)
+    part = -1.0
+    while True:
+        if not models_with_barrier(stages, work, mem):
+            return False
+        find_step(least, free, stages, work, mem)
+        part = search(True, stages, work, mem)
+        # Far away, linearised equalities may be absurd; softened equalities demand only a part.
+        if part >= STUCK or asked(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
+            break
+        mem.soft *= SOFTER
+    if part < 0:
+        part = force_step(stages, work, mem)
+    if part < 0:
+        return False
+    take(part, stages, work, mem)
+    return True
+
+
+def asked(stages, work):
+    """The largest change of the multiplier of an equality without a price, times its row's size."""
+    rows, largest = stages.rows, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0 and regularised(at % rows.size, rows):
+            largest = larger(largest, abs(work.step.force[at]) * rows.table[at % rows.size, SIZE])
+    return largest
+
+
+def falls_lately(work, mem):
+    """Whether the measures have decreased lately, so that Mehrotra's rule may choose the barrier parameter.
+
+    The rule empties the filter each time. Without this condition, iterations may cycle.
+    """
+    error = larger(larger(mem.stationarity, mem.gap), larger(mem.miss, mem.product / mem.scale))
+    count, worst = int(mem.failed), inf
+    if count > 0:
+        worst = -inf
+        for i in range(min(count, LATELY)):
+            worst = max(worst, work.errors[i])
+    good = error < worst
+    if good:
+        work.errors[count % LATELY] = error
+        mem.failed += 1
+    return good
+
+
+def lower_barrier(done, least, free, stages, work, mem):
+    """Lower the barrier parameter while the measures are small relative to it, unless Mehrotra's rule will."""
+    # A bad first plan may cost a hundred times the optimum, which would make the first barrier too high.
+    mem.highest = min(mem.highest, mem.barrier * mem.scale / max(mem.pairs, 1.0))
+    if mem.parameter > mem.highest and done > 0:
+        mem.parameter, mem.filtered = mem.highest, 0.0
+    if free and mem.rung == 0 and mem.part >= LONG:
+        return
+    for _ in range(LEVELS):
+        residual = max(mem.stationarity * mem.scale, max(mem.miss, mem.gap) * mem.scale)
+        residual = max(residual, off_centre(stages, work, mem))
+        if residual > NEARLY * mem.parameter or mem.parameter <= least:
+            break
+        lower = mem.scale * (mem.parameter / mem.scale) ** POWER
+        mem.parameter, mem.filtered = max(least, min(LOWER * mem.parameter, lower)), 0.0
+
+
+def off_centre(stages, work, mem):
+    """The largest difference of a product of slack and multiplier from the barrier parameter."""
+    rows, slacks, largest = stages.rows, work.now.slacks, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            if has_slack(row, rows):
+                largest = max(largest, abs(slacks.slack[at] * above(at, rows) - mem.parameter))
+            if has_excess(row, rows):
+                largest = max(largest, abs(slacks.excess[at] * below(at, rows) - mem.parameter))
+    return largest
+
+
+def models_with_barrier(stages, work, mem):
+    """Give the models the barrier's curvature, and the least regularisation with which they have a minimum."""
+    rows, slacks = stages.rows, work.now.slacks
+    for at in range(rows.size * (stages.steps + 1)):
+        work.curves[at], work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0, 0.0
+        if rows.live[at] != 0:
+            row, width = at % rows.size, 0.0
+            if regularised(row, rows):
+                size = rows.table[row, SIZE]
+                width = mem.soft * REGULARISATION * size * size / mem.scale
+            else:
+                width = slacks.slack[at] / above(at, rows)
+                if has_excess(row, rows):
+                    width += slacks.excess[at] / below(at, rows)
+            work.curves[at] = 1 / width
+    pull_rows(False, work.corrections, stages, work, mem)
+    rung = regularised_direction(0, stages, work.now.plan, work.gaps, 0.0, mem.scale, work.curves, work.forces)
+    if rung < 0:
+        return False
+    mem.rung, mem.share = float(rung), share_of(rung)
+    return True
+
+
+def pull_rows(beyond, corrections, stages, work, mem):
+    """Write the forces of the rows in the condensed equations of a step; `beyond` adds further residuals."""
+    rows = stages.rows
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            residual = residual_of(at, corrections, rows, work, mem)
+            if beyond:
+                residual += work.beyond[at]
+            work.forces[at] = rows.force[at] - work.curves[at] * residual
+
+
+def residual_of(at, corrections, rows, work, mem):
+    """Residual of a row in these equations: its value, minus slacks with the desired products."""
+    row, residual = at % rows.size, work.now.numbers[at]
+    if has_slack(row, rows):
+        residual -= (mem.parameter - corrections.slack[at]) / above(at, rows)
+    if has_excess(row, rows):
+        residual += (mem.parameter - corrections.excess[at]) / below(at, rows)
+    return residual
+
+
+def solve(beyond, corrections, gaps, stages, work, mem):
+    """Compute another step with the same models, but without weights on changes; return whether there is one."""
+    pull_rows(beyond, corrections, stages, work, mem)
+    return direction(stages, work.now.plan, gaps, mem.share, 0.0, 1.0, work.curves, work.forces) == -1
+
+
+def complete(beyond, corrections, out, stages, work, mem):
+    """Complete the step in `stages` by slacks and multipliers, (PlanStep)."""
+    rows, slacks = stages.rows, work.now.slacks
+    copy_plan(stages.steps, stages.changes, out.changes)
+    for t in range(stages.steps + 1):
+        copy(stages.to_go.gradient[t], N, out.costates[t])
+        for row in range(rows.size):
+            at = rows.size * t + row
+            out.force[at], out.slacks.slack[at], out.slacks.excess[at] = 0.0, 0.0, 0.0
+            if rows.live[at] == 0:
+                continue
+            ahead = moved(t, row, stages) + residual_of(at, corrections, rows, work, mem)
+            if beyond:
+                ahead += work.beyond[at]
+            change = -work.curves[at] * ahead
+            out.force[at] = change
+            if has_slack(row, rows):
+                wanted, dual, slack = mem.parameter - corrections.slack[at], above(at, rows), slacks.slack[at]
+                out.slacks.slack[at] = wanted / dual - slack - slack / dual * change
+            if has_excess(row, rows):
+                wanted, dual, excess = mem.parameter - corrections.excess[at], below(at, rows), slacks.excess[at]
+                out.slacks.excess[at] = wanted / dual - excess + excess / dual * change
+
+
+def find_step(least, free, stages, work, mem):
+    """Find the step of an iteration, with corrections if its models have a minimum without regularisation."""
+    if mem.rung == 0 and free and mem.part >= LONG and mem.pairs > 0:
+        predict(least, stages, work, mem)
+        solve(False, work.corrections, work.gaps, stages, work, mem)
+    complete(False, work.corrections, work.step, stages, work, mem)
+    if mem.rung == 0:
+        centre(stages, work, mem)
+
+
+def predict(least, stages, work, mem):
+    """Mehrotra's rule: set the barrier parameter by an affine step, and second-order corrections of the products."""
+    rows, slacks, step, corrections = stages.rows, work.now.slacks, work.other, work.corrections
+    mem.parameter = 0.0
+    solve(False, corrections, work.gaps, stages, work, mem)
+    complete(False, corrections, step, stages, work, mem)
+    primal, dual = longest(1.0, work.now.slacks, step.slacks, stages), longest_dual(1.0, step.force, stages)
+    average, after = 0.0, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            if has_slack(row, rows):
+                distance = above(at, rows)
+                average += slacks.slack[at] * distance
+                after += (slacks.slack[at] + primal * step.slacks.slack[at]) * (distance + dual * step.force[at])
+            if has_excess(row, rows):
+                distance = below(at, rows)
+                average += slacks.excess[at] * distance
+                after += (slacks.excess[at] + primal * step.slacks.excess[at]) * (distance - dual * step.force[at])
+    average, ratio = average / mem.pairs, after / average
+    mem.parameter = max(least, min(HIGHER * mem.highest, ratio * ratio * ratio * average))
+    mem.filtered = 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0 and primal > CENTRED:
+            corrections.slack[at] = step.slacks.slack[at] * step.force[at]
+            corrections.excess[at] = -step.slacks.excess[at] * step.force[at]
+
+
+def centre(stages, work, mem):
+    """If a slack stops the step early, replace it by another step if that goes further.
+
+    The corrections of that step bring outliers among the products, predicted for a slightly longer step, back to within
+    a factor of `OUTLIER` of the barrier parameter (Gondzio, 1996).
+    """
+    rows, slacks, step, corrections = stages.rows, work.now.slacks, work.step, work.corrections
+    share = boundary(mem)
+    part, dual = longest(share, slacks, step.slacks, stages), longest_dual(share, step.force, stages)
+    if part >= LONG:
+        return
+    ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row, force = at % rows.size, dual_ahead * step.force[at]
+            if has_slack(row, rows):
+                product = (slacks.slack[at] + ahead * step.slacks.slack[at]) * (above(at, rows) + force)
+                work.others.slack[at] = corrections.slack[at] - lacking(product, mem)
+            if has_excess(row, rows):
+                product = (slacks.excess[at] + ahead * step.slacks.excess[at]) * (below(at, rows) - force)
+                work.others.excess[at] = corrections.excess[at] - lacking(product, mem)
+    if not solve(False, work.others, work.gaps, stages, work, mem):
+        return
+    complete(False, work.others, work.other, stages, work, mem)
+    if longest(share, slacks, work.other.slacks, stages) >= part + FURTHER * REACH:
+        count = rows.size * (stages.steps + 1)
+        copy_slacks(count, work.others, corrections)
+        copy_slacks(count, work.other.slacks, step.slacks)
+        copy(work.other.force, count, step.force)
+        copy_plan(stages.steps, work.other.changes, step.changes)
+        for t in range(stages.steps + 1):
+            copy(work.other.costates[t], N, step.costates[t])
+
+
+def lacking(product, mem):
+    """What brings a product to within a factor of the barrier parameter, but not more than that."""
+    wanted = min(max(product, mem.parameter / OUTLIER), OUTLIER * mem.parameter)
+    return max(wanted - product, -OUTLIER * mem.parameter)
+
+
+def boundary(mem):
+    """The share of the distance to a zero slack that a step may take."""
+    return max(BOUNDARY, 1 - mem.parameter / mem.scale)
+
+
+def longest(share, slacks, changes, stages):
+    """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
+    rows, part = stages.rows, 1.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            if has_slack(row, rows) and changes.slack[at] < 0:
+                part = min(part, -share * slacks.slack[at] / changes.slack[at])
+            if has_excess(row, rows) and changes.excess[at] < 0:
+                part = min(part, -share * slacks.excess[at] / changes.excess[at])
+    return part
+
+
+def longest_dual(share, changes, stages):
+    """The same for changes of the multipliers, and their bounds."""
+    rows, part = stages.rows, 1.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row, change = at % rows.size, changes[at]
+            if has_slack(row, rows) and change < 0:
+                part = min(part, -share * above(at, rows) / change)
+            if has_excess(row, rows) and change > 0:
+                part = min(part, share * below(at, rows) / change)
+    return part
+
+
+# The line search.
+
+
+def search(corrected, stages, work, mem):
+    """Backtrack along the step until the filter accepts; the first trial also with a second-order correction.
+
+    The correction reduces the residuals after the whole step, which remain because rows and dynamics are not linear.
+    Only if `corrected` are there corrections.
+
+    Returns:
+      The fraction of the step that leads to the point in `work.tried`, or -1.
+    """
+    step, now = work.step, work.now
+    mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
+    mem.merit = merit_of(now, mem.cost, stages, mem)
+    part, first = longest(boundary(mem), now.slacks, step.slacks, stages), True
+    while part > SHORTEST:
+        mem.tried = go(part, now, step.changes, step.slacks, work.tried, stages)
+        if isfinite(mem.tried) and acceptable(part, work.tried, mem.tried, stages, work, mem):
+            if corrected and part >= LONG:
+                close_residuals(part, stages, work, mem)
+            return part
+        if first and isfinite(mem.tried) and corrected and correct(part, stages, work, mem):
+            close_residuals(part, stages, work, mem)
+            return part
+        first = False
+        part /= 2
+    return -1.0
+
+
+def correct(part, stages, work, mem):
+    """Try a step that also reduces the residuals at a trial, if these have not fallen; return whether it is accepted.
+
+    Multipliers and costates come from the uncorrected step.
+    """
+    rows, now, tried = stages.rows, work.now, work.tried
+    if not off(tried, stages) >= mem.violated:
+        return False
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            before = missed(at, now)
+            work.beyond[at] = part * before + missed(at, tried) - before
+    for t in range(stages.steps):
+        for i in range(N):
+            work.wider[t, i] = part * work.gaps[t, i] + tried.arrived[t, i] - tried.plan.states[t + 1, i]
+    if not solve(True, work.corrections, work.wider, stages, work, mem):
+        return False
+    complete(True, work.corrections, work.other, stages, work, mem)
+    far = longest(boundary(mem), now.slacks, work.other.slacks, stages)
+    cost = go(far, now, work.other.changes, work.other.slacks, work.closer, stages)
+    if not isfinite(cost) or not acceptable(part, work.closer, cost, stages, work, mem):
+        return False
+    copy_point(work.closer, work.tried, stages)
+    mem.tried = cost
+    return True
+
+
+def close_residuals(part, stages, work, mem):
+    """Move the trial towards feasibility by the smallest changes, as far as the filter accepts them.
+
+    The changes use the models of the step, so each change costs a Riccati pass and an evaluation of the steps. A good
+    plan is then feasible long before it is optimal.
+    """
+    rows, tried, slacks, other = stages.rows, work.tried, work.now.slacks, work.other
+    for _ in range(CLOSINGS):
+        violated = off(tried, stages)
+        for at in range(rows.size * (stages.steps + 1)):
+            work.forces[at] = -work.curves[at] * missed(at, tried) if rows.live[at] != 0 else 0.0
+        for t in range(stages.steps):
+            for i in range(N):
+                work.wider[t, i] = tried.arrived[t, i] - tried.plan.states[t + 1, i]
+        if direction(stages, work.now.plan, work.wider, mem.share, 0.0, 0.0, work.curves, work.forces) != -1:
+            return
+        for t in range(stages.steps + 1):
+            for row in range(rows.size):
+                at = rows.size * t + row
+                if rows.live[at] != 0:
+                    change = -work.curves[at] * (moved(t, row, stages) + missed(at, tried))
+                    other.slacks.slack[at] = -slacks.slack[at] / above(at, rows) * change
+                    other.slacks.excess[at] = slacks.excess[at] / below(at, rows) * change
+        far = longest(boundary(mem), tried.slacks, other.slacks, stages)
+        cost = go(far, tried, stages.changes, other.slacks, work.closer, stages)
+        if not isfinite(cost) or off(work.closer, stages) > CLOSER * violated:
+            return
+        if not acceptable(part, work.closer, cost, stages, work, mem):
+            return
+        copy_point(work.closer, tried, stages)
+        mem.tried = cost
+
+
+def force_step(stages, work, mem):
+    """A step for when the filter rejects every fraction of the last step: its fraction; -1 if there is none.
+
+    It is the step of the projected Hessian; or, if the filter rejects that, a small fraction of it, better or not.
+    """
+    rows = stages.rows
+    mem.forced += 1
+    mem.share = 1.0
+    for at in range(rows.size * (stages.steps + 1)):
+        work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0
+    if mem.forced > FORCED or not solve(False, work.corrections, work.gaps, stages, work, mem):
+        return -1.0
+    mem.filtered = 0.0
+    complete(False, work.corrections, work.step, stages, work, mem)
+    part = search(False, stages, work, mem)
+    if part >= 0:
+        return part
+    part = SOME * longest(boundary(mem), work.now.slacks, work.step.slacks, stages)
+    mem.tried = go(part, work.now, work.step.changes, work.step.slacks, work.tried, stages)
+    return part if isfinite(mem.tried) else -1.0
+
+
+def take(part, stages, work, mem):
+    """Go to the trial, with that fraction of the step in multipliers and costates."""
+    rows, step, count = stages.rows, work.step, int(mem.filtered)
+    work.filter[count, 0] = (1 - MARGIN) * mem.violated
+    work.filter[count, 1] = merit_of(work.now, mem.cost, stages, mem) - MARGIN * mem.violated
+    mem.filtered += 1
+    mem.part = part
+    if part >= LONG:
+        mem.soft = max(1.0, mem.soft / SOFTER)
+    dual = longest_dual(boundary(mem), step.force, stages)
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            rows.force[at] += (part if regularised(row, rows) else dual) * step.force[at]
+            if is_hard(row, rows):  # its product stays within a factor of the barrier parameter
+                middle = mem.parameter / work.tried.slacks.slack[at]
+                rows.force[at] = min(max(rows.force[at], middle / WIDE), WIDE * middle)
+    for t in range(stages.steps + 1):
+        for i in range(N):
+            work.costates[t, i] += part * (step.costates[t, i] - work.costates[t, i])
+    go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
+
+
+def go(part, about, changes, slacks, out, stages):
+    """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
+    rows, steps, good = stages.rows, stages.steps, True
+    for t in range(steps + 1):
+        for i in range(N):
+            out.plan.states[t, i] = about.plan.states[t, i] + part * changes.states[t, i]
+        if t < steps:
+            for i in range(M):
+                out.plan.controls[t, i] = about.plan.controls[t, i] + part * changes.controls[t, i]
+    cost = trial(stages, out.plan, out.arrived)
+    for t in range(steps):
+        for i in range(N):
+            good = good and isfinite(out.arrived[t, i])
+    read_rows(stages, out.plan, out.numbers)
+    for at in range(rows.size * (steps + 1)):
+        if rows.live[at] != 0:
+            good = good and isfinite(out.numbers[at])
+            out.slacks.slack[at] = about.slacks.slack[at] + part * slacks.slack[at]
+            out.slacks.excess[at] = about.slacks.excess[at] + part * slacks.excess[at]
+            if is_hard(at % rows.size, rows):
+                out.slacks.slack[at] = max(out.slacks.slack[at], out.numbers[at])
+    return cost if good else nan
+
+
+def is_hard(row, rows):
+    """Whether a row is an inequality without a price."""
+    return rows.table[row, KIND] != EQUALITY and not rows.table[row, PRICE] < inf
+
+
+def missed(at, point):
+    """A row's value minus its slacks."""
+    return point.numbers[at] - (point.slacks.slack[at] - point.slacks.excess[at])
+
+
+def off(point, stages):
+    """Total violation of dynamics and rows at a point, relative to their sizes."""
+    rows, total = stages.rows, gap_of(point, stages)
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            total += abs(missed(at, point)) / rows.table[at % rows.size, SIZE]
+    return total
+
+
+def gap_of(point, stages):
+    """The part of the violation that is due to the dynamics."""
+    total = 0.0
+    for t in range(stages.steps):
+        for i in range(N):
+            total += abs(point.arrived[t, i] - point.plan.states[t + 1, i]) / stages.state_size[i]
+    return total
+
+
+def merit_of(point, cost, stages, mem):
+    """Cost plus prices plus barrier."""
+    rows, logarithms, paid = stages.rows, 0.0, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            if has_slack(row, rows):
+                logarithms += log(point.slacks.slack[at])
+            if has_excess(row, rows):
+                logarithms += log(point.slacks.excess[at])
+                both = rows.table[row, KIND] == EQUALITY
+                slack = point.slacks.slack[at] if both else 0.0
+                paid += rows.table[row, PRICE] * (point.slacks.excess[at] + slack)
+    return cost + paid - mem.parameter * logarithms
+
+
+def slope_of_merit(stages, work, mem):
+    """Derivative of the merit along the step."""
+    rows, step, slacks, slope = stages.rows, work.step, work.now.slacks, 0.0
+    for t in range(stages.steps + 1):
+        for i in range(N):
+            slope += stages.models.gradient[t, i] * step.changes.states[t, i]
+        if t < stages.steps:
+            for i in range(M):
+                slope += stages.models.gradient[t, N + i] * step.changes.controls[t, i]
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            price = rows.table[row, PRICE]
+            if has_slack(row, rows):
+                paid = price if rows.table[row, KIND] == EQUALITY else 0.0
+                slope += (paid - mem.parameter / slacks.slack[at]) * step.slacks.slack[at]
+            if has_excess(row, rows):
+                slope += (price - mem.parameter / slacks.excess[at]) * step.slacks.excess[at]
+    return slope
+
+
+def acceptable(part, point, cost, stages, work, mem):
+    """Whether the filter accepts a trial."""
+    violated, merit, before, slope = off(point, stages), merit_of(point, cost, stages, mem), mem.violated, mem.slope
+    if not isfinite(merit) or violated > mem.farthest or gap_of(point, stages) > mem.farthest_gap:
+        return False
+    for k in range(int(mem.filtered)):
+        if violated > work.filter[k, 0] and merit > work.filter[k, 1]:
+            return False
+    small = SMALL * max(1.0, PER_GAP * stages.steps * N)
+    if before < small and slope < 0 and min(-part * slope, HUGE) ** SWITCH > before**SWITCHED:
+        return merit <= mem.merit + ARMIJO * part * slope + ROUNDING * abs(mem.merit)
+    at_rest = violated < AT_REST and merit <= mem.merit + RESTING * abs(mem.merit)
+    return violated <= (1 - MARGIN) * before or merit <= mem.merit - MARGIN * before or at_rest
+
+
+# Points, and the models about them.
+
+
+def copy_slacks(count, source, target):
+    """Copy the slacks of rows."""
+    copy(source.slack, count, target.slack)
+    copy(source.excess, count, target.excess)
+
+
+def copy_point(source, target, stages):
+    """Copy a point."""
+    count = stages.rows.size * (stages.steps + 1)
+    copy_plan(stages.steps, source.plan, target.plan)
+    for t in range(stages.steps):
+        copy(source.arrived[t], N, target.arrived[t])
+    copy(source.numbers, count, target.numbers)
+    copy_slacks(count, source.slacks, target.slacks)
+
+
+def go_to(point, cost, least, stages, work, mem):
+    """Go to a point of this cost; its multipliers up to `least` count as zero in the models."""
+    copy_point(point, work.now, stages)
+    mem.cost = cost
+    look(stages, work.now.plan, work.costates, least)
+    take_measures(stages, work, mem)
+
+
+def go_back(stages, work, mem):
+    """Go back to the point that was kept."""
+    copy(work.kept_force, stages.rows.size * (stages.steps + 1), stages.rows.force)
+    for t in range(stages.steps + 1):
+        copy(work.kept_costates[t], N, work.costates[t])
+    go_to(work.kept, mem.kept, NEGLIGIBLE * mem.kept_scale, stages, work, mem)
+
+
+def keep_point(stages, work, mem):
+    """Keep the iterate."""
+    copy_point(work.now, work.kept, stages)
+    mem.kept, mem.kept_scale = mem.cost, mem.scale
+    copy(stages.rows.force, stages.rows.size * (stages.steps + 1), work.kept_force)
+    for t in range(stages.steps + 1):
+        copy(work.costates[t], N, work.kept_costates[t])
+
+
+def take_measures(stages, work, mem):
+    """Compute the measures of the iterate, about which the models are."""
+    rows, slacks = stages.rows, work.now.slacks
+    steepest, missing, unequal, widest, product = measure(stages, work.now.plan, work.now.numbers, work.gaps)
+    # Measures are relative to the cost, or to a fraction of its typical size if its terms cancel.
+    least = CANCELLED * mem.typical
+    mem.scale = max(abs(mem.cost), least) if isfinite(mem.cost) else least
+    mem.stationarity, mem.gap, mem.violation = steepest / mem.scale, widest, larger(larger(missing, unequal), 0.0)
+    mem.miss, mem.product = 0.0, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] != 0:
+            row = at % rows.size
+            mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.table[row, SIZE])
+            if has_slack(row, rows):
+                mem.product = larger(mem.product, slacks.slack[at] * above(at, rows))
+            if has_excess(row, rows):
+                mem.product = larger(mem.product, slacks.excess[at] * below(at, rows))
+    # The product of margin and multiplier; for violated elastic rows, that of the other slack.
+    mem.complementarity = (mem.product if mem.elastic != 0 else product) / mem.scale
+
+
+# The crossover from the barrier to the active set.
+
+
+def settle(tolerance, violation, begun, stages, work, mem):
+    """Take steps without a barrier from the given plan and multipliers; return whether they converge."""
+    rows = stages.rows
+    keep_point(stages, work, mem)
+    copy_plan(stages.steps, begun.plan, work.now.plan)
+    mem.cost = trial(stages, work.now.plan, work.now.arrived)
+    read_rows(stages, work.now.plan, work.now.numbers)
+    for at in range(rows.size * (stages.steps + 1)):
+        rows.force[at] = 0.0
+        if rows.live[at] != 0:
+            row = at % rows.size
+            size, price = rows.table[row, SIZE], rows.table[row, PRICE]
+            rows.force[at] = min(max(begun.known[at], -price), price)
+            if rows.table[row, KIND] == LIMIT and work.now.numbers[at] <= AT_LIMIT * size:
+                rows.force[at] = AT_LIMIT * mem.scale / size
+    if isfinite(mem.cost):
+        look(stages, work.now.plan, work.costates, inf)
+        adjoint(stages, work.costates, work.other.changes.controls)
+        if step_to_active_set(tolerance, violation, stages, work, mem):
+            return True
+    go_back(stages, work, mem)
+    return False
+
+
+def cross(tolerance, violation, stages, work, mem):
+    """Cross over from the barrier to the active set: active rows become equalities. Return whether they were right.
+
+    Controls then end exactly at their limits, and multipliers lose the barrier's contribution. Constraints keep a
+    margin for rounding. If the rows were not right, the iterate is as before.
+    """
+    keep_point(stages, work, mem)
+    if step_to_active_set(tolerance, violation, stages, work, mem):
+        return True
+    go_back(stages, work, mem)
+    return False
+
+
+def step_to_active_set(tolerance, violation, stages, work, mem):
+    """Take steps in which rows that press stay at their targets; return whether they converge."""
+    rows, right = stages.rows, False
+    for at in range(rows.size * (stages.steps + 1)):
+        rows.held[at] = first_state(at, rows, work, mem) if rows.live[at] != 0 else FREE
+    for k in range(CROSSINGS):
+        # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.
+        weight = mem.scale / (REGULARISATION if k > 0 else CROSSING)
+        if not right:  # otherwise the models are known
+            for at in range(rows.size * (stages.steps + 1)):
+                if rows.held[at] == FREE:
+                    rows.force[at] = 0.0
+                elif rows.held[at] == PAID:
+                    rows.force[at] = copysign(rows.table[at % rows.size, PRICE], rows.force[at])
+            look(stages, work.now.plan, work.costates, 0.0)
+        if not step_with_held_rows(weight, violation, stages, work, mem):
+            break
+        right = not change_held_rows(rows, stages, work)
+        far = farthest_from_target(violation, stages, work)
+        if right and max(mem.stationarity, mem.gap) < SETTLED * tolerance and far < SETTLED * violation:
+            break
+    if not right or not max(mem.stationarity, mem.gap) < tolerance:
+        return False
+    return mem.elastic != 0 or mem.violation <= violation
+
+
+def first_state(at, rows, work, mem):
+    """What a row does in the active set, by the barrier's slacks and multipliers."""
+    row, number, force = at % rows.size, work.now.numbers[at], rows.force[at]
+    size, price, equality = rows.table[row, SIZE], rows.table[row, PRICE], rows.table[row, KIND] == EQUALITY
+    if price < inf:
+        violation = abs(number) if equality else -number
+        if violation / size > 1 - abs(force) / price:
+            return PAID
+    return HELD if equality or force * size / mem.scale > number / size else FREE
+
+
+def change_held_rows(rows, stages, work):
+    """Correct what rows do in the active set after a step; return whether any was wrong."""
+    wrong = False
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.live[at] == 0:
+            continue
+        row, number, force, before = at % rows.size, work.now.numbers[at], rows.force[at], rows.held[at]
+        if before == HELD and abs(force) > rows.table[row, PRICE]:
+            rows.held[at] = PAID
+        elif before == HELD and force < 0 and rows.table[row, KIND] != EQUALITY:
+            rows.held[at] = FREE
+        elif (before == PAID and number * force > 0) or (before == FREE and number < 0):
+            rows.held[at] = HELD
+        wrong = wrong or rows.held[at] != before
+    return wrong
+
+
+def target_of(row, violation, rows):
+    """The value at which a row is held: constraints that are inequalities keep a margin."""
+    return INSIDE * violation if rows.table[row, KIND] == INEQUALITY else 0.0
+
+
+def farthest_from_target(violation, stages, work):
+    """The largest distance of a row that is held from its target."""
+    rows, largest = stages.rows, 0.0
+    for at in range(rows.size * (stages.steps + 1)):
+        if rows.held[at] == HELD:
+            largest = larger(largest, abs(work.now.numbers[at] - target_of(at % rows.size, violation, rows)))
+    return largest
+
+
+def step_with_held_rows(weight, violation, stages, work, mem):
+    """Take a step that brings rows that are held to their targets; return whether there is one.
+
+    Args:
+      weight: cost of twice the square of a change by a row's size.
+    """
+    rows, now, step = stages.rows, work.now, work.step
+    for t in range(stages.steps):
+        for i in range(N):
+            work.wider[t, i] = stages.models.arrived[t, i] - now.plan.states[t + 1, i]
+    for at in range(rows.size * (stages.steps + 1)):
+        work.curves[at], work.forces[at] = 0.0, rows.force[at]
+        if rows.held[at] == HELD:
+            row = at % rows.size
+            work.curves[at] = weight / (rows.table[row, SIZE] * rows.table[row, SIZE])
+            work.forces[at] -= work.curves[at] * (now.numbers[at] - target_of(row, violation, rows))
+    if direction(stages, now.plan, work.wider, 0.0, 0.0, 1.0, work.curves, work.forces) != -1:
+        return False
+    for t in range(stages.steps + 1):
+        for row in range(rows.size):
+            at = rows.size * t + row
+            step.slacks.slack[at], step.slacks.excess[at] = 0.0, 0.0
+            # The multiplier after the step.
+            step.force[at] = work.forces[at]
+            if rows.held[at] == HELD:
+                step.force[at] -= work.curves[at] * moved(t, row, stages)
+    cost = go(1.0, now, stages.changes, step.slacks, work.tried, stages)
+    if not isfinite(cost):
+        return False
+    copy_slacks(rows.size * (stages.steps + 1), now.slacks, work.tried.slacks)
+    copy(step.force, rows.size * (stages.steps + 1), rows.force)
+    for t in range(stages.steps + 1):
+        copy(stages.to_go.gradient[t], N, work.costates[t])
+    go_to(work.tried, cost, 0.0, stages, work, mem)
+    return True
