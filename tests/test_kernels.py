@@ -40,6 +40,7 @@ from lqrsim.control.tracking_laws import Weights
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 from lqrsim.kernels import (
+    active_set,
     augmented_lagrangian,
     certificate,
     cost_to_come_dual,
@@ -48,13 +49,16 @@ from lqrsim.kernels import (
     declarations,
     estimation,
     exponential,
+    interior_point,
     iterations,
     linear_algebra,
     mjcf_distances,
     mjcf_dynamics,
     model_functions,
+    plan_methods,
     policy_evaluation,
     projection,
+    restoration,
     rollouts,
     rotation_ratios,
     signed_distance,
@@ -65,7 +69,8 @@ from lqrsim.kernels import stages as stage_kernels
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
-    ActiveRows,
+    MEASURES,
+    RESTORED,
     CostModel,
     CostToCome,
     CostToGo,
@@ -75,6 +80,7 @@ from lqrsim.kernels.records import (
     LinearStep,
     Measurements,
     Motion,
+    PlanBeginning,
     Policy,
     Predictor,
     QuadraticStage,
@@ -91,6 +97,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
+from lqrsim.solvers.interior_point import InteriorPoint
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
@@ -115,6 +122,27 @@ DIVIDED = {
     "lqrsim.kernels.differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2,
     "lqrsim.kernels.differences.curvature_from_values": 16 * 2.0**-52 / 1.2e-4**2,
     "lqrsim.kernels.differences.curvature_from_jacobians": 16 * 2.0**-52 / 6e-6,
+    # Steps with rows that are held: their weights are 1e8, and so are what cancels; several steps are taken in turn.
+    **{
+        f"lqrsim.kernels.interior_point.{name}": 100 * 1e8 * 2.0**-52
+        for name in (
+            "interior_point",
+            "iterations",
+            "iterate",
+            "models_with_barrier",
+            "settle",
+            "cross",
+            "settle_rows",
+            "predict",
+            "find_step",
+            "centre",
+            "correct",
+            "close_residuals",
+            "force_step",
+            "search",
+            "solve",
+        )
+    },
 }
 
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
@@ -147,16 +175,24 @@ class Recorded:
 
 
 def snapshot(value: Any, known: dict[int, Any]) -> Any:
-    """A copy in which what was the same array still is; a row becomes an array of one."""
+    """A copy in which arrays that share memory still do; a row becomes an array of one."""
     if isinstance(value, tuple):
         parts = [snapshot(one, known) for one in value]
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     if isinstance(value, np.void):
         return np.array([value.item()], dtype=value.dtype)
     if isinstance(value, np.ndarray) and value.size < MEMORY:
-        if id(value) not in known:
-            known[id(value)] = np.array(value, order="C", subok=False)
-        return known[id(value)]
+        root = value
+        while isinstance(root.base, np.ndarray):
+            root = root.base
+        if root.size >= MEMORY or not (root.flags.c_contiguous and value.flags.c_contiguous):
+            root = value
+        if id(root) not in known:
+            known[id(root)] = np.array(root, order="C", subok=False)
+        if root is value:
+            return known[id(root)]
+        offset = value.ctypes.data - root.ctypes.data
+        return np.ndarray(value.shape, value.dtype, buffer=known[id(root)].data, offset=offset)
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -1165,107 +1201,131 @@ class TestDesigns:
             np.testing.assert_allclose(found, compiled_one, rtol=0, atol=1e-9 * max(1.0, np.abs(compiled_one).max()))
 
 
-class TestInteriorPoint:
-    """What an iteration takes of a problem, and the step that it makes."""
+class TestPlanMethods:
+    """Iterations on states and controls at once, from a soft start, with constraints that bend, and limits."""
 
-    def test_models_steps_and_where_they_lead(self) -> None:
-        """From a soft start, with constraints that bend; the plan is no motion."""
+    def made(self, **changed: Any) -> tuple[Stages, Motion]:
         rng = np.random.default_rng(0)
         kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
-        one = problem(steps=3, constraints=kept)
-        stages, source = Stages(one), source_of(stage_kernels)
-        plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
-        multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
-        rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
-        begun, costates = (3, 1), rng.normal(size=(4, 3))
-        given = *begun, 0, plan, costates, stages._model, stages._values, rows, stages.models
-        replay(source_of(stage_kernels), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
-        replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
-        replay(source, SIZES, "trial_cost", *begun, plan, stages._model, np.zeros((3, 3)))
-        gradient, jacobian = stages.models.gradient, stages.models.jacobian
-        replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
+        stages = Stages(problem(steps=3, constraints=kept, **changed))
+        return stages, Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
+
+    @pytest.mark.parametrize("price", [np.inf, 20.0])
+    @pytest.mark.parametrize("informed", [False, True])
+    def test_interior_point(self, price: float, informed: bool) -> None:
+        stages, plan = self.made(**({"initial": ls.FixedState([0.0, 0.0, 0.3])} if informed else {}))
+        point = InteriorPoint(stages, plan, price=price)
+        stages.state(margin=1e-9)
+        known = np.abs(stages.numbers.ravel()) if informed else np.zeros(stages.live.size)
+        begun = PlanBeginning(plan, known, informed, 1.0, 0.02)
+        work, memory = stages.interior
+        work = work._replace(filter=np.zeros((20, 2)))
+        log = np.zeros(20, MEASURES)
+        kernel = source_of(interior_point)
+
+        def run(task: int, first: int, last: int) -> Any:
+            rest = with_rows((begun, stages.about, work, memory, log))
+            return replay(kernel, SIZES, "interior_point", task, first, last, 1e-6, 1e-6, *rest)
+
+        run(interior_point.BEGIN, 0, 0)
+        assert memory["elastic"][0] == np.isfinite(price)
+        for rung in (3.0, 0.0):  # with regularised models, and without
+            memory["rung"] = rung
+            for done in range(2):
+                memory["filtered"] = 0.0
+                assert run(interior_point.ITERATE, done, done + 1)[0] == done + 1
+        state = with_rows((stages.about, work, memory.view(np.recarray)[0]))
+        assert replay(kernel, SIZES, "force_step", *state) != 0
+        replay(kernel, SIZES, "correct", 1.0, *state)
+        replay(kernel, SIZES, "close_residuals", 0.5, *state)
+        replay(kernel, SIZES, "centre", *state)
+        replay(kernel, SIZES, "predict", 1e-9, *state)
+        memory["parameter"] = 0.1
+        replay(kernel, SIZES, "off_centre", *state)
+        replay(kernel, SIZES, "asked", *state[:2])
+        run(interior_point.SETTLE, 0, 0)
+        memory["solved"] = 1.0
+        replay(kernel, SIZES, "cross", 1e6, 1e6, *state)
+        assert np.isfinite(point.measures).all()
+
+    def test_active_set(self) -> None:
+        """With rows of all kinds held, and prices."""
+        stages, plan = self.made()
+        work, memory = stages.active_set
+        work.plan.states[...], work.plan.controls[...] = plan
+        stages.state(price=np.inf, margin=1e-9)
+        rng = np.random.default_rng(1)
+        stages.force[...] = stages.live * rng.uniform(-0.1, 1.0, size=stages.live.shape)
+
+        def run(task: int) -> Any:
+            rest = with_rows((stages.about, work, memory))
+            return replay(source_of(active_set), SIZES, "active_set", task, 1e-6, *rest)
+
+        run(active_set.BEGIN)
+        run(active_set.PREPARE)
+        outcomes = {run(active_set.PIVOT) for _ in range(40)}
+        assert outcomes & {declarations.CONVERGED, declarations.STALLED}
+        stages.state(price=0.1)
+        stages.held[:, 0] = stages.live[:, 0] * active_set.PAID
+        stages.force[:, 0] = 0.1 * stages.live[:, 0]
+        run(active_set.PREPARE)
+        memory["phase"] = active_set.CHOOSING
+        run(active_set.PIVOT)
+        run(active_set.TAKE)
+        for worst in (True, False):
+            replay(source_of(active_set), SIZES, "change_rows", worst, stages.about, work)
+        run(active_set.ROLL_OUT)
+
+    def test_restoration(self) -> None:
+        stages, plan = self.made(initial=ls.FixedState([0.0, 0.0, 0.3]))
+        sizes = stages.sizes(plan)
+        work, memory = stages.restoration
+        work.plan.states[...], work.plan.controls[...] = plan
+        work.plan.states[0] = [0.0, 0.0, 0.3]
+        log, price = np.zeros(9, RESTORED), float(100 * sizes.cost)
+
+        def run(first: int, last: int) -> Any:
+            rest = with_rows((stages.about, work, memory, log))
+            return replay(source_of(restoration), SIZES, "restoration", first, last, price, *rest)
+
+        run(0, 0)
+        for done in range(3):
+            assert run(done, done + 1)[0] == done + 1
+        replay(source_of(restoration), SIZES, "share_price", price, stages.about, work)
+
+    def test_models_and_steps(self) -> None:
+        """The entries that no method leads to; and models that have no minimum."""
+        stages, plan = self.made()
+        source, rng = source_of(plan_methods), np.random.default_rng(0)
+        costates, rows = rng.normal(size=(4, 3)), stages.live.size
+        assert replay(source, SIZES, "survey", stages.about, plan) > 0
+        stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)
+        replay(source, SIZES, "look", stages.about, plan, costates, 0.0)
+        replay(source, SIZES, "adjoint", stages.about, costates, np.zeros((3, 2)))
+        replay(source, SIZES, "trial", stages.about, plan, np.zeros((3, 3)))
+        replay(source, SIZES, "read_rows", stages.about, plan, np.zeros(rows))
         held = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
-        for curve, free, good in ((stages.models.convex + np.eye(5), 1.0, True), (-np.ones((4, 5, 5)), 0.0, False)):
-            given = 3, np.full(3, free), curve, jacobian, held, np.zeros(2)
-            assert replay(source_of(stage_kernels), SIZES, "least_curvatures", *given) == good
-        policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
-        to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
-        changes = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
-        gaps = 0.1 * rng.normal(size=(3, 3))
+        convex, kernel = stages.models.convex + np.eye(5), source_of(stage_kernels)
+        for curve, good in ((convex, True), (-np.ones((4, 5, 5)), False)):
+            stages.models.hessian[...] = curve
+            given = stages.about, np.zeros(rows), held, np.zeros(2)
+            assert replay(source, SIZES, "least_curvatures", *given) == good
+        gaps, curves, forces = 0.1 * rng.normal(size=(3, 3)), np.zeros(rows), np.zeros(rows)
 
         def direction(hessian: Array, free: float = 1.0) -> int:
-            given = 3, np.full(3, free), 0.0, 1.0, 1.0, 1.0, stages.models._replace(hessian=hessian), gaps
-            rows = stages.active._replace(size=0)
-            failed, _ = replay(source_of(stage_kernels), SIZES, "pivot", *given, rows, policy, to_go, changes)
-            return failed
+            stages.free[...], stages.models.hessian[...] = free, hessian
+            return replay(kernel, SIZES, "direction", stages.about, plan, gaps, 0.0, 0.0, 1.0, curves, forces)
 
-        convex = stages.models.convex + np.eye(5)
         assert direction(convex) == direction(convex, 0.0) == -1
-        assert changes.states.any()
-        limits = Limits(plan.controls - 0.1, plan.controls + 0.1)
-        out = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
-        replay(source, SIZES, "closed_loop_rollout", 3, 0.5, plan, policy, limits, stages._model, out)
+        assert stages.about.changes.states.any()
         bent = convex.copy()
         bent[2, 3:, 3:] -= 1e4 * np.eye(2)
         assert direction(bent) == 2  # the controls of that step have no least
+        given = 0, stages.about, plan, gaps, 0.0, 1.0, curves, forces
+        assert replay(kernel, SIZES, "regularised_direction", *given) > 0
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
         assert direction(bent) == 4  # nor has the start
-
-
-class TestActiveSet:
-    """What is taken of a problem whose rows are held or not, and pivots."""
-
-    def test_models_and_pivots(self) -> None:
-        """From a soft start, with constraints that bend, an equality and limits, some of them held."""
-        rng = np.random.default_rng(0)
-        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState(x=1.4)]
-        stages, source = Stages(problem(steps=3, constraints=kept)), source_of(stage_kernels)
-        plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
-        rows = len(stages.owners)
-        live = stages.live.astype(np.float64).ravel()
-        drawn, force = live * rng.integers(0, 2, size=live.size), live * rng.uniform(-0.1, 1.0, size=live.size)
-        kind = np.where(stages.equality, stage_kernels.EQUALITY, stage_kernels.INEQUALITY)
-        table = np.column_stack(
-            [kind, rng.uniform(0.5, 2.0, size=(rows, 1)), np.full((rows, 1), 1e-2), np.zeros((rows, 3))]
-        )
-        table[stages.owners == -1, 0] = stage_kernels.LIMIT
-        table[stages.owners == -1, 3:] = [(i, sign, side) for sign, i, side in stages.limits]
-        numbers, pressing, wrong = np.zeros((3, live.size))
-        active = ActiveRows(rows, table, live, drawn, numbers, force, pressing, wrong)
-        known = stages._rows._replace(least=0.0, multipliers=force)
-        gaps, costates = np.zeros((3, 3)), rng.normal(size=(4, 3))
-        for own in (0, 1):
-            given = 3, 1, own, plan, costates, stages._model, stages._values, known, stages.models
-            replay(source, SIZES, "linearize_plan", *given, active)
-        replay(
-            source, SIZES, "optimality_measures", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0)
-        )
-        stages.convexify(plan)
-        stages.models.convex[...] += np.eye(5)
-        policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
-        to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
-        changes = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
-
-        def pivot(share: float, free: float = 1.0) -> tuple[int, int]:
-            given = 3, np.full(3, free), share, 2.0, 1e3, 0.5, stages.models, gaps, active, policy, to_go, changes
-            return replay(source, SIZES, "pivot", *given)
-
-        for worst in (1, 0):
-            failed, wrong = pivot(1.0, free=float(worst))
-            assert failed == -1
-            assert wrong == np.count_nonzero(active.wrong) > 1
-            before = active.held.copy()
-            replay(source, SIZES, "update_active_set", 3, worst, active)
-            changed = np.flatnonzero(active.held != before)
-            assert (active.wrong[changed] < 0).all()
-            assert 1 <= len(changed) <= (wrong if worst else 1)
-        stages.models.hessian[2, 3:, 3:] -= 1e6 * np.eye(2)
-        assert pivot(0.5)[0] == 2  # the controls of that step have no least
-        limits = Limits(*(np.tile(side, (3, 1)) for side in (stages.low, stages.high)))
-        motion = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
-        given = 3, 1, plan, policy, limits, active, stages._model, stages._values, motion
-        replay(source, SIZES, "rollout_of_active_set", *given)
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -12,42 +12,18 @@ from league.problems import FAMILIES, Start
 from numpy.random import Generator
 
 import lqrsim as ls
-from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.interior_point import InteriorPoint
+from lqrsim.solvers.active_set import ActiveSet
+from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures
+from lqrsim.solvers.stages import Stages
 from paper.common import numbers
 
 ASIDE = (1e-2, 1e-3, 1e-4)  # of what states and controls change by: how far from the optimum it settles from, in turn
-NEAR = {"barrier": 0.01, "room": 0.01}  # as the strategy begins near an answer
+NEAR = 0.01  # the first barrier parameter and slacks, as the strategy begins near an answer
 MOST = 100  # iterations with the barrier
 CLOSE, ROUNDING = 0.1, 1e-11  # relative to what changes: errors that say something of the order
 FEWEST = 3  # of these, for an order
-
-
-class Watched(InteriorPoint):
-    """Which can be told to settle once more from beside its plan, and keeps the plans that it comes by."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        self._plans: list[Motion] = []
-        super().__init__(*arguments, **options)
-
-    def settle_from(self, plan: Motion) -> list[Motion]:
-        """The plans of each step: all that it can be told to take, for nothing is good enough.
-
-        It keeps its multipliers, and to begin with what it knows of the rows: which of them press.
-        """
-        kept = self.point
-        cost, arrived = self.stages.trial(plan)
-        self.point = self.point._replace(plan=plan, cost=cost, arrived=arrived)
-        self._plans.clear()
-        self._cross(0.0, 0.0)
-        self.point = kept
-        return self._plans[:-1]  # the last is where it goes back to
-
-    def _measure(self) -> None:
-        super()._measure()
-        self._plans.append(self.point.plan)
 
 
 def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
@@ -55,24 +31,36 @@ def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
 
     From as far beside the optimum as leads back to it; empty if nothing does.
     """
-    plan = solution.trajectory
-    point = Watched(problem, Motion(in_c_order(plan.states), in_c_order(plan.controls)), **NEAR)
-    with np.errstate(all="ignore"):
-        found = point.run(tolerance=1e-8, violation=1e-6, most=MOST)
-    best, (of_states, of_controls, *_) = found.plan, point.sizes
+    stages, plan = Stages(problem), Motion(solution.trajectory.states, solution.trajectory.controls)
+    found = InteriorPoint(stages, plan, barrier=NEAR, room=NEAR).run(tolerance=1e-8, violation=1e-6, most=MOST)
+    best, (of_states, of_controls, *_) = found.plan, found.sizes
     if not found.solved:
         return np.array([])
-    inside = (best.controls > point.stages.low) & (best.controls < point.stages.high)
+    inside = (best.controls > stages.low) & (best.controls < stages.high)
     shifts = [rng.uniform(-1, 1, part.shape) for part in best]
     shifts[0][0] = 0.0  # the start is given
     for aside in ASIDE:
         states = best.states + aside * of_states * shifts[0]
         controls = best.controls + aside * of_controls * inside * shifts[1]
-        with np.errstate(all="ignore"):
-            steps = point.settle_from(Motion(in_c_order(states), in_c_order(controls)))
+        steps = settle(stages, Motion(states, controls), found)
         if steps and _apart(steps[-1], best, of_controls) < 1e-6:
             return np.array([_apart(one, steps[-1], of_controls) for one in steps[:-1]])
     return np.array([])
+
+
+def settle(stages: Stages, plan: Motion, found: Found) -> list[Motion]:
+    """The plan, and those after each step from there with the multipliers of the optimum; nothing is good enough."""
+    plans = [plan]
+    with np.errstate(all="ignore"):
+        active = ActiveSet(stages, plan, found.multipliers, 1e-6)
+        active.held[(stages.owners == -1) & (stages.values(found.plan) <= 0) & stages.live] = 1.0
+
+        def watch(measures: Measures) -> bool:
+            plans.append(Motion(*map(np.copy, active.plan)))
+            return False
+
+        active.run(0.0, watch, lambda seconds: False)
+    return plans
 
 
 def problems(planar: int) -> Iterator[tuple[str, ls.Problem, Start | None]]:

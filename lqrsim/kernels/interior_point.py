@@ -3,9 +3,9 @@
 Written in the kernels' subset. Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a
 logarithmic barrier, subject to the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are
 closed on the way. The barrier parameter is reduced by Mehrotra's rule if the last step was long and the measures
-decrease. Otherwise it is reduced when the barrier problem is nearly solved. A filter decides how much of a step is taken
-(Waechter and Biegler, 2006). Corrections with the same models then reduce the residuals of a long step. If a model has
-no minimum, the ladder of `stages.py` gives it one.
+decrease. Otherwise it is reduced when the barrier problem is nearly solved. A filter decides how much of a step is
+taken (Waechter and Biegler, 2006). Corrections with the same models then reduce the residuals of a long step. If a
+model has no minimum, the ladder of `stages.py` gives it one.
 
 A row d of an inequality means d >= 0, a row of an equality d = 0. Control limits are rows, too. The multiplier y of a
 row lies between a lower and an upper bound, and `d = s - p` has two slacks. The product of s and y - lower is the
@@ -16,12 +16,24 @@ equality without a price has no slacks, and is regularised.
 
 from math import copysign, inf, isfinite, isnan, log, nan
 
+from lqrsim.kernels.active_set import (
+    AT_LIMIT,
+    CANCELLED,
+    FREE,
+    HELD,
+    PAID,
+    SOFTNESS,
+    measure_plan,
+    pivot,
+    prepare_step,
+    take_step,
+)
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N
-from lqrsim.kernels.linear_algebra import copy, fill
+from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
+    AIM,
     EQUALITY,
-    INEQUALITY,
     KIND,
     LIMIT,
     PRICE,
@@ -29,6 +41,7 @@ from lqrsim.kernels.stages import (
     adjoint,
     direction,
     look,
+    look_with_own_costates,
     measure,
     moved,
     read_rows,
@@ -38,7 +51,6 @@ from lqrsim.kernels.stages import (
     trial,
 )
 
-REGULARISATION = 1e-8  # relative regularisation of equalities
 # Regularisation of active rows in the first step without a barrier. If a row couples controls, the curvature across it
 # must exceed 1e-9 of its weight; the kernel treats less as rounding.
 CROSSING = 1e-6
@@ -52,11 +64,13 @@ REACH, FURTHER, OUTLIER = 0.5, 0.1, 10.0
 BOUNDARY = 0.99  # least part of the distance to a zero slack that a step may take
 LEVELS = 4  # largest number of reductions of the barrier parameter at once
 NEARLY = 10.0  # residuals of a barrier problem that is nearly solved, relative to the parameter
-LOWER, POWER = 0.2, 1.5  # factor by which the parameter then falls at least, and power of the parameter, if that is less
+LOWER, POWER = (
+    0.2,
+    1.5,
+)  # factor by which the parameter then falls at least, and power of the parameter, if that is less
 HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
 LEAST = 0.1  # least barrier parameter, relative to the tolerance
 NOTHING, FAR = 1e-4, 1e-2  # least scale of the first plan, relative to the typical cost of a change; if infinite
-CANCELLED = 1e-6  # least scale later, relative to the same: the cost's terms may cancel
 SHORTEST = 1e-7  # fraction of a step below which the line search gives up
 MARGIN = 1e-5  # improvement that the filter requires
 ARMIJO = 1e-4  # fraction of the predicted decrease that a step must achieve
@@ -66,8 +80,6 @@ WIDE = 1e10  # factor by which slack times multiplier may differ from the barrie
 CROSSINGS = 8  # largest number of final steps without a barrier
 SETTLED = 1e-3  # fraction of the tolerances at which these end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
-INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the tolerance
-AT_LIMIT = 1e-9  # distance, relative to its range, at which a control counts as at its limit
 CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
 SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
@@ -86,9 +98,6 @@ NEGLIGIBLE = 1e-10  # multiplier that counts as zero in the Hessians, relative t
 # Tasks of `interior_point`: to choose slacks and multipliers at a plan; to take steps without a barrier from there; to
 # iterate; and to cross over, because no iteration follows.
 BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3
-
-# What the rows of an active set do: nothing, stay at their target, or, at a price, stay violated.
-FREE, HELD, PAID = 0.0, 1.0, 2.0
 
 
 def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
@@ -349,7 +358,7 @@ def models_with_barrier(stages, work, mem):
             row, width = at % rows.size, 0.0
             if regularised(row, rows):
                 size = rows.table[row, SIZE]
-                width = mem.soft * REGULARISATION * size * size / mem.scale
+                width = mem.soft * SOFTNESS * size * size / mem.scale
             else:
                 width = slacks.slack[at] / above(at, rows)
                 if has_excess(row, rows):
@@ -832,23 +841,22 @@ def take_measures(stages, work, mem):
 
 def settle(tolerance, violation, begun, stages, work, mem):
     """Take steps without a barrier from the given plan and multipliers; return whether they converge."""
-    rows = stages.rows
+    rows, plan = stages.rows, work.active.plan
     keep_point(stages, work, mem)
-    copy_plan(stages.steps, begun.plan, work.now.plan)
-    mem.cost = trial(stages, work.now.plan, work.now.arrived)
-    read_rows(stages, work.now.plan, work.now.numbers)
+    copy_plan(stages.steps, begun.plan, plan)
+    cost = trial(stages, plan, work.tried.arrived)
+    read_rows(stages, plan, rows.numbers)
     for at in range(rows.size * (stages.steps + 1)):
         rows.force[at] = 0.0
         if rows.live[at] != 0:
             row = at % rows.size
             size, price = rows.table[row, SIZE], rows.table[row, PRICE]
             rows.force[at] = min(max(begun.known[at], -price), price)
-            if rows.table[row, KIND] == LIMIT and work.now.numbers[at] <= AT_LIMIT * size:
+            if rows.table[row, KIND] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
                 rows.force[at] = AT_LIMIT * mem.scale / size
-    if isfinite(mem.cost):
-        look(stages, work.now.plan, work.costates, inf)
-        adjoint(stages, work.costates, work.other.changes.controls)
-        if step_to_active_set(tolerance, violation, stages, work, mem):
+    if isfinite(cost):
+        look_with_own_costates(stages, plan, work.active.costates)
+        if settle_rows(tolerance, violation, stages, work, mem):
             return True
     go_back(stages, work, mem)
     return False
@@ -861,41 +869,57 @@ def cross(tolerance, violation, stages, work, mem):
     margin for rounding. If the rows were not right, the iterate is as before.
     """
     keep_point(stages, work, mem)
-    if step_to_active_set(tolerance, violation, stages, work, mem):
+    copy_plan(stages.steps, work.now.plan, work.active.plan)
+    copy(work.now.numbers, stages.rows.size * (stages.steps + 1), stages.rows.numbers)
+    for t in range(stages.steps + 1):
+        copy(work.costates[t], N, work.active.costates[t])
+    if settle_rows(tolerance, violation, stages, work, mem):
         return True
     go_back(stages, work, mem)
     return False
 
 
-def step_to_active_set(tolerance, violation, stages, work, mem):
-    """Take steps in which rows that press stay at their targets; return whether they converge."""
-    rows, right = stages.rows, False
+def settle_rows(tolerance, violation, stages, work, mem):
+    """Take steps with the rows that press held at their targets, and go where they converge; return whether they do."""
+    rows, active, memory = stages.rows, work.active, work.active_memory[0]
     for at in range(rows.size * (stages.steps + 1)):
-        rows.held[at] = first_state(at, rows, work, mem) if rows.live[at] != 0 else FREE
+        rows.held[at] = first_state(at, rows, mem) if rows.live[at] != 0 else FREE
+        if rows.held[at] == FREE:
+            rows.force[at] = 0.0
+        elif rows.held[at] == PAID:
+            rows.force[at] = copysign(rows.table[at % rows.size, PRICE], rows.force[at])
+    memory.typical = mem.typical
+    memory.cost = look(stages, active.plan, active.costates, 0.0)
+    measure_plan(violation, stages, active, memory)
     for k in range(CROSSINGS):
         # The first step may be long; with a weight as large as in the other steps, rounding would spoil it.
-        weight = mem.scale / (REGULARISATION if k > 0 else CROSSING)
-        if not right:  # otherwise the models are known
-            for at in range(rows.size * (stages.steps + 1)):
-                if rows.held[at] == FREE:
-                    rows.force[at] = 0.0
-                elif rows.held[at] == PAID:
-                    rows.force[at] = copysign(rows.table[at % rows.size, PRICE], rows.force[at])
-            look(stages, work.now.plan, work.costates, 0.0)
-        if not step_with_held_rows(weight, violation, stages, work, mem):
+        softness, outcome = SOFTNESS if k > 0 else CROSSING, RUNNING
+        prepare_step(stages, active, memory)
+        while outcome == RUNNING:
+            outcome = pivot(softness, stages, active, memory)
+        if outcome == STALLED:
             break
-        right = not change_held_rows(rows, stages, work)
-        far = farthest_from_target(violation, stages, work)
-        if right and max(mem.stationarity, mem.gap) < SETTLED * tolerance and far < SETTLED * violation:
+        take_step(violation, stages, active, memory)
+        if not isfinite(memory.cost):
+            return False
+        far = farthest_from_target(rows, stages.steps)
+        if max(memory.stationarity, memory.gap) < SETTLED * tolerance and far < SETTLED * violation:
             break
-    if not right or not max(mem.stationarity, mem.gap) < tolerance:
+    kept = mem.elastic != 0 or memory.violation <= violation
+    if not kept or not max(memory.stationarity, memory.gap) < tolerance:
         return False
-    return mem.elastic != 0 or mem.violation <= violation
+    copy_plan(stages.steps, active.plan, work.now.plan)
+    copy(rows.numbers, rows.size * (stages.steps + 1), work.now.numbers)
+    for t in range(stages.steps + 1):
+        copy(active.costates[t], N, work.costates[t])
+    mem.cost = memory.cost
+    take_measures(stages, work, mem)
+    return True
 
 
-def first_state(at, rows, work, mem):
-    """What a row does in the active set, by the barrier's slacks and multipliers."""
-    row, number, force = at % rows.size, work.now.numbers[at], rows.force[at]
+def first_state(at, rows, mem):
+    """What a row does in the active set, by its value and multiplier."""
+    row, number, force = at % rows.size, rows.numbers[at], rows.force[at]
     size, price, equality = rows.table[row, SIZE], rows.table[row, PRICE], rows.table[row, KIND] == EQUALITY
     if price < inf:
         violation = abs(number) if equality else -number
@@ -904,69 +928,10 @@ def first_state(at, rows, work, mem):
     return HELD if equality or force * size / mem.scale > number / size else FREE
 
 
-def change_held_rows(rows, stages, work):
-    """Correct what rows do in the active set after a step; return whether any was wrong."""
-    wrong = False
-    for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] == 0:
-            continue
-        row, number, force, before = at % rows.size, work.now.numbers[at], rows.force[at], rows.held[at]
-        if before == HELD and abs(force) > rows.table[row, PRICE]:
-            rows.held[at] = PAID
-        elif before == HELD and force < 0 and rows.table[row, KIND] != EQUALITY:
-            rows.held[at] = FREE
-        elif (before == PAID and number * force > 0) or (before == FREE and number < 0):
-            rows.held[at] = HELD
-        wrong = wrong or rows.held[at] != before
-    return wrong
-
-
-def target_of(row, violation, rows):
-    """The value at which a row is held: constraints that are inequalities keep a margin."""
-    return INSIDE * violation if rows.table[row, KIND] == INEQUALITY else 0.0
-
-
-def farthest_from_target(violation, stages, work):
+def farthest_from_target(rows, steps):
     """The largest distance of a row that is held from its target."""
-    rows, largest = stages.rows, 0.0
-    for at in range(rows.size * (stages.steps + 1)):
+    largest = 0.0
+    for at in range(rows.size * (steps + 1)):
         if rows.held[at] == HELD:
-            largest = larger(largest, abs(work.now.numbers[at] - target_of(at % rows.size, violation, rows)))
+            largest = larger(largest, abs(rows.numbers[at] - rows.table[at % rows.size, AIM]))
     return largest
-
-
-def step_with_held_rows(weight, violation, stages, work, mem):
-    """Take a step that brings rows that are held to their targets; return whether there is one.
-
-    Args:
-      weight: cost of twice the square of a change by a row's size.
-    """
-    rows, now, step = stages.rows, work.now, work.step
-    for t in range(stages.steps):
-        for i in range(N):
-            work.wider[t, i] = stages.models.arrived[t, i] - now.plan.states[t + 1, i]
-    for at in range(rows.size * (stages.steps + 1)):
-        work.curves[at], work.forces[at] = 0.0, rows.force[at]
-        if rows.held[at] == HELD:
-            row = at % rows.size
-            work.curves[at] = weight / (rows.table[row, SIZE] * rows.table[row, SIZE])
-            work.forces[at] -= work.curves[at] * (now.numbers[at] - target_of(row, violation, rows))
-    if direction(stages, now.plan, work.wider, 0.0, 0.0, 1.0, work.curves, work.forces) != -1:
-        return False
-    for t in range(stages.steps + 1):
-        for row in range(rows.size):
-            at = rows.size * t + row
-            step.slacks.slack[at], step.slacks.excess[at] = 0.0, 0.0
-            # The multiplier after the step.
-            step.force[at] = work.forces[at]
-            if rows.held[at] == HELD:
-                step.force[at] -= work.curves[at] * moved(t, row, stages)
-    cost = go(1.0, now, stages.changes, step.slacks, work.tried, stages)
-    if not isfinite(cost):
-        return False
-    copy_slacks(rows.size * (stages.steps + 1), now.slacks, work.tried.slacks)
-    copy(step.force, rows.size * (stages.steps + 1), rows.force)
-    for t in range(stages.steps + 1):
-        copy(stages.to_go.gradient[t], N, work.costates[t])
-    go_to(work.tried, cost, 0.0, stages, work, mem)
-    return True

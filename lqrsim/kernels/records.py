@@ -228,7 +228,8 @@ class StageRows(NamedTuple):
     Attributes:
       table: (size, 7) properties of each row; see `stages.py`.
       first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
-      live, held: ((T+1) size,) 1 for rows that act, and for rows that are fixed at their target, else 0.
+      live: ((T+1) size,) 1 for rows that act, else 0. held: ((T+1) size,) what rows do in an active set; see
+        `active_set.py`.
       numbers: ((T+1) size,) values. force: ((T+1) size,) multipliers.
     """
 
@@ -269,18 +270,27 @@ class PlanStages(NamedTuple):
     changes: Motion
 
 
-class RowWork(NamedTuple):
-    """Numbers of rows, ((T+1) size,) each, while an active set is sought.
+class ActiveSetArrays(NamedTuple):
+    """All arrays of an active set, with K = (T+1) size rows.
 
     Attributes:
-      curves, forces: see `direction` of `stages.py`. pressing: multipliers after a step.
-      wrong: relative distance by which a row is on the wrong side after a step, negative; else 0.
+      plan: the iterate, a Motion. costates: (T+1, N) and gaps: (T, N) there. out, limits: of its rollout.
+      curves, forces: (K,) see `direction` of `stages.py`. pressing: (K,) multipliers after a step.
+      wrong: (K,) relative distance by which a row is on the wrong side after a step, negative; else 0.
+      before, chosen: (K,) the rows that were held before the step, and that convex models choose.
     """
 
+    plan: Motion
+    costates: Arrays
+    gaps: Arrays
+    out: Motion
+    limits: Limits
     curves: Arrays
     forces: Arrays
     pressing: Arrays
     wrong: Arrays
+    before: Arrays
+    chosen: Arrays
 
 
 class Slacks(NamedTuple):
@@ -337,6 +347,7 @@ class InteriorArrays(NamedTuple):
       curves, forces: (K,) see `direction` of `stages.py`.
       corrections, others: corrections of the products of slacks and multipliers.
       beyond: (K,) further residuals of the rows. wider: (T, N) further gaps.
+      active: the arrays of the crossover to an active set. active_memory: (1,) row of `ACTIVE_SET`.
       filter: (any, 2) violations and merits that a trial must not both exceed. errors: (LATELY,) the last errors.
     """
 
@@ -356,6 +367,8 @@ class InteriorArrays(NamedTuple):
     others: Slacks
     beyond: Arrays
     wider: Arrays
+    active: ActiveSetArrays
+    active_memory: Arrays
     filter: Arrays
     errors: Arrays
 
@@ -736,36 +749,42 @@ MEMORY = _row(
     "patient",
 )  # fmt: skip
 
-# The state of an interior point between calls.
-# cost, stationarity, violation, gap, complementarity: the measures of the iterate; see `interior_point.Measures` of the
-# solvers. miss: largest difference of a row's value and its slacks, relative to the row's size. product: largest product
-# of a slack and its multiplier. scale: the cost to which measures are relative. typical: the typical cost of a change.
-# parameter, highest, barrier: the barrier parameter; its largest value; and that as a fraction of the cost of a row.
-# pairs: number of slacks. elastic: 1 if a row has a price.
-# rung: that of the step's models on the ladder of regularisation. share: fraction of the projected Hessian in these.
-# soft: softness of equalities. part: the fraction of the last step that was taken. forced: number of steps that were
-# taken although the filter rejected them. filtered, failed: numbers of rows of the filter and of the last errors.
-# farthest, farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the
-# cost of its trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier
-# falls. since: number of iterations since the last attempt to cross over. short: number of short steps in a row.
-# before: cost at the first of these. kept, kept_scale: cost and scale of the point to go back to.
+# The state of an interior point between calls. cost, stationarity, violation, gap, complementarity: the measures of the
+# iterate; see `interior_point.Measures` of the solvers. miss: largest difference of a row's value and its slacks,
+# relative to the row's size. product: largest product of a slack and its multiplier. scale: the cost to which measures
+# are relative. typical: the typical cost of a change. parameter, highest, barrier: the barrier parameter; its largest
+# value; and that as a fraction of the cost of a row. pairs: number of slacks. elastic: 1 if a row has a price. rung:
+# that of the step's models on the ladder of regularisation. share: fraction of the projected Hessian in these. soft:
+# softness of equalities. part: the fraction of the last step that was taken. forced: number of steps that were taken
+# although the filter rejected them. filtered, failed: numbers of rows of the filter and of the last errors. farthest,
+# farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the cost of its
+# trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier falls. since:
+# number of iterations since the last attempt to cross over. short: number of short steps in a row. before: cost at the
+# first of these. kept, kept_scale: cost and scale of the point to go back to.
 INTERIOR = _row(
     "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
-    "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed", "farthest",
-    "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before", "kept",
-    "kept_scale",
+    "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed",
+    "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before",
+    "kept", "kept_scale",
+)  # fmt: skip
+
+# The state of an active set between calls. cost, stationarity, violation, gap, complementarity, scale, typical: as
+# above. kept: 1 if the plan keeps the constraints. phase, pivots, fewest, patience: of a step; number of pivots in its
+# phase, the least number of wrong rows so far, and the number of pivots that may pass without fewer.
+ACTIVE_SET = _row(
+    "cost", "stationarity", "violation", "gap", "complementarity", "scale", "typical", "kept", "phase", "pivots",
+    "fewest", "patience",
 )  # fmt: skip
 
 # The measures of an iteration of the interior point.
 MEASURES = _row("cost", "stationarity", "violation", "gap", "complementarity")
 
-# The state of a restoration between calls.
-# rows: number of rows that act. parameter, least: the barrier parameter, and its least value. damping: of the steps.
-# level: the predicted decrease that is negligible. cost, merit, decrease: of the iterate, and the predicted slope of its
-# merit. promised: its predicted decrease, relative to the merit. part: the fraction of the step that was accepted; 0 for
-# none. violation, near: of the iterate, and whether it is nearly feasible. close: number of times in a row that it was,
-# and its cost `before` hardly different. informed: 1 once multipliers are known. looking: 1 if the last iteration is not
-# yet completed.
+# The state of a restoration between calls. rows: number of rows that act. parameter, least: the barrier parameter, and
+# its least value. damping: of the steps. level: the predicted decrease that is negligible. cost, merit, decrease: of
+# the iterate, and the predicted slope of its merit. promised: its predicted decrease, relative to the merit. part: the
+# fraction of the step that was accepted; 0 for none. violation, near: of the iterate, and whether it is nearly
+# feasible. close: number of times in a row that it was, and its cost `before` hardly different. informed: 1 once
+# multipliers are known. looking: 1 if the last iteration is not yet completed.
 RESTORATION = _row(
     "rows", "parameter", "least", "damping", "level", "cost", "merit", "decrease", "promised", "part", "violation",
     "near", "close", "before", "informed", "looking",

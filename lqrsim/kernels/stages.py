@@ -215,7 +215,7 @@ def read_rows(stages, plan, numbers):
 
 
 def survey(stages, plan):
-    """Determine which rows act, and typical sizes, from a plan and the models about it; return the cost of such changes.
+    """Determine which rows act, and typical sizes, from a plan and the models about it; return the typical cost.
 
     Which entries a row depends on is determined from slopes at the plan and near it.
     """
@@ -279,7 +279,7 @@ def typical_sizes(stages, plan, hessian):
     for t in range(steps + 1):
         for i in range(W):
             cost += 0.5 * abs(hessian[t, i, i]) * size_of(i, stages) * size_of(i, stages)
-    return cost if 0 < cost and cost < inf else 1.0
+    return cost if cost > 0 and cost < inf else 1.0
 
 
 def size_of(i, stages):
@@ -319,7 +319,7 @@ def measure(stages, plan, numbers, gaps):
     Returns:
       The largest derivative of the Lagrangian in a control or a free start, times its size; the largest violation of
       an inequality, negative if all are satisfied; the largest violation of an equality; the largest gap, relative to
-      the state's size; and the largest product of a multiplier and the value of its inequality.
+      the state's size; and the largest product of a multiplier and the value of its inequality, if that has no price.
     """
     slope, after, rows = stack(W), stack(N), stages.rows
     steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
@@ -340,7 +340,8 @@ def measure(stages, plan, numbers, gaps):
                 unequal = larger(unequal, abs(numbers[at]))
             else:
                 missed = larger(missed, -numbers[at])
-                product = larger(product, abs(numbers[at]) * rows.force[at])
+                if not rows.table[row, PRICE] < inf:
+                    product = larger(product, abs(numbers[at]) * rows.force[at])
     for i in range(N):
         steepest = larger(steepest, abs(after[i]) * stages.state_size[i] * stages.free[i])
     return steepest, missed, unequal, widest, product

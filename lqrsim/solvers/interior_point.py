@@ -11,21 +11,12 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ITERATE, LATELY, SETTLE
-from lqrsim.kernels.records import (
-    INTERIOR,
-    MEASURES,
-    InteriorArrays,
-    Motion,
-    PlanBeginning,
-    PlanPoint,
-    PlanStep,
-    Slacks,
-)
-from lqrsim.kernels.stages import PRICE
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, ITERATE, SETTLE
+from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
-from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.problem.problem import FixedState
 from lqrsim.solvers.budget import ATTENTION, Laps
+from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Sizes, Stages
 
 NAME = "interior point"  # name of its iterations in the log
@@ -50,9 +41,7 @@ class Measures(NamedTuple):
     def record(self, laps: Laps, method: str = NAME, seconds: float | None = None) -> None:
         """Record the residuals as those of an iteration; by default it took all the time since the last one."""
         optimality = max(self.stationarity, self.complementarity)
-        laps.record(
-            method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation, seconds=seconds
-        )
+        laps.record(method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation, seconds=seconds)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -102,13 +91,12 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             begun.states[0, fixed] = np.asarray(problem.start)[fixed]
-        stages.about.rows.table[:, PRICE] = np.where(stages.owners == -1, np.inf, price)
+        stages.state(price=price)
         known = in_c_order(stages.of_constraints(multipliers)).reshape(-1)
         self._begun = PlanBeginning(
             Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier), float(room)
         )
-        self._arrays, self._memory = stages.work.get("interior") or _allocated(stages)
-        stages.work["interior"] = self._arrays, self._memory
+        self._arrays, self._memory = stages.interior
         self._log = np.zeros(0, MEASURES)
         self._tolerances = np.nan, np.nan
         self._call(BEGIN, 0)
@@ -146,6 +134,7 @@ class InteriorPoint:
         functions = functions_of(self.stages.problem)
         self._make_room(most)
         self._tolerances = float(tolerance), float(violation)
+        self.stages.state(margin=INSIDE * violation)
         clock = time.perf_counter()
         if near and self._call(SETTLE, 1)[1] == CONVERGED:
             self.iterations = 1
@@ -178,7 +167,7 @@ class InteriorPoint:
         self._log = np.zeros(most, MEASURES)
         if len(self._arrays.filter) < most:
             self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
-            self.stages.work["interior"] = self._arrays, self._memory
+            self.stages.interior = self._arrays, self._memory
 
     def _found(self, solved: bool) -> Found:
         stages = self.stages
@@ -188,30 +177,6 @@ class InteriorPoint:
             pressing[:, i] -= sign * stages.force[:-1, row]
         return Found(
             plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=self.measures,
-            multipliers=known, pressing=pressing, solved=solved, sizes=self.sizes, scale=float(self._memory["scale"][0]),
+            multipliers=known, pressing=pressing, solved=solved, sizes=self.sizes,
+            scale=float(self._memory["scale"][0]),
         )  # fmt: skip
-
-
-def _allocated(stages: Stages) -> tuple[InteriorArrays, Array]:
-    """The memory of an interior point."""
-    n, m, steps, rows, zeros = stages.n, stages.m, stages.steps, stages.live.size, np.zeros
-
-    def motion() -> Motion:
-        return Motion(zeros((steps + 1, n)), zeros((steps, m)))
-
-    def slacks() -> Slacks:
-        return Slacks(zeros(rows), zeros(rows))
-
-    def point() -> PlanPoint:
-        return PlanPoint(motion(), zeros((steps, n)), zeros(rows), slacks())
-
-    def step() -> PlanStep:
-        return PlanStep(motion(), slacks(), zeros(rows), zeros((steps + 1, n)))
-
-    arrays = InteriorArrays(
-        now=point(), costates=zeros((steps + 1, n)), gaps=zeros((steps, n)), tried=point(), closer=point(),
-        kept=point(), kept_force=zeros(rows), kept_costates=zeros((steps + 1, n)), step=step(), other=step(),
-        curves=zeros(rows), forces=zeros(rows), corrections=slacks(), others=slacks(), beyond=zeros(rows),
-        wider=zeros((steps, n)), filter=zeros((0, 2)), errors=zeros(LATELY),
-    )  # fmt: skip
-    return arrays, zeros(1, INTERIOR)

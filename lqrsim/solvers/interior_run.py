@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from lqrsim.errors import Array
+from lqrsim.kernels.active_set import AT_LIMIT, FIRMNESS
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.kernels.interior_point import AT_LIMIT
 from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
-from lqrsim.solvers.stages import FIRMNESS, Stages
+from lqrsim.solvers.stages import Stages
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError, check_kind, check_number
-from lqrsim.kernels.records import Motion, RowWork
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
@@ -110,15 +110,12 @@ class PreparedSolver:
             stages, plan = Stages(self.problem), Motion(*run.work.best)
             _Neighbour(run, stages, plan, _Best(run)).find()
             # Another solve may need code that this solve did not need.
-            stages.call("update_active_set", stages.about, 0, RowWork(*(np.zeros(stages.live.size) for _ in range(4))))
-            with np.errstate(all="ignore"):
-                InteriorPoint(stages, plan).run(
-                    tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
-                )
-                restore(
-                    stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True,
-                    stationary=lambda *_: False,
-                )  # fmt: skip
+            InteriorPoint(stages, plan).run(
+                tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
+            )
+            restore(
+                stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False
+            )
 
     def _stages_of(self, problem: Problem) -> Stages:
         try:
@@ -291,7 +288,10 @@ class _Neighbour:
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    self._stages, copied(self._best.plan), barrier=LITTLE.parameter, room=LITTLE.room,
+                    self._stages,
+                    copied(self._best.plan),
+                    barrier=LITTLE.parameter,
+                    room=LITTLE.room,
                     multipliers=known,
                 )
 

@@ -9,7 +9,7 @@ import numpy as np
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING
-from lqrsim.kernels.records import RESTORATION, RESTORED, Limits, Motion, RestorationArrays
+from lqrsim.kernels.records import RESTORED, Motion
 from lqrsim.kernels.stages import SIZE
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.solvers.budget import ATTENTION
@@ -45,8 +45,7 @@ def restore(
     Returns:
       None if a trajectory is not finite, or there is no step.
     """
-    work, memory = stages.work.get("restoration") or _allocated(stages)
-    stages.work["restoration"] = work, memory
+    work, memory = stages.restoration
     stages.about.state_size[...], stages.about.control_size[...] = sizes.states, sizes.controls
     stages.about.rows.table[:, SIZE] = sizes.rows
     work.plan.states[...], work.plan.controls[...] = plan
@@ -77,17 +76,3 @@ def restore(
     if outcome == NOT_FINITE:
         return None
     return Restored(Motion(*map(np.copy, work.plan)), settled, bool(memory["near"][0]))
-
-
-def _allocated(stages: Stages) -> tuple[RestorationArrays, Array]:
-    """The memory of a restoration."""
-    n, m, steps, rows, zeros = stages.n, stages.m, stages.steps, stages.live.size, np.zeros
-
-    def motion() -> Motion:
-        return Motion(zeros((steps + 1, n)), zeros((steps, m)))
-
-    arrays = RestorationArrays(
-        motion(), motion(), Limits(zeros((steps, m)), zeros((steps, m))), zeros((steps + 1, n)), zeros((steps, n)),
-        zeros((steps, n)), *(zeros(rows) for _ in range(5)),
-    )  # fmt: skip
-    return arrays, zeros(1, RESTORATION)

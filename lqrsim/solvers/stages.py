@@ -5,8 +5,9 @@ The plan need not satisfy the dynamics; a step closes the gaps between its state
 to do with the rows: the interior point, the active set, and the restoration.
 """
 
+import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,30 @@ from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import plan_methods as kernel
-from lqrsim.kernels.records import CostToGo, Motion, PlanStages, Policy, StageModels, StageRows
-from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, PRICE, SIDE, SIGN, SIZE
+from lqrsim.kernels.interior_point import LATELY
+from lqrsim.kernels.records import (
+    ACTIVE_SET,
+    INTERIOR,
+    RESTORATION,
+    ActiveSetArrays,
+    CostToGo,
+    InteriorArrays,
+    Limits,
+    Motion,
+    PlanPoint,
+    PlanStages,
+    PlanStep,
+    Policy,
+    ProblemModel,
+    RestorationArrays,
+    Slacks,
+    StageModels,
+    StageRows,
+    StructuredArray,
+)
+from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, PRICE, SIDE, SIGN, SIZE
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
-
-FIRMNESS = 8.0  # penalty that makes a policy keep the constraints, in cost per squared row size
 
 
 class Sizes(NamedTuple):
@@ -41,8 +60,7 @@ class Stages:
         R, n+m) of its rows.
       force, held: (T+1, R) multipliers of the rows, and 1 for rows that an active set holds.
       limits: for each row that is a limit, its sign, the control, and the value of the limit.
-      about: `records.PlanStages`, the argument of the kernels; it has the last step. work: memory of the methods, by
-        their names.
+      about: `records.PlanStages`, the argument of the kernels; it has the last step.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -50,8 +68,7 @@ class Stages:
         self.n, self.m, steps = n, m, problem.steps
         self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
-        self.work: dict[str, Any] = {}
-        zeros, terms = np.zeros, problem.constraint_terms
+        zeros, terms, unread = np.zeros, problem.constraint_terms, cast(ProblemModel, None)
         counts = [term.rows for term in terms]
         rows = sum(counts) + sum(len(sides) for sides in _finite(problem))
         self.slopes, self.numbers = zeros((steps + 1, rows, n + m)), zeros((steps + 1, rows))
@@ -61,7 +78,7 @@ class Stages:
             zeros((steps, n, n + m)), zeros((steps, n)), self.slopes.reshape(-1, n + m),
         )  # fmt: skip
         self.about = PlanStages(
-            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), None,
+            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), unread,
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
                 rows, zeros((rows, PRICE + 1)), np.cumsum([0, *counts])[:-1].astype(np.float64),
@@ -104,6 +121,14 @@ class Stages:
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
             table[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
+    def state(self, *, price: float | Array | None = None, margin: float | None = None) -> None:
+        """State prices of violations, in cost per unit, for all or each of the rows; or a margin. Limits have none."""
+        table, limit = self.about.rows.table, self.owners == -1
+        if price is not None:
+            table[:, PRICE] = np.where(limit, np.inf, price)
+        if margin is not None:
+            table[:, AIM] = np.where(limit | self.equality, 0.0, margin)
+
     @property
     def free(self) -> Array:
         """(n,) 1 for the states of the start that are free, else 0."""
@@ -114,8 +139,10 @@ class Stages:
         owners, limits, steps = self.owners, [one[:2] for one in self.limits], self.steps
         counts = [term.rows for term in problem.constraint_terms]
         lower, upper = _finite(problem)
-        same = steps == problem.steps and [*lower, *upper] == [i for _, i in limits] and len(lower) == sum(
-            sign > 0 for sign, _ in limits
+        same = (
+            steps == problem.steps
+            and [*lower, *upper] == [i for _, i in limits]
+            and len(lower) == sum(sign > 0 for sign, _ in limits)
         )
         if not same or not np.array_equal(owners[owners >= 0], np.repeat(np.arange(len(counts)), counts)):
             return Stages(problem)
@@ -168,10 +195,6 @@ class Stages:
         """
         return self.sized(self.call("survey", self.about, _ordered(plan)))
 
-    def sizes_of(self, plan: Motion, hessian: Array) -> Sizes:
-        """Typical sizes from the plan of the current models and the Hessians of its cost."""
-        return self.sized(self.call("typical_sizes", self.about, plan, hessian))
-
     def sized(self, cost: float) -> Sizes:
         """The sizes that a kernel has just written, with the cost that it returned."""
         self.live[...] = self._live > 0
@@ -200,6 +223,57 @@ class Stages:
         costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
         self.call("adjoint", self.about, costates, slopes)
         return costates, slopes
+
+    # The memory of the methods; solves of one structure use it in turn.
+
+    def _motion(self) -> Motion:
+        return Motion(np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m)))
+
+    def _rows(self, count: int) -> tuple[Array, ...]:
+        return tuple(np.zeros(self.live.size) for _ in range(count))
+
+    def _knots(self) -> tuple[Array, Array]:
+        """Costates and gaps."""
+        return np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.n))
+
+    def _bounds(self) -> Limits:
+        return Limits(np.zeros((self.steps, self.m)), np.zeros((self.steps, self.m)))
+
+    @functools.cached_property
+    def active_set(self) -> tuple[ActiveSetArrays, StructuredArray]:
+        """Arrays of an active set, and its state between calls."""
+        arrays = ActiveSetArrays(self._motion(), *self._knots(), self._motion(), self._bounds(), *self._rows(6))
+        return arrays, np.zeros(1, ACTIVE_SET)
+
+    @functools.cached_property
+    def interior(self) -> tuple[InteriorArrays, StructuredArray]:
+        """The same of an interior point."""
+
+        def point() -> PlanPoint:
+            return PlanPoint(self._motion(), self._knots()[1], self._rows(1)[0], Slacks(*self._rows(2)))
+
+        def step() -> PlanStep:
+            return PlanStep(self._motion(), Slacks(*self._rows(2)), self._rows(1)[0], self._knots()[0])
+
+        costates, gaps = self._knots()
+        kept_costates, wider = self._knots()
+        curves, forces, kept_force, beyond = self._rows(4)
+        active, active_memory = self.active_set
+        arrays = InteriorArrays(
+            now=point(), costates=costates, gaps=gaps, tried=point(), closer=point(), kept=point(),
+            kept_force=kept_force, kept_costates=kept_costates, step=step(), other=step(), curves=curves, forces=forces,
+            corrections=Slacks(*self._rows(2)), others=Slacks(*self._rows(2)), beyond=beyond, wider=wider,
+            active=active, active_memory=active_memory, filter=np.zeros((0, 2)), errors=np.zeros(LATELY),
+        )  # fmt: skip
+        return arrays, np.zeros(1, INTERIOR)
+
+    @functools.cached_property
+    def restoration(self) -> tuple[RestorationArrays, StructuredArray]:
+        """The same of a restoration."""
+        arrays = RestorationArrays(
+            self._motion(), self._motion(), self._bounds(), *self._knots(), self._knots()[1], *self._rows(5)
+        )
+        return arrays, np.zeros(1, RESTORATION)
 
 
 def _finite(problem: Problem) -> tuple[list[int], list[int]]:
