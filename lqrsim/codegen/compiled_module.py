@@ -98,25 +98,38 @@ class CompiledModule:
                     self._made[key] = make()
         return self._made[key]
 
-    def _make_entry(self, name: str, types: tuple[Type, ...]) -> "Entry":
-        def write(program: Program, scope: Scope) -> Type | None:
-            return program.entry(scope.function(name), types, "entry")
+    def prepare(self, **calls: tuple[Any, ...]) -> None:
+        """Compile functions for such arguments, name -> arguments, together: what they share is compiled once."""
+        types = {name: tuple(map(type_of, arguments)) for name, arguments in calls.items()}
+        entries = self._once(tuple(types.items()), lambda: self._make_entries(types))
+        self._last |= entries
+        self._made |= {(name, types[name]): entry for name, entry in entries.items()}
 
-        loaded, returns = self._load(f"{name} for {self.what}", repr((name, types)), write, name in LONG)
-        return Entry(types, loaded.address("entry"), returns)
+    def _make_entry(self, name: str, types: tuple[Type, ...]) -> "Entry":
+        return self._make_entries({name: types})[name]
+
+    def _make_entries(self, types: dict[str, tuple[Type, ...]]) -> dict[str, "Entry"]:
+        def write(program: Program, scope: Scope) -> list[Type | None]:
+            return [program.entry(scope.function(name), of, f"entry_{name}") for name, of in types.items()]
+
+        what = f"{' and '.join(list(types)[:2])} for {self.what}"
+        loaded, returns = self._load(what, repr(types), write, not types.keys().isdisjoint(LONG))
+        pairs = zip(types.items(), returns, strict=True)
+        return {name: Entry(of, loaded.address(f"entry_{name}"), kind) for (name, of), kind in pairs}
 
     def _make_functions(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        def write(program: Program, scope: Scope) -> None:
+        def write(program: Program, scope: Scope) -> list[Type | None]:
             for name in names:
                 program.export(scope.function(name), _signature(name, scope.sizes).members, name)
+            return []
 
         loaded, _ = self._load(f"{' and '.join(names[:2])} of {self.what}", repr(names), write, False)
         return tuple(float(loaded.address(name)) for name in names)
 
     def _load(
-        self, what: str, functions: str, write: Callable[[Program, Scope], Type | None], long: bool
-    ) -> tuple[Loaded, Type | None]:
-        """Machine code of some functions, from disk or newly compiled, and the type that their entry returns."""
+        self, what: str, functions: str, write: Callable[[Program, Scope], list[Type | None]], long: bool
+    ) -> tuple[Loaded, list[Type | None]]:
+        """Machine code of some functions, from disk or newly compiled, and the types that entries among them return."""
         sizes = repr(sorted(self._sizes.items()))
         key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
         kept = disk.load(key)
@@ -127,8 +140,8 @@ class CompiledModule:
         return found
 
     def _compiled(
-        self, what: str, write: Callable[[Program, Scope], Type | None], long: bool, key: str
-    ) -> tuple[Loaded, Type | None]:
+        self, what: str, write: Callable[[Program, Scope], list[Type | None]], long: bool, key: str
+    ) -> tuple[Loaded, list[Type | None]]:
         compilations.append(what)
         # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
         log, timed = logger.warning if long else logger.debug, f"{what} on {instruction_set()[1]}"
@@ -142,7 +155,7 @@ class CompiledModule:
         loaded = Loaded(code, libraries)
         if long:
             disk.note(timed, time.perf_counter() - clock)
-        disk.save(key, code, what, libraries=libraries, returns=_encoded(returns))
+        disk.save(key, code, what, libraries=libraries, returns=[_encoded(kind) for kind in returns])
         return loaded, returns
 
 
@@ -313,14 +326,19 @@ def _encoded(returns: Type | None) -> Any:
     return [one.name for one in scalars(returns) if isinstance(one, Scalar)], isinstance(returns, Group)
 
 
-def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, Type | None] | None:
-    """Load a cached function; None if it cannot be used, and must be compiled again."""
+def _decoded(known: Any) -> Type | None:
+    """The type that `_encoded` encoded."""
+    if known is None:
+        return None
+    names, several = known
+    kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
+    return Group(kinds) if several else kinds[0]
+
+
+def _unpacked(code: bytes, known: dict[str, Any]) -> tuple[Loaded, list[Type | None]] | None:
+    """Load cached functions; None if they cannot be used, and must be compiled again."""
     try:
-        returns = None
-        if known["returns"] is not None:
-            names, several = known["returns"]
-            kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
-            returns = Group(kinds) if several else kinds[0]
+        returns = [_decoded(kind) for kind in known["returns"]]
         return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a cached compiled function cannot be used ({error})")

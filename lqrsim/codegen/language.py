@@ -33,7 +33,8 @@ Expressions
 Kernels may also use the functions of `kernels/declarations.py`: `stack` and `zeros` for work arrays of constant shape,
 `call` and `call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, atomic access to
 words that threads share, and `power_of_two`. An address is an int or a float64, which represents all integers up to
-2^53, beyond any address of a process. The decorators `inline`, `outline` and `exact` say how a kernel is compiled.
+2^53, beyond any address of a process. The decorators `inline`, `outline`, `compact` and `exact` say how a kernel is
+compiled.
 """
 
 from dataclasses import dataclass

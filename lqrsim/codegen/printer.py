@@ -96,7 +96,7 @@ class Program:
     def text(self) -> str:
         """The IR."""
         kinds = "attributes #0 = { nounwind }\nattributes #1 = { nounwind alwaysinline }\n"
-        kinds += "attributes #2 = { nounwind noinline }\n"
+        kinds += "attributes #2 = { nounwind noinline }\nattributes #3 = { nounwind noinline optsize }\n"
         return "\n".join([*self._declared.values(), *self._texts, kinds])
 
     @property
@@ -239,8 +239,10 @@ class _Body:
     def run(self) -> None:
         """Print the function."""
         arguments, decorators = self.function.node.args, self.function.node.decorator_list
-        if len(self.function.decorators & {"inline", "outline", "exact"}) < len(decorators):
-            self._refuse(self.function.node, f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @exact or none")
+        if len(self.function.decorators & {"inline", "outline", "compact", "exact"}) < len(decorators):
+            self._refuse(
+                self.function.node, f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @compact, @exact or none"
+            )
         if arguments.vararg or arguments.kwarg or arguments.kwonlyargs or arguments.defaults or arguments.posonlyargs:
             self._refuse(self.function.node, "arguments with defaults, * or **", "positional ones")
         if len(arguments.args) != len(self.types):
@@ -261,7 +263,8 @@ class _Body:
         given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(self.types)))
         kind = "void" if self.result is None else llvm_type(self.result)
         decorators = self.function.decorators
-        attributes = "#1" if "inline" in decorators else "#2" if "outline" in decorators else "#0"
+        known = {"inline": "#1", "outline": "#2", "compact": "#3"}
+        attributes = next((number for name, number in known.items() if name in decorators), "#0")
         lines = [f"define internal {kind} {name}({given}) {attributes} {{", "entry:", *self._slots, "  br label %body"]
         for block in self._blocks:
             lines += [f"{block.label}:", *block.lines]

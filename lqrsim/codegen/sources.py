@@ -24,7 +24,7 @@ from lqrsim.results.archive import sha256
 # Words of the language that `declarations.py` declares.
 WORDS = (
     "stack", "zeros", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
-    "power_of_two", "inline", "outline", "exact",
+    "power_of_two", "inline", "outline", "compact", "exact",
 )  # fmt: skip
 PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
 

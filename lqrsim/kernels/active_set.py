@@ -14,7 +14,7 @@ A row whose price is too low to keep it does not press more than its price: it s
 
 from math import copysign, inf, isfinite, nan
 
-from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
 from lqrsim.kernels.rollouts import larger
@@ -57,6 +57,7 @@ PATIENCE = 3  # pivots without fewer wrong rows before rows change one at a time
 BEGIN, PREPARE, PIVOT, TAKE, ROLL_OUT = 0, 1, 2, 3, 4
 
 
+@compact
 def active_set(task, violation, stages, work, memory):
     """Do a part of a step with an active set, so that the caller can end it in time.
 
@@ -81,6 +82,7 @@ def active_set(task, violation, stages, work, memory):
     return RUNNING
 
 
+@compact
 def begin_active_set(violation, stages, work, mem):
     """Compute the models about the plan, its costates, typical sizes and measures; choose the first active set."""
     rows = stages.rows
@@ -96,6 +98,7 @@ def begin_active_set(violation, stages, work, mem):
     measure_plan(violation, stages, work, mem)
 
 
+@compact
 def leave(stages):
     """Remove rows that do not act at a step from the active set."""
     rows = stages.rows
@@ -106,6 +109,7 @@ def leave(stages):
             rows.force[at], rows.held[at] = 0.0, FREE
 
 
+@compact
 def measure_plan(violation, stages, work, mem):
     """Compute the measures of the plan about which the models are, and whether it keeps the constraints."""
     rows, priced = stages.rows, False
@@ -119,12 +123,14 @@ def measure_plan(violation, stages, work, mem):
     mem.violation = larger(larger(missed, unequal), 0.0)
 
 
+@compact
 def prepare_step(stages, work, mem):
     """Begin a step: with the rows that are known."""
     copy(stages.rows.held, stages.rows.size * (stages.steps + 1), work.before)
     mem.phase, mem.pivots, mem.fewest, mem.patience = 0.0, 0.0, inf, float(PATIENCE)
 
 
+@compact
 def pivot(softness, stages, work, mem):
     """Solve the quadratic problem with the rows that are held; then change rows, or go to the next phase, if need be.
 
@@ -156,6 +162,7 @@ def pivot(softness, stages, work, mem):
     return RUNNING
 
 
+@compact
 def hold(weight, price, stages, work):
     """Write the curvature and the force of each row: `weight` holds limits, `price` constraints; relative to sizes."""
     rows = stages.rows
@@ -168,6 +175,7 @@ def hold(weight, price, stages, work):
             work.forces[at] -= work.curves[at] * (rows.numbers[at] - rows.table[row, AIM])
 
 
+@compact
 def predict_rows(scale, stages, work):
     """Write the multipliers after a step, and which rows are wrong there; return the number of wrong rows."""
     rows, count = stages.rows, 0
@@ -197,6 +205,7 @@ def predict_rows(scale, stages, work):
     return count
 
 
+@compact
 def change_rows(worst, stages, work):
     """Hold rows that are violated, and release or pay for rows with a wrong multiplier.
 
@@ -232,6 +241,7 @@ def change_row(at, rows, work):
         rows.held[at] = FREE
 
 
+@compact
 def take_step(violation, stages, work, mem):
     """Take the step that pivoting has found; compute the models and measures there."""
     rows, changes = stages.rows, stages.changes
@@ -251,6 +261,7 @@ def take_step(violation, stages, work, mem):
     measure_plan(violation, stages, work, mem)
 
 
+@compact
 def roll_out(stages, work, mem):
     """Roll out a policy about the plan into `work.out`, and evaluate the constraints there; write the cost.
 

@@ -70,6 +70,14 @@ def outline(function: Callable) -> Callable:
     return function
 
 
+def compact(function: Callable) -> Callable:
+    """Decorate a kernel that takes little of the time: it is not inlined, and its loops are not unrolled.
+
+    Compiling it then takes a third of the time.
+    """
+    return function
+
+
 def exact(function: Callable) -> Callable:
     """Decorate a kernel whose sums are evaluated in the order in which they are written."""
     return function

@@ -28,7 +28,7 @@ from lqrsim.kernels.active_set import (
     prepare_step,
     take_step,
 )
-from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N
+from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
@@ -100,6 +100,7 @@ NEGLIGIBLE = 1e-10  # multiplier that counts as zero in the Hessians, relative t
 BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3
 
 
+@compact
 def interior_point(task, first, last, tolerance, violation, begun, stages, work, memory, log):
     """Begin an interior point, settle at a known optimum, or run the iterations `first` to `last` - 1.
 
@@ -123,6 +124,7 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     return iterations(first, last, task == CLOSE, tolerance, violation, stages, work, memory[0], log)
 
 
+@compact
 def begin(begun, stages, work, mem):
     """Begin from a plan: compute typical sizes, slacks, multipliers and measures."""
     rows, now, steps, limits = stages.rows, work.now, stages.steps, stages.model.limits
@@ -161,6 +163,7 @@ def begin(begun, stages, work, mem):
     mem.farthest = FARTHEST * max(PER_ROW * max(float(steps), mem.pairs), violated)
 
 
+@compact
 def begin_row(at, begun, stages, work, mem):
     """Choose the first slacks and the multiplier of a row."""
     rows = stages.rows
@@ -215,6 +218,7 @@ def below(at, rows):
 # The loop.
 
 
+@compact
 def iterations(first, last, closing, tolerance, violation, stages, work, mem, log):
     """Run the iterations `first` to `last` - 1, until the measures are within tolerance or no step helps.
 
@@ -270,6 +274,7 @@ def within(tolerance, violation, mem):
     return mem.stationarity < tolerance and mem.gap < tolerance and mem.complementarity < tolerance and missed
 
 
+@compact
 def iterate(done, stages, work, mem):
     """Do one iteration; return whether a step was found."""
     least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
@@ -292,6 +297,7 @@ def iterate(done, stages, work, mem):
     return True
 
 
+@compact
 def asked(stages, work):
     """The largest change of the multiplier of an equality without a price, times its row's size."""
     rows, largest = stages.rows, 0.0
@@ -301,6 +307,7 @@ def asked(stages, work):
     return largest
 
 
+@compact
 def falls_lately(work, mem):
     """Whether the measures have decreased lately, so that Mehrotra's rule may choose the barrier parameter.
 
@@ -319,6 +326,7 @@ def falls_lately(work, mem):
     return good
 
 
+@compact
 def lower_barrier(done, least, free, stages, work, mem):
     """Lower the barrier parameter while the measures are small relative to it, unless Mehrotra's rule will."""
     # A bad first plan may cost a hundred times the optimum, which would make the first barrier too high.
@@ -336,6 +344,7 @@ def lower_barrier(done, least, free, stages, work, mem):
         mem.parameter, mem.filtered = max(least, min(LOWER * mem.parameter, lower)), 0.0
 
 
+@compact
 def off_centre(stages, work, mem):
     """The largest difference of a product of slack and multiplier from the barrier parameter."""
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
@@ -349,6 +358,7 @@ def off_centre(stages, work, mem):
     return largest
 
 
+@compact
 def models_with_barrier(stages, work, mem):
     """Give the models the barrier's curvature, and the least regularisation with which they have a minimum."""
     rows, slacks = stages.rows, work.now.slacks
@@ -372,6 +382,7 @@ def models_with_barrier(stages, work, mem):
     return True
 
 
+@compact
 def pull_rows(beyond, corrections, stages, work, mem):
     """Write the forces of the rows in the condensed equations of a step; `beyond` adds further residuals."""
     rows = stages.rows
@@ -383,6 +394,7 @@ def pull_rows(beyond, corrections, stages, work, mem):
             work.forces[at] = rows.force[at] - work.curves[at] * residual
 
 
+@compact
 def residual_of(at, corrections, rows, work, mem):
     """Residual of a row in these equations: its value, minus slacks with the desired products."""
     row, residual = at % rows.size, work.now.numbers[at]
@@ -393,12 +405,14 @@ def residual_of(at, corrections, rows, work, mem):
     return residual
 
 
+@compact
 def solve(beyond, corrections, gaps, stages, work, mem):
     """Compute another step with the same models, but without weights on changes; return whether there is one."""
     pull_rows(beyond, corrections, stages, work, mem)
     return direction(stages, work.now.plan, gaps, mem.share, 0.0, 1.0, work.curves, work.forces) == -1
 
 
+@compact
 def complete(beyond, corrections, out, stages, work, mem):
     """Complete the step in `stages` by slacks and multipliers, (PlanStep)."""
     rows, slacks = stages.rows, work.now.slacks
@@ -423,6 +437,7 @@ def complete(beyond, corrections, out, stages, work, mem):
                 out.slacks.excess[at] = wanted / dual - excess + excess / dual * change
 
 
+@compact
 def find_step(least, free, stages, work, mem):
     """Find the step of an iteration, with corrections if its models have a minimum without regularisation."""
     if mem.rung == 0 and free and mem.part >= LONG and mem.pairs > 0:
@@ -433,6 +448,7 @@ def find_step(least, free, stages, work, mem):
         centre(stages, work, mem)
 
 
+@compact
 def predict(least, stages, work, mem):
     """Mehrotra's rule: set the barrier parameter by an affine step, and second-order corrections of the products."""
     rows, slacks, step, corrections = stages.rows, work.now.slacks, work.other, work.corrections
@@ -461,6 +477,7 @@ def predict(least, stages, work, mem):
             corrections.excess[at] = -step.slacks.excess[at] * step.force[at]
 
 
+@compact
 def centre(stages, work, mem):
     """If a slack stops the step early, replace it by another step if that goes further.
 
@@ -506,6 +523,7 @@ def boundary(mem):
     return max(BOUNDARY, 1 - mem.parameter / mem.scale)
 
 
+@compact
 def longest(share, slacks, changes, stages):
     """The largest part of the changes of slacks, at most 1, by the fraction-to-the-boundary rule."""
     rows, part = stages.rows, 1.0
@@ -519,6 +537,7 @@ def longest(share, slacks, changes, stages):
     return part
 
 
+@compact
 def longest_dual(share, changes, stages):
     """The same for changes of the multipliers, and their bounds."""
     rows, part = stages.rows, 1.0
@@ -535,6 +554,7 @@ def longest_dual(share, changes, stages):
 # The line search.
 
 
+@compact
 def search(corrected, stages, work, mem):
     """Backtrack along the step until the filter accepts; the first trial also with a second-order correction.
 
@@ -562,6 +582,7 @@ def search(corrected, stages, work, mem):
     return -1.0
 
 
+@compact
 def correct(part, stages, work, mem):
     """Try a step that also reduces the residuals at a trial, if these have not fallen; return whether it is accepted.
 
@@ -589,6 +610,7 @@ def correct(part, stages, work, mem):
     return True
 
 
+@compact
 def close_residuals(part, stages, work, mem):
     """Move the trial towards feasibility by the smallest changes, as far as the filter accepts them.
 
@@ -622,6 +644,7 @@ def close_residuals(part, stages, work, mem):
         mem.tried = cost
 
 
+@compact
 def force_step(stages, work, mem):
     """A step for when the filter rejects every fraction of the last step: its fraction; -1 if there is none.
 
@@ -644,6 +667,7 @@ def force_step(stages, work, mem):
     return part if isfinite(mem.tried) else -1.0
 
 
+@compact
 def take(part, stages, work, mem):
     """Go to the trial, with that fraction of the step in multipliers and costates."""
     rows, step, count = stages.rows, work.step, int(mem.filtered)
@@ -667,6 +691,7 @@ def take(part, stages, work, mem):
     go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
 
 
+@compact
 def go(part, about, changes, slacks, out, stages):
     """Write the point at a fraction of a step from a point; return its cost, NaN if it is not finite."""
     rows, steps, good = stages.rows, stages.steps, True
@@ -701,6 +726,7 @@ def missed(at, point):
     return point.numbers[at] - (point.slacks.slack[at] - point.slacks.excess[at])
 
 
+@compact
 def off(point, stages):
     """Total violation of dynamics and rows at a point, relative to their sizes."""
     rows, total = stages.rows, gap_of(point, stages)
@@ -710,6 +736,7 @@ def off(point, stages):
     return total
 
 
+@compact
 def gap_of(point, stages):
     """The part of the violation that is due to the dynamics."""
     total = 0.0
@@ -719,6 +746,7 @@ def gap_of(point, stages):
     return total
 
 
+@compact
 def merit_of(point, cost, stages, mem):
     """Cost plus prices plus barrier."""
     rows, logarithms, paid = stages.rows, 0.0, 0.0
@@ -735,6 +763,7 @@ def merit_of(point, cost, stages, mem):
     return cost + paid - mem.parameter * logarithms
 
 
+@compact
 def slope_of_merit(stages, work, mem):
     """Derivative of the merit along the step."""
     rows, step, slacks, slope = stages.rows, work.step, work.now.slacks, 0.0
@@ -756,6 +785,7 @@ def slope_of_merit(stages, work, mem):
     return slope
 
 
+@compact
 def acceptable(part, point, cost, stages, work, mem):
     """Whether the filter accepts a trial."""
     violated, merit, before, slope = off(point, stages), merit_of(point, cost, stages, mem), mem.violated, mem.slope
@@ -780,6 +810,7 @@ def copy_slacks(count, source, target):
     copy(source.excess, count, target.excess)
 
 
+@compact
 def copy_point(source, target, stages):
     """Copy a point."""
     count = stages.rows.size * (stages.steps + 1)
@@ -790,6 +821,7 @@ def copy_point(source, target, stages):
     copy_slacks(count, source.slacks, target.slacks)
 
 
+@compact
 def go_to(point, cost, least, stages, work, mem):
     """Go to a point of this cost; its multipliers up to `least` count as zero in the models."""
     copy_point(point, work.now, stages)
@@ -798,6 +830,7 @@ def go_to(point, cost, least, stages, work, mem):
     take_measures(stages, work, mem)
 
 
+@compact
 def go_back(stages, work, mem):
     """Go back to the point that was kept."""
     copy(work.kept_force, stages.rows.size * (stages.steps + 1), stages.rows.force)
@@ -806,6 +839,7 @@ def go_back(stages, work, mem):
     go_to(work.kept, mem.kept, NEGLIGIBLE * mem.kept_scale, stages, work, mem)
 
 
+@compact
 def keep_point(stages, work, mem):
     """Keep the iterate."""
     copy_point(work.now, work.kept, stages)
@@ -815,6 +849,7 @@ def keep_point(stages, work, mem):
         copy(work.costates[t], N, work.kept_costates[t])
 
 
+@compact
 def take_measures(stages, work, mem):
     """Compute the measures of the iterate, about which the models are."""
     rows, slacks = stages.rows, work.now.slacks
@@ -839,6 +874,7 @@ def take_measures(stages, work, mem):
 # The crossover from the barrier to the active set.
 
 
+@compact
 def settle(tolerance, violation, begun, stages, work, mem):
     """Take steps without a barrier from the given plan and multipliers; return whether they converge."""
     rows, plan = stages.rows, work.active.plan
@@ -862,6 +898,7 @@ def settle(tolerance, violation, begun, stages, work, mem):
     return False
 
 
+@compact
 def cross(tolerance, violation, stages, work, mem):
     """Cross over from the barrier to the active set: active rows become equalities. Return whether they were right.
 
@@ -879,6 +916,7 @@ def cross(tolerance, violation, stages, work, mem):
     return False
 
 
+@compact
 def settle_rows(tolerance, violation, stages, work, mem):
     """Take steps with the rows that press held at their targets, and go where they converge; return whether they do."""
     rows, active, memory = stages.rows, work.active, work.active_memory[0]
@@ -917,6 +955,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
     return True
 
 
+@compact
 def first_state(at, rows, mem):
     """What a row does in the active set, by its value and multiplier."""
     row, number, force = at % rows.size, rows.numbers[at], rows.force[at]

@@ -13,7 +13,7 @@ changes of controls. Both are reduced after full steps and increased after short
 
 from math import hypot, inf, isfinite, log
 
-from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N
+from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
@@ -45,6 +45,7 @@ CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
 LEVEL, FINER = 1e-4, 0.1  # negligible predicted decrease, relative to the merit; factor by which it falls
 
 
+@compact
 def restoration(first, last, price, stages, work, memory, log):
     """Run the iterations `first` to `last` - 1 from the plan in `work.plan`; with `last` of 0, begin there.
 
@@ -85,6 +86,7 @@ def restoration(first, last, price, stages, work, memory, log):
             return done, NO_PROGRESS
 
 
+@compact
 def begin_restoration(price, stages, work, mem):
     """Begin with the rollout of the plan's controls, moved inside their limits."""
     rows, limits, steps = stages.rows, stages.model.limits, stages.steps
@@ -109,6 +111,7 @@ def begin_restoration(price, stages, work, mem):
         fill(work.costates[t], N, 0.0)
 
 
+@compact
 def confine(stages, work):
     """Write the limits of the controls in one step from the plan."""
     limits = stages.model.limits
@@ -119,6 +122,7 @@ def confine(stages, work):
             work.limits.high[t, i] = high - INSIDE * (high - control) if high < inf else high
 
 
+@compact
 def descend(price, stages, work, mem):
     """Find a step and try fractions of it, into `work.trial`; return whether there is a step."""
     rows, steps = stages.rows, stages.steps
@@ -179,6 +183,7 @@ def isfinite_everywhere(steps, states):
     return True
 
 
+@compact
 def slope_of_merit(stages):
     """Derivative of the merit along the step."""
     changes, rows, slope = stages.changes, stages.rows, 0.0
@@ -195,6 +200,7 @@ def slope_of_merit(stages):
     return slope
 
 
+@compact
 def model_penalties(price, stages, work, mem):
     """Write forces and curvatures of the penalties; unknown multipliers are the forces."""
     rows, parameter = stages.rows, mem.parameter
@@ -236,6 +242,7 @@ def slacks_of(row, number, price, parameter, rows):
     return small, large
 
 
+@compact
 def penalized(cost, numbers, price, stages, mem):
     """The merit of a plan of this cost, whose rows have these values: cost and penalties; infinite if there is none."""
     rows, total, parameter = stages.rows, cost, mem.parameter
@@ -252,6 +259,7 @@ def penalized(cost, numbers, price, stages, mem):
     return total if isfinite(total) else inf
 
 
+@compact
 def judge(stages, work, mem):
     """Compute the violation of the plan before the step; return whether the descent ends."""
     rows, relative = stages.rows, 0.0
@@ -268,6 +276,7 @@ def judge(stages, work, mem):
     return mem.close >= PATIENCE
 
 
+@compact
 def share_price(price, stages, work):
     """Write the multipliers after the step relative to the price, from -1 to 1; 0 for limits."""
     rows = stages.rows

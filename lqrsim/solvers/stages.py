@@ -20,12 +20,14 @@ from lqrsim.kernels.interior_point import LATELY
 from lqrsim.kernels.records import (
     ACTIVE_SET,
     INTERIOR,
+    MEASURES,
     RESTORATION,
     ActiveSetArrays,
     CostToGo,
     InteriorArrays,
     Limits,
     Motion,
+    PlanBeginning,
     PlanPoint,
     PlanStages,
     PlanStep,
@@ -91,6 +93,8 @@ class Stages:
         self._take(problem)
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
+        if problem.constraint_terms:
+            self.prepare()
 
     def _take(self, problem: Problem) -> None:
         """Read a problem's numbers, and determine which rows can act."""
@@ -149,6 +153,19 @@ class Stages:
         self._take(problem)
         self.about.rows.support[...] = 0.0
         return self
+
+    def prepare(self) -> None:
+        """Compile what a solve needs of the stages, with the interior point, together."""
+        about, plan = self.about, self.about.changes
+        arrays, memory = self.interior
+        begun = PlanBeginning(plan, about.rows.force, False, 0.0, 0.0)
+        costates, slopes = about.to_go.gradient, plan.controls
+        self._module.prepare(
+            interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, MEASURES)),
+            survey=(about, plan), look=(about, plan, costates, 0.0), adjoint=(about, costates, slopes),
+            trial=(about, plan, about.models.arrived), read_rows=(about, plan, about.rows.numbers),
+            least_curvatures=(about, about.rows.force, slopes, slopes[0]),
+        )  # fmt: skip
 
     def call(self, name: str, *arguments: Any) -> Any:
         """Call a compiled function, reusing the layout of its arguments."""
