@@ -417,13 +417,19 @@ class TestProgress:
         assert len(lines) > 0
         assert all(one.success for one in solved)
 
-    def test_no_thread_is_left(self, slow: ls.Problem) -> None:
+    def test_no_thread_is_left(self, slow: ls.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
         def stop(iteration: ls.types.Iteration) -> None:
             raise KeyboardInterrupt
 
-        with pytest.raises(KeyboardInterrupt):
-            ls.smooth(slow, callback=stop)
-        assert not [thread for thread in threading.enumerate() if thread.name == "progress"]
+        monkeypatch.setattr(budget, "SILENT", 0.01)
+        for _ in range(3):
+            with pytest.raises(KeyboardInterrupt):
+                ls.smooth(slow, callback=stop)
+        watching = [thread for thread in threading.enumerate() if thread.name == "progress"]
+        assert len(watching) <= 1
+        for thread in watching:
+            thread.join(60)
+            assert not thread.is_alive()
 
 
 @pytest.mark.parametrize("ended", ["time", "iterations"])

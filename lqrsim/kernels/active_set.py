@@ -86,6 +86,7 @@ def active_set(task, violation, stages, work, memory):
 def begin_active_set(violation, stages, work, mem):
     """Compute the models about the plan, its costates, typical sizes and measures; choose the first active set."""
     rows = stages.rows
+    copy(rows.acts, rows.size * (stages.steps + 1), rows.live)
     read_rows(stages, work.plan, rows.numbers)
     leave(stages)
     mem.cost = look_with_own_costates(stages, work.plan, work.costates)

@@ -228,8 +228,8 @@ class StageRows(NamedTuple):
     Attributes:
       table: (size, 7) properties of each row; see `stages.py`.
       first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
-      live: ((T+1) size,) 1 for rows that act, else 0. held: ((T+1) size,) what rows do in an active set; see
-        `active_set.py`.
+      acts, live: ((T+1) size,) 1 for rows that can act, and for those that do at the plan, else 0.
+      held: ((T+1) size,) what rows do in an active set; see `active_set.py`.
       numbers: ((T+1) size,) values. force: ((T+1) size,) multipliers.
     """
 
@@ -237,6 +237,7 @@ class StageRows(NamedTuple):
     table: Arrays
     first: Arrays
     support: Arrays
+    acts: Arrays
     live: Arrays
     held: Arrays
     numbers: Arrays

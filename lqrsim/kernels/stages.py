@@ -222,8 +222,8 @@ def survey(stages, plan):
     rows, beside = stages.rows, stages.changes
     read_rows(stages, plan, rows.numbers)
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.numbers[at] == inf:  # the constraint does not act at that step
-            rows.live[at] = 0.0
+        # Infinity means that the constraint does not act at that step.
+        rows.live[at] = 0.0 if rows.numbers[at] == inf else rows.acts[at]
         rows.force[at] = 0.0
     for t in range(stages.steps + 1):
         for i in range(N):

@@ -19,6 +19,7 @@ _log = logging.getLogger("lqrsim")
 ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C
 SILENT = 2.0  # s without a message after which a solve reports its progress; later reports come at growing intervals
 SELDOM = 60.0  # s
+SHORTEST = 1e-3  # s, the least time between two looks at what is reported
 NOTED = 10.0  # compiling is mentioned if it takes longer than the time limit divided by this
 
 
@@ -232,6 +233,76 @@ class Laps:
         self._budget.record(Iteration(cost, improvement, gap, optimality, gap, violation, seconds, method))
 
 
+class _Watch:
+    """The thread that reports progress, one for all activities of the process, for starting one takes long.
+
+    It looks at them at most every `SILENT` seconds, and ends when there was none for as long.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._activities = threading.Lock(), list[_Activity]()
+        self._thread: threading.Thread | None = None
+        self._woken, self._sleeps_until = threading.Event(), 0.0
+
+    def begin(self, activity: "_Activity") -> None:
+        """Begin to watch an activity."""
+        with self._lock:
+            self._activities.append(activity)
+            if self._thread is None or not self._thread.is_alive():  # also after a fork
+                self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
+                self._thread.start()
+            elif activity.due < self._sleeps_until:
+                self._woken.set()
+
+    def end(self, activity: "_Activity") -> None:
+        """Watch an activity no longer."""
+        with self._lock:
+            self._activities.remove(activity)
+
+    def _run(self) -> None:
+        idle = False
+        while True:
+            with self._lock:
+                activities = list(self._activities)
+                if idle and not activities:
+                    self._thread = None
+                    return
+            idle = not activities
+            now = time.perf_counter()
+            for activity in activities:
+                activity.report(now)
+            wait = max(min((one.due - now for one in activities), default=SILENT), SHORTEST)
+            self._sleeps_until = now + min(wait, SILENT)
+            self._woken.wait(min(wait, SILENT))
+            self._woken.clear()
+
+
+@dataclass(eq=False)
+class _Activity:
+    """What a block of `reported` does: its name, and functions as there. `due` is the time of the next report."""
+
+    what: str
+    found: Callable[[], str]
+    told: Callable[[], float]
+    begun: float
+
+    def __post_init__(self) -> None:
+        self._wait = SILENT
+        self.due = time.perf_counter() + self._wait
+
+    def report(self, now: float) -> None:
+        """Report the progress if it is due."""
+        if now < self.due:
+            return
+        if now - self.told() >= SILENT:
+            _log.warning("%s: %.0f s, %s", self.what, now - self.begun, self.found())
+            self._wait = min(2 * self._wait, SELDOM)
+        self.due = now + self._wait
+
+
+_watch = _Watch()
+
+
 @contextlib.contextmanager
 def reported(
     what: str, found: Callable[[], str], told: Callable[[], float] = lambda: -np.inf, begun: float | None = None
@@ -245,20 +316,9 @@ def reported(
         `time.perf_counter`.
       begun: time at which the activity began, on the same clock; by default now.
     """
-    ended, begun = threading.Event(), time.perf_counter() if begun is None else begun
-
-    def watch() -> None:
-        wait = SILENT
-        while not ended.wait(wait):
-            if (now := time.perf_counter()) - told() >= SILENT:
-                _log.warning("%s: %.0f s, %s", what, now - begun, found())
-                wait = min(2 * wait, SELDOM)
-
-    watcher = threading.Thread(target=watch, name="progress", daemon=True)
+    activity = _Activity(what, found, told, time.perf_counter() if begun is None else begun)
     try:
-        watcher.start()
+        _watch.begin(activity)
         yield
     finally:
-        ended.set()  # first of all, so that it also happens if Ctrl-C came while the thread began
-        if watcher.is_alive():
-            watcher.join()
+        _watch.end(activity)

@@ -31,7 +31,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
-from lqrsim.solvers.stages import Sizes, Stages
+from lqrsim.solvers.stages import Sizes
 
 FAR = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
 # Iterations of the augmented Lagrangian: from the plan of smoothing; undamped iterations without progress among these;
@@ -59,12 +59,12 @@ class Known:
 
 
 class Ladder:
-    """Tries one start after another for a plan that keeps the constraints. `stages` is as for `InteriorRun`."""
+    """Tries one start after another for a plan that keeps the constraints."""
 
-    def __init__(self, run: SolveRun, known: Known, stages: Stages | None = None) -> None:
+    def __init__(self, run: SolveRun, known: Known) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
-        self._point = InteriorRun(run, stages)
-        self._allowed, self._stages = self._point.allowed, self._point.stages
+        self._point, self._stages = InteriorRun(run), run.stages
+        self._allowed = self._point.allowed
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self._given: RunResult | None = None

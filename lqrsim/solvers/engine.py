@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.codegen.compiled_module import Call, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
@@ -41,7 +41,7 @@ from lqrsim.solvers.certify import certified, no_value
 from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.settings import INSIDE, SmootherSettings
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.stages import LARGEST_KEPT, MOST_KEPT, Stages
 
 _METHODS = {
     declarations.SMOOTH: "smooth",
@@ -73,7 +73,6 @@ _DETAILS = {
     declarations.STALLED: "the line search found no lower cost",
 }
 
-MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory is kept for later solves, and largest size in bytes
 # Newton's method takes over when the states of least total cost are within VALLEY of the rollout, relative to its
 # range: smoothing is then near a local optimum. Damped iterations approach it slowly. They end when the cost falls by
 # less than NEARLY, twice, with a gap below NEAR.
@@ -300,6 +299,7 @@ class SolveRun:
 
     def give_back(self) -> None:
         """Leave the memory to another solve."""
+        self._release_stages()
         if self.problem.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
             with _lending:
                 _idle.append(self)
@@ -307,6 +307,7 @@ class SolveRun:
 
     def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
         self.initial_guess, self.budget = initial_guess, budget
+        self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
         self.ending = Ending(declarations.RUNNING)
@@ -321,6 +322,19 @@ class SolveRun:
     def cost(self) -> float:
         """True cost of the last rollout; infinite if there is no rollout, or a pass failed."""
         return np.inf if self.ending.pass_failed else _cost_of(self._last)
+
+    @property
+    def stages(self) -> Stages:
+        """The stages of the problem, in memory that is lent until the result is certified, or the run's given back."""
+        if self._stages is None:
+            with self.budget.stop.not_counting():  # compiling
+                self._stages = Stages.lent(self.problem)
+        return self._stages
+
+    def _release_stages(self) -> None:
+        if self._stages is not None:
+            self._stages.give_back()
+            self._stages = None
 
     # The phases of a run.
 
@@ -565,7 +579,10 @@ class SolveRun:
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
-            return replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
+            found = replace(found, certificate=replace(certificate, curvature=self.bend(found).curvature))
+        self._release_stages()
+        if not wrong:
+            return found
         if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
             return replace(found, status=Status.NOT_POSITIVE_DEFINITE)
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
@@ -580,8 +597,7 @@ class SolveRun:
             self._loop(*self._check_arguments(declarations.CURVE, found, no_value(found.states), out))
             if out["curvature"][0] > FLAT:
                 return Bend(Curvature.MINIMUM)
-        stages = Stages(problem)
-        plan = Motion(*map(in_c_order, (found.states, found.controls)))
+        stages, plan = self.stages, Motion(*map(in_c_order, (found.states, found.controls)))
         return curvature_at(stages, plan, stages.of_constraints([one.values for one in found.multipliers]))
 
     def _expected_cost(self, found: RunResult) -> float:
@@ -737,6 +753,8 @@ class Workspace:
         m = initial_guess.offset.shape[1]
         self.dual = settings.form == "dual"
         self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
+        self._evaluation: Call | None = None
+        self._rollout: Call | None = None
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
@@ -846,12 +864,25 @@ class Workspace:
                 data[i][len(term.functions) + term.factor] *= share
         return self.model.stage._replace(data=tuple(data))
 
+    def roll_out(self, gain: Array, offset: Array, state: Array) -> Motion:
+        """Roll out the policy u_t = gain_t x + offset_t from a state: gains (T, m, n), offsets (T, m)."""
+        plan = Motion(np.empty_like(self.last.states), np.empty_like(self.last.controls))
+        of = self._problem.steps, in_c_order(state), Policy(in_c_order(gain), in_c_order(offset)), self.model, plan
+        if self._rollout is None:
+            self._rollout = self.core.lay_out("rollout", *of)
+        with self._problem.dynamics.quiet():
+            self._rollout(*of)
+        return plan
+
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero if it does not act."""
         values = [np.empty_like(one.values) for one in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
-            self._costs.evaluate_constraints(self._problem.steps, states, controls, constraints, tuple(values))
+            of = self._problem.steps, in_c_order(states), in_c_order(controls), constraints, tuple(values)
+            if self._evaluation is None:
+                self._evaluation = self._costs.lay_out("evaluate_constraints", *of)
+            self._evaluation(*of)
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:

@@ -19,7 +19,6 @@ from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
-from lqrsim.solvers.stages import Stages
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan
@@ -41,16 +40,12 @@ class InteriorRun:
     """The interior point for the problem of a run.
 
     Attributes:
-      stages: stages of the problem; by default they are made here. allowed: tolerance of its constraints.
+      allowed: tolerance of its constraints.
     """
 
-    def __init__(self, run: SolveRun, stages: Stages | None = None) -> None:
+    def __init__(self, run: SolveRun) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self.allowed = run.settings.violation_tolerance(run.problem)
-        if stages is None:
-            with run.budget.stop.not_counting():  # compiling
-                stages = Stages(run.problem)
-        self.stages = stages
 
     def instead(self, plan: Motion | RunResult) -> RunResult | None:
         """The result from a plan if it converges; else None, so that smoothing can continue."""
@@ -74,7 +69,7 @@ class InteriorRun:
 
         with budget.stop.heeding():
             point = InteriorPoint(
-                self.stages, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
+                run.stages, plan, barrier=barrier.parameter, room=barrier.room, price=run.settings.price,
                 multipliers=multipliers,
             )  # fmt: skip
             found = point.run(
@@ -94,14 +89,14 @@ class InteriorRun:
     def start(self) -> RunResult:
         """The rollout of the initial policy."""
         guess, start = self._run.initial_guess, self._run.work.start
-        plan = compiled.rollout(self._problem, guess.gain, guess.offset, start.copy())
+        plan = self._run.work.roll_out(guess.gain, guess.offset, start)
         return self.result(*plan, (guess.gain, guess.offset))
 
     def result(self, states: Array, controls: Array, law: tuple[Array, Array] | None = None) -> RunResult:
         """The result for a plan that has not converged; without a law, its controls are applied without feedback."""
         if law is None:
             law = np.zeros((*controls.shape, states.shape[1])), controls
-        cost, _ = self.stages.trial(Motion(states, controls))
+        cost, _ = self._run.stages.trial(Motion(states, controls))
         work = self._run.work
         violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
         return RunResult(
@@ -119,18 +114,18 @@ class InteriorRun:
         candidates = []
         for gains in (gain.copy(), np.zeros_like(gain)):
             law = compiled.law_about(*plan, gains)
-            candidates.append(self.result(*compiled.rollout(self._problem, *law, plan.states[0].copy()), law))
+            candidates.append(self.result(*self._run.work.roll_out(*law, plan.states[0]), law))
         return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
 
     def _polished(self, found: Found) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
         work = self._run.work
         law = compiled.law_about(found.plan.states, *self._at_limits(found))
-        states, controls = compiled.rollout(self._problem, *law, found.plan.states[0].copy())
+        states, controls = work.roll_out(*law, found.plan.states[0])
         if not np.isfinite(states).all():
             return None
         self._take_multipliers(found, work.constraint_values(states, controls))
-        work.take(states, controls, self.stages.trial(Motion(states, controls))[0])
+        work.take(states, controls, self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
         with self._budget.joined_with_last(NAME):
@@ -152,7 +147,7 @@ class InteriorRun:
     def _at_limits(self, found: Found) -> tuple[Array, Array]:
         """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
         controls, gain = found.plan.controls.copy(), found.gain.copy()
-        for side, sign in ((self.stages.low, -1.0), (self.stages.high, 1.0)):
+        for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
             room = np.abs(side - controls) / found.sizes.controls
             force = sign * found.pressing * found.sizes.controls / found.scale
             there = (room < AT_LIMIT) & (force > room)
@@ -164,7 +159,7 @@ class InteriorRun:
         """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
         each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(each):
-            size = found.sizes.rows[self.stages.owners == k]
+            size = found.sizes.rows[self._run.stages.owners == k]
             own.penalty = FIRMNESS * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
             presses = known > own.penalty * (numbers - own.margin)  # other forces are remnants of the barrier
@@ -182,7 +177,7 @@ class InteriorRun:
         values = self._run.work.constraint_values(result.states, result.controls)
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):
-            size = found.sizes.rows[self.stages.owners == k]
+            size = found.sizes.rows[self._run.stages.owners == k]
             idle = one.values * size / found.scale < values[k] / size
             idle &= not self._problem.constraint_terms[k].equality
             multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))

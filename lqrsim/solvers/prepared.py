@@ -28,7 +28,6 @@ from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
 from lqrsim.solvers.restoration import restore
 from lqrsim.solvers.settings import SmootherSettings, check_problem
-from lqrsim.solvers.stages import Stages
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
 # Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be
@@ -87,7 +86,6 @@ class PreparedSolver:
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
         self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
-        self._idle: list[Stages] = []  # memory for the next solve
         self._compile()
 
     def __repr__(self) -> str:
@@ -107,8 +105,8 @@ class PreparedSolver:
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and run.second_order:
-            stages, plan = Stages(self.problem), Motion(*run.work.best)
-            _Neighbour(run, stages, plan, _Best(run)).find()
+            stages, plan = run.stages, Motion(*run.work.best)
+            _Neighbour(run, plan, _Best(run)).find()
             # Another solve may need code that this solve did not need.
             InteriorPoint(stages, plan).run(
                 tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
@@ -116,12 +114,6 @@ class PreparedSolver:
             restore(
                 stages, plan, stages.sizes(plan), price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False
             )
-
-    def _stages_of(self, problem: Problem) -> Stages:
-        try:
-            return self._idle.pop().renewed(problem)
-        except IndexError:  # other threads use all of them
-            return Stages(problem)
 
     def check(self, problem: Problem) -> Problem:
         """Check that a problem needs no compiling: only numbers may differ from the prepared one.
@@ -175,13 +167,11 @@ class PreparedSolver:
         best = _Best(run)
         with problem.dynamics.solving(1):
             if problem.constraints and run.second_order:
-                stages = self._stages_of(problem)
-                neighbour = _Neighbour(run, stages, _plan_of(start, best), best, self._closing)
+                neighbour = _Neighbour(run, _plan_of(start, best), best, self._closing)
                 found, ended = neighbour.find(), neighbour.laps.ended
                 if neighbour.may_be_far:
                     best.consider(found)
-                    found, ended = Ladder(run, Known(), stages).climb(), time.perf_counter()
-                self._idle.append(stages)
+                    found, ended = Ladder(run, Known()).climb(), time.perf_counter()
             else:
                 found = _solve(run, best)
                 ended = time.perf_counter()
@@ -255,7 +245,7 @@ class _Neighbour:
     """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
 
     Args:
-      run: a run with the initial law and multipliers. stages: stages of its problem.
+      run: a run with the initial law and multipliers.
       plan: states and controls to which the law belongs; the first state is the start.
       best: the plan that the law leads to. closing: duration of the work after the last iteration, in s.
 
@@ -265,8 +255,8 @@ class _Neighbour:
         when an obstacle has come into its way.
     """
 
-    def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
-        self._run, self._stages, self._plan, self._best = run, stages, plan, best
+    def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
+        self._run, self._stages, self._plan, self._best = run, run.stages, plan, best
         self._closing, self._budget = closing, run.budget
         self._allowed = run.settings.violation_tolerance(run.problem)
         self.laps, self.may_be_far, self._out_of_time = Laps(run.budget), False, False

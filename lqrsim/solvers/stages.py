@@ -6,6 +6,7 @@ to do with the rows: the interior point, the active set, and the restoration.
 """
 
 import functools
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -43,6 +44,10 @@ from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMI
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
+MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # memories that are kept for later solves, and largest size in bytes
+_idle: "list[Stages]" = []
+_lending = threading.Lock()
+
 
 class Sizes(NamedTuple):
     """Typical sizes of states (n,), controls (m,) and constraint rows (R,), and of the cost of such changes."""
@@ -66,15 +71,13 @@ class Stages:
     """
 
     def __init__(self, problem: Problem) -> None:
-        n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
-        self.n, self.m, steps = n, m, problem.steps
+        self._shape = self.n, self.m, steps, counts, lower, upper = _shape(problem)
+        n, m = self.n, self.m
         self._module = module_of(source_of(kernel), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
-        zeros, terms, unread = np.zeros, problem.constraint_terms, cast(ProblemModel, None)
-        counts = [term.rows for term in terms]
-        rows = sum(counts) + sum(len(sides) for sides in _finite(problem))
+        zeros, unread, rows = np.zeros, cast(ProblemModel, None), sum(counts) + len(lower) + len(upper)
         self.slopes, self.numbers = zeros((steps + 1, rows, n + m)), zeros((steps + 1, rows))
-        self.force, self.held, self._live = (zeros((steps + 1, rows)) for _ in range(3))
+        self.force, self.held, self._live, self._acts = (zeros((steps + 1, rows)) for _ in range(4))
         self.models = StageModels(
             zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m)),
             zeros((steps, n, n + m)), zeros((steps, n)), self.slopes.reshape(-1, n + m),
@@ -84,7 +87,8 @@ class Stages:
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
                 rows, zeros((rows, PRICE + 1)), np.cumsum([0, *counts])[:-1].astype(np.float64),
-                zeros((rows, n + m)), *(one.reshape(-1) for one in (self._live, self.held, self.numbers, self.force)),
+                zeros((rows, n + m)),
+                *(one.reshape(-1) for one in (self._acts, self._live, self.held, self.numbers, self.force)),
             ),
             self.models, Policy(zeros((steps, m, n)), zeros((steps, m))),
             CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
@@ -103,7 +107,7 @@ class Stages:
         own = [compiled.ConstraintMultipliers(problem, term) for term in terms]
         model = compiled.arguments(problem, multipliers=own, second_order=True)
         self.low, self.high = model.limits
-        lower, upper = _finite(problem)
+        *_, lower, upper = self._shape
         self.limits = [(1.0, i, self.low[i]) for i in lower] + [(-1.0, i, self.high[i]) for i in upper]
         counts = [*(term.rows for term in terms), len(self.limits)]
         self.equality = np.repeat([*(term.equality for term in terms), False], counts).astype(bool)
@@ -113,7 +117,7 @@ class Stages:
             self.live[: one.first, self.owners == k] = False
             self.live[steps, self.owners == k] &= not one.term.uses_control
         self.live[steps, self.owners == -1] = False
-        self._live[...] = self.live
+        self._acts[...] = self._live[...] = self.live
         self.about = self.about._replace(steps=steps, soft=0 if fixed else 1, model=model)
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         if problem.goal is not None and problem.start is not None:
@@ -138,21 +142,26 @@ class Stages:
         """(n,) 1 for the states of the start that are free, else 0."""
         return self.about.free
 
-    def renewed(self, problem: Problem) -> "Stages":
-        """The stages of another problem of the same structure, in this memory if sizes allow."""
-        owners, limits, steps = self.owners, [one[:2] for one in self.limits], self.steps
-        counts = [term.rows for term in problem.constraint_terms]
-        lower, upper = _finite(problem)
-        same = (
-            steps == problem.steps
-            and [*lower, *upper] == [i for _, i in limits]
-            and len(lower) == sum(sign > 0 for sign, _ in limits)
-        )
-        if not same or not np.array_equal(owners[owners >= 0], np.repeat(np.arange(len(counts)), counts)):
-            return Stages(problem)
-        self._take(problem)
-        self.about.rows.support[...] = 0.0
-        return self
+    @classmethod
+    def lent(cls, problem: Problem) -> "Stages":
+        """The stages of a problem, if possible in memory that was given back, because allocating takes time."""
+        shape = _shape(problem)
+        with _lending:
+            found = next((one for one in reversed(_idle) if one._shape == shape), None)
+            if found is not None:
+                _idle.remove(found)
+        if found is None:
+            return cls(problem)
+        found._take(problem)
+        found.about.rows.support[...] = 0.0
+        return found
+
+    def give_back(self) -> None:
+        """Leave the memory to another solve."""
+        if self.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
+            with _lending:
+                _idle.append(self)
+                del _idle[:-MOST_KEPT]
 
     def prepare(self) -> None:
         """Compile what a solve needs of the stages, with the interior point, together."""
@@ -293,11 +302,14 @@ class Stages:
         return arrays, np.zeros(1, RESTORATION)
 
 
-def _finite(problem: Problem) -> tuple[list[int], list[int]]:
-    """The controls with a lower limit, and those with an upper limit."""
-    space = problem.control_coordinates
-    lower, upper = (np.flatnonzero(np.isfinite(side)).tolist() for side in (space.low, space.high))
-    return lower, upper
+_Shape = tuple[int, int, int, tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+
+
+def _shape(problem: Problem) -> _Shape:
+    """Numbers of states, controls and steps; rows of each constraint; the controls with lower and upper limits."""
+    space, counts = problem.control_coordinates, tuple(term.rows for term in problem.constraint_terms)
+    sides = (tuple(np.flatnonzero(np.isfinite(side)).tolist()) for side in (space.low, space.high))
+    return len(problem.dynamics.state_coordinates), len(space), problem.steps, counts, *sides
 
 
 def _ordered(plan: Motion) -> Motion:
