@@ -238,6 +238,7 @@ class Search:
         self._default = self._settings.start is None and self._settings.starts is None
         self._tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
         self._finished: list[tuple[SolveRun, RunResult]] = []
+        self._looked: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
         self._softer: list[Candidate] = []  # plans for softer contacts
         self._soft: list[tuple[str, Problem]] = []  # the problem with contacts of each softness, the widest first
 
@@ -470,7 +471,10 @@ class Search:
         found, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
         if not np.isfinite(found.cost):
             return []
-        return reach.unmoved(self._problem, found.states, found.controls, found.cost, allowed)
+        if self._looked[0] is not found:
+            places = reach.unmoved(self._problem, found.states, found.controls, found.cost, allowed)
+            self._looked = found, places
+        return self._looked[1]
 
     def keep(self, given: RunResult | None) -> None:
         """If the best plan is worse than the plan that the caller gave: descend from that plan, or return it."""
