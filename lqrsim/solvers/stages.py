@@ -308,8 +308,8 @@ _Shape = tuple[int, int, int, tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 def _shape(problem: Problem) -> _Shape:
     """Numbers of states, controls and steps; rows of each constraint; the controls with lower and upper limits."""
     space, counts = problem.control_coordinates, tuple(term.rows for term in problem.constraint_terms)
-    sides = (tuple(np.flatnonzero(np.isfinite(side)).tolist()) for side in (space.low, space.high))
-    return len(problem.dynamics.state_coordinates), len(space), problem.steps, counts, *sides
+    lower, upper = (tuple(np.flatnonzero(np.isfinite(side)).tolist()) for side in (space.low, space.high))
+    return len(problem.dynamics.state_coordinates), len(space), problem.steps, counts, lower, upper
 
 
 def _ordered(plan: Motion) -> Motion:

@@ -1,30 +1,12 @@
 """The attempts of `smooth`, in order, until one converges.
 
-`solve`
-  1. The search: a few iterations from each start, and the most promising one is continued to its end (`Search.run`).
-     With constraints, the others follow as long as they may cost less.
-  2. If the states leave their domain: constant controls under which they do not, and a line of states. If the best plan
-     is far from the goal, goes through an obstacle, violates the constraints or does nothing: from a plan without the
-     constraints that it may pass on one side or another; other routes, found with larger weights of obstacles and goal;
-     without an ObstacleCost, other paths and oscillating controls (`Search.widen`).
-  3. If the best plan touches a constraint that may be passed on another side: paths to the left and to the right
-     (`Search.look_aside`).
-  4. If the best plan is a saddle: down along its direction of negative curvature (`Search.leave_saddles`).
-  5. If no control changes a state that misses its goal: pushes by one control at a time (`Search.move`).
-  6. If the risk is too high for an intermediate plan: a solve without risk, and then one with risk that starts from it
-     (`Search.retry_without_risk`).
-  7. If nothing converges among contacts or joint limits of an MJCF: plans for softer contacts and limits, stiffened
-     step by step to the true ones (`Search.soften`).
-  8. If the answer is worse than the plan that the caller gave, or has left what that moved: a descent from that plan
-     (`Search.keep`).
-  9. If all that ends at a jump or a kink: softening again from the best plan, and a descent that keeps the active
-     contacts, in turn (`Search.alternate`).
-  A free duration is found in an outer loop around these steps (`free_duration.py`).
+`ATTEMPTS` says what is tried in which order, when, and from what. A free duration is found in an outer loop around
+these attempts (`free_duration.py`).
 
 `finish`, for one start
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
      (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
-  with constraints: a ladder of initial plans, each finished by the interior point (`constrained.py`).
+  with constraints: the interior point from one plan after another (`ATTEMPTS` of `constrained.py`).
   without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
      smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
 
@@ -37,6 +19,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,18 +112,9 @@ def solve(
         ]
     is_plan = settings.start is not None and first.prior is None and first.found is None
     kept = runs[0].given() if is_plan else None
-    search = Search([name for name, _ in given], runs, callback, threads)
+    search = Search([name for name, _ in given], runs, callback, threads, kept)
     with stop.reporting("smooth", attentive):
-        with problem.dynamics.solving(threads if len(runs) == 1 else 1):
-            search.run()
-            search.widen()
-            search.look_aside()
-            search.leave_saddles()
-            search.move()
-            search.retry_without_risk()
-        search.soften()
-        search.keep(kept)
-        search.alternate()
+        search.attempt(ATTEMPTS)
     solution = search.solution()
     for run in runs:
         run.give_back()
@@ -221,22 +195,24 @@ def _without_constraints(run: SolveRun) -> RunResult:
 
 
 class Search:
-    """Several runs, the most promising of which are finished.
-
-    The methods are in the order in which `solve` calls them. Each does nothing if it is not needed, or not permitted by
-    the settings, or if no time is left.
+    """Several runs, the most promising of which are finished. The answer must not be worse than the plan `given`.
 
     Attributes:
-      best: the run with the best result so far, and that result.
+      best: the run with the best result so far, and that result. tried: whether other starts were tried, as far as
+        they are to be.
     """
 
-    def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
+    def __init__(
+        self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int,
+        given: RunResult | None = None,
+    ) -> None:  # fmt: skip
         self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads, self._known = callback, threads, Known()
+        self._callback, self._threads, self._known, self._given = callback, threads, Known(), given
+        self._solving = threads if len(runs) == 1 else 1
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._default = self._settings.start is None and self._settings.starts is None
-        self._tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
+        self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._looked: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
         self._softer: list[Candidate] = []  # plans for softer contacts
@@ -245,6 +221,14 @@ class Search:
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
         return self._finished[0]
+
+    def attempt(self, attempts: "Sequence[Attempt]") -> None:
+        """Make these attempts in turn, as far as they are called for."""
+        for one in attempts:
+            if one.when(self):
+                threads = contextlib.nullcontext() if one.others else self._problem.dynamics.solving(self._solving)
+                with threads:
+                    one.make(self)
 
     def run(self) -> None:
         """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
@@ -260,29 +244,17 @@ class Search:
                 break
             self._offer(run, self._finish(run))
 
-    def widen(self) -> None:
-        """If the best plan is poor, try other routes, or, if there is nothing to go round, other controls and paths."""
-        self._try_finite()
-        if not (self._is_poor and self._may_go_on):
-            return
-        self._try_past_constraints()
-        if not self._is_poor:
-            return
-        if pull(self._problem) > 0:
-            for times in HEAVIER:
-                self._try_reweighted(times)
-        elif self._without_plan:
-            self._try_elsewhere()
-        else:
-            self._try_sinusoidal_controls()
-        self._tried = not self._budget.stop.due
+    @property
+    def is_lost(self) -> bool:
+        """Whether the states leave their domain."""
+        found = self.best[1]
+        lost = not np.isfinite(found.cost) and found.status is not Status.RISK_TOO_HIGH
+        return lost and self._problem.start is not None and not self._budget.stop.due
 
-    def _try_finite(self) -> None:
-        """While the states leave their domain: try constant controls under which they do not, and a line of states."""
+    def try_finite(self) -> None:
+        """Try constant controls under which the states stay in their domain, and a line of states."""
         problem, exact = self._problem, self.best[0].second_order
-        lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
-        if not lost or problem.start is None or self._budget.stop.due:
-            return
+        assert problem.start is not None
         self._known.from_start = False
         work, plans = self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in constant_controls(problem):
@@ -306,8 +278,13 @@ class Search:
         run = self._add(resolve(Trajectory(states, controls.copy(), problem.dt), problem), "a line of states")
         self._offer(run, self._finish(run, from_states))
 
-    def _try_reweighted(self, times: float) -> None:
+    def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
+        for times in HEAVIER:
+            self._try_reweighted(times)
+        self.tried = not self._budget.stop.due
+
+    def _try_reweighted(self, times: float) -> None:
         if self._budget.stop.due:
             return
         heavier = reweighted(self._problem, times)
@@ -324,8 +301,12 @@ class Search:
         lower = not best.success or found.cost < best.cost - 1e-3 * abs(best.cost)
         self._offer(run, found, better=found.rank < best.rank and lower)
 
-    def _try_elsewhere(self) -> None:
+    def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
+        self._try_elsewhere()
+        self.tried = not self._budget.stop.due
+
+    def _try_elsewhere(self) -> None:
         problem, exact = self._problem, self.best[0].second_order
         motions = dict[str, StartLike](self._motions()) if exact else {}
         sways = {f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
@@ -338,24 +319,25 @@ class Search:
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
             self._offer(run, self._finish(run, finish if exact and name in sways else refine))
 
-    def _try_past_constraints(self) -> None:
-        """While no plan keeps the constraints: plan without those that may be passed on one side or another.
+    @property
+    def is_barred(self) -> bool:
+        """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
+        return self.is_poor and self.best[0].second_order and self.is_without_plan and any(passable(self._problem))
+
+    def try_past_constraints(self) -> None:
+        """Plan without the constraints that may be passed on one side or another.
 
         A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
         """
         problem = self._problem
         kept = [one for one, passed in zip(problem.constraints, passable(problem), strict=True) if not passed]
-        exact = self.best[0].second_order
-        if not (exact and self._without_plan) or len(kept) == len(problem.constraints) or self._budget.stop.due:
-            return
         free = problem.with_constraints(kept)
         given = guides(free, None)
         search = Search(
             [name for name, _ in given], [self._another(resolve(one, free), free) for _, one in given],
             self._callback, self._threads,
         )  # fmt: skip
-        search.run()
-        search.widen()
+        search.attempt(FIRST)
         found = search.best[1]
         if found.success and not self._budget.stop.due:
             run = self._add(policy_of(found, "a plan without what is in the way"))
@@ -391,7 +373,8 @@ class Search:
                     moving.update(np.flatnonzero(slope[: len(state)]).tolist())
         return sorted(moving)
 
-    def _try_sinusoidal_controls(self) -> None:
+    def try_sinusoidal_controls(self) -> None:
+        """Solve from the most promising of some oscillating controls."""
         problem = self._problem
         runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
         chosen = choose(runs, self._threads)[0]
@@ -399,25 +382,36 @@ class Search:
         found, best = self._finish(chosen, known=Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
         self._offer(chosen, found, better=found.violation <= best.violation and found.cost < best.cost)
+        self.tried = not self._budget.stop.due
+
+    @property
+    def touches(self) -> bool:
+        """Whether the best plan touches a constraint that may be passed on another side."""
+        if self._settings.start is not None or not self.best[0].second_order or pull(self._problem) > 0:
+            return False
+        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
+        return any(one.values.any() for one in touched)
 
     def look_aside(self) -> None:
-        """Finish plans from paths aside, if the best plan touches a constraint that may be passed on another side."""
-        if self._settings.start is not None or not self.best[0].second_order:
-            return
+        """Finish plans from paths to the left and to the right."""
         problem, tried = self._problem, {name for name, _ in self._named}
-        touched = any(one.values.any() for one in itertools.compress(self.best[1].multipliers, passable(problem)))
-        if touched and pull(problem) == 0:
-            for name, one in detours(problem, self._settings.starts).items():
-                if name not in tried and not self._budget.stop.due:
-                    run = self._add(resolve(one, problem), name)
-                    self._offer(run, self._finish(run))
+        for name, one in detours(problem, self._settings.starts).items():
+            if name not in tried and not self._budget.stop.due:
+                run = self._add(resolve(one, problem), name)
+                self._offer(run, self._finish(run))
+
+    @property
+    def is_at_saddle(self) -> bool:
+        """Whether the best plan is a saddle."""
+        certificate = self.best[1].certificate
+        return certificate is not None and certificate.curvature is Curvature.SADDLE
 
     def leave_saddles(self) -> None:
-        """While the best plan is a saddle: go down along a direction of negative curvature, and converge from there."""
+        """Go down along a direction of negative curvature, and converge from there, while that is a saddle, too."""
         for _ in range(SADDLES):
-            run, found = self.best
-            if found.certificate is None or found.certificate.curvature is not Curvature.SADDLE:
+            if not self.is_at_saddle:
                 return
+            run, found = self.best
             if not self._descend(run, found):
                 status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
@@ -446,12 +440,14 @@ class Search:
                 return True
         return False
 
+    @property
+    def misses_unmoved(self) -> bool:
+        """Whether no control changes a state that misses its goal, such as a box that nothing touches."""
+        return self._default and self.may_go_on and bool(self._unmoved())
+
     def move(self) -> None:
-        """If no control changes a state that misses its goal, such as a box that nothing touches: begin with pushes."""
-        found = self.best[1]
-        places = self._unmoved() if self._default and self._may_go_on else []
-        if not places:
-            return
+        """Begin with pushes by one control at a time."""
+        found, places = self.best[1], self._unmoved()
         problem, plans = self._problem, list[tuple[float, str, Array]]()
         for name, controls, plan in pushes(problem):
             if reach.differ(plan, found, places):
@@ -476,14 +472,21 @@ class Search:
             self._looked = found, places
         return self._looked[1]
 
-    def keep(self, given: RunResult | None) -> None:
-        """If the best plan is worse than the plan that the caller gave: descend from that plan, or return it."""
-        run, found = self.best
-        if given is None:
-            return
+    @property
+    def has_left_given(self) -> bool:
+        """Whether the best plan is worse than the plan that the caller gave, or has left what that moved."""
+        (run, found), given = self.best, self._given
+        return given is not None and (
+            reach.differ(found, given, self._unmoved())
+            or run.is_worse(found, given)
+            or reach.goal_left(self._problem, found, given)
+        )
+
+    def keep(self) -> None:
+        """Descend from the plan that the caller gave; return it, if none is better."""
+        (run, found), given = self.best, self._given
+        assert given is not None
         still = reach.differ(found, given, self._unmoved())
-        if not (still or run.is_worse(found, given) or reach.goal_left(self._problem, found, given)):
-            return
         if not self._budget.stop.due:
             run = self._add(policy_of(given, "descent from the given plan"))
             other = self._finish(run, refine)
@@ -495,11 +498,14 @@ class Search:
             detail = "no plan was found that is better than the given one, which is returned"
             self._offer(run, replace(given, status=status, detail=detail), better=True)
 
-    def retry_without_risk(self) -> None:
-        """If the risk was too high for an intermediate plan: solve without risk, and continue from that plan."""
+    @property
+    def risked_too_much(self) -> bool:
+        """Whether the risk was too high for an intermediate plan."""
         too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
-        if self._problem.risk <= 0 or not too_high or not self._may_go_on:
-            return
+        return self._problem.risk > 0 and too_high and self.may_go_on
+
+    def retry_without_risk(self) -> None:
+        """Solve without risk, and continue from that plan."""
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
         found = finish(choose(runs, self._threads)[0], Known())
@@ -512,15 +518,13 @@ class Search:
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
     def soften(self) -> None:
-        """If no plan has converged: plan for contacts and limits of decreasing softness, and then for the true ones.
+        """Plan for contacts and limits of decreasing softness, and then for the true ones.
 
         Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
         earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
         softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
         are good, and a third of the plans goes on at each.
         """
-        if not self._may_soften:
-            return
         problem = self._problem
         self._soft = [
             (name, dataclasses.replace(problem, dynamics=dynamics))
@@ -537,13 +541,11 @@ class Search:
         self._stiffen(found, harder, [name], self._budget.left)
 
     def alternate(self) -> None:
-        """If none has converged yet: soften the cheapest plan's contacts a little, stiffen them, and keep its modes.
+        """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
 
         Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
         again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
         """
-        if self.best[1].success or not self._may_go_on:
-            return
         optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
         for _ in range(ROUNDS):
             before = self._cheapest
@@ -611,9 +613,7 @@ class Search:
         given = guides(soft, None)
         runs = [self._another(resolve(one, soft), soft) for _, one in given]
         search = Search([name for name, _ in given], runs, self._callback, self._threads)
-        with soft.dynamics.solving(self._threads if len(runs) == 1 else 1):
-            search.run()
-            search.widen()
+        search.attempt(FIRST)
         return search.best
 
     def _keep_softer(self, name: str, run: SolveRun, found: RunResult) -> RunResult:
@@ -648,7 +648,7 @@ class Search:
         problem, settings, stop = self._problem, self._settings, self._budget.stop
         if not np.isfinite(found.states).all() and not found.success:
             found = replace(found, status=Status.NOT_FINITE, detail=left_domain(problem, found))
-        elif found.status is Status.INFEASIBLE and not self._tried and stop.error is None:
+        elif found.status is Status.INFEASIBLE and not self.tried and stop.error is None:
             untried = "no time was left for other starts, which may keep the constraints"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}")
         elif self._cut_short and np.isfinite(found.cost):
@@ -710,25 +710,31 @@ class Search:
             self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
 
     @property
-    def _may_go_on(self) -> bool:
+    def may_go_on(self) -> bool:
         """Whether other starts may be tried: by default, as long as there is time."""
         return self._settings.safeguard and not self._budget.stop.due
 
     @property
-    def _may_soften(self) -> bool:
-        return self._default and self._may_go_on and not self.best[1].success
+    def may_soften(self) -> bool:
+        """Whether no plan has converged, and softer contacts may be tried."""
+        return self._default and self.may_go_on and not self.best[1].success
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether obstacles in the cost push the plan."""
+        return pull(self._problem) > 0
 
     @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
         if self.best[1].success or not (self._default and self._settings.safeguard and self._budget.stop.due):
             return False
-        if not self._tried and self._is_unacceptable:
+        if not self.tried and self._is_unacceptable:
             return True
         return bool(self._soft) or any(True for _ in self._problem.dynamics.softened(self.best[1].states))
 
     @property
-    def _is_poor(self) -> bool:
+    def is_poor(self) -> bool:
         """Whether other starts are to be tried.
 
         INFEASIBLE is a statement about the problem, wherever the caller begins, so it needs other starts.
@@ -746,7 +752,7 @@ class Search:
         problem = self._problem
         space = problem.dynamics.state_coordinates
         if pull(problem) == 0 or problem.goal is None:
-            return self._idle() or self._without_plan
+            return self._idle() or self.is_without_plan
         (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
             return run.budget.left > 0
@@ -768,9 +774,69 @@ class Search:
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
-    def _without_plan(self) -> bool:
+    def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
+
+
+class Attempt(NamedTuple):
+    """One of the attempts of `smooth`.
+
+    Attributes:
+      words: what it begins with. when: whether it is called for. make: makes it.
+      others: whether it also solves problems with other dynamics, for which it sets the number of threads itself.
+    """
+
+    words: str
+    when: Callable[[Search], bool]
+    make: Callable[[Search], None]
+    others: bool = False
+
+
+def _is_poor(search: Search) -> bool:
+    return search.is_poor and search.may_go_on and not search.tried
+
+
+# What a search among starts is, also of a problem that is a part of another attempt.
+FIRST = (
+    Attempt("the most promising of the given starts, or of paths to the goal", lambda search: True, Search.run),
+    Attempt("constant controls, then a line of states", lambda search: search.is_lost, Search.try_finite),
+    Attempt(
+        "a plan without the constraints that may be passed on one side or another",
+        lambda search: _is_poor(search) and search.is_barred,
+        Search.try_past_constraints,
+    ),
+    Attempt(
+        "a plan for larger weights of obstacles and goal",
+        lambda search: _is_poor(search) and search.is_guided,
+        Search.try_reweighted,
+    ),
+    Attempt(
+        "paths from start to goal, then oscillating controls",
+        lambda search: _is_poor(search) and not search.is_guided and search.is_without_plan,
+        Search.try_elsewhere,
+    ),
+    Attempt(
+        "oscillating controls",
+        lambda search: _is_poor(search) and not search.is_guided,
+        Search.try_sinusoidal_controls,
+    ),
+)
+ATTEMPTS = (
+    *FIRST,
+    Attempt("paths to the left and to the right", lambda search: search.touches, Search.look_aside),
+    Attempt("a plan beside a saddle", lambda search: search.is_at_saddle, Search.leave_saddles),
+    Attempt("pushes by one control at a time", lambda search: search.misses_unmoved, Search.move),
+    Attempt("a plan without risk", lambda search: search.risked_too_much, Search.retry_without_risk),
+    Attempt("plans for softer contacts", lambda search: search.may_soften, Search.soften, others=True),
+    Attempt("the plan that the caller gave", lambda search: search.has_left_given, Search.keep, others=True),
+    Attempt(
+        "the cheapest plan, softened again, and its contact modes",
+        lambda search: not search.best[1].success and search.may_go_on,
+        Search.alternate,
+        others=True,
+    ),
+)
 
 
 def left_domain(problem: Problem, found: RunResult) -> str:
