@@ -1,23 +1,12 @@
 """The plans from which a plan that keeps the constraints is sought, in turn; the interior point finishes each.
 
-    the optimum of the search for a free duration, which is only finished;
-    the plan of another solution, with its multipliers;
-    for a start that is to be kept to, with an ObstacleCost: that start, after damped iterations on the augmented
-      Lagrangian;
-    a trajectory or a policy that the caller gave;
-    unless the start is to be kept to:
-      the plan of smoothing without the constraints, after a few iterations;
-      that plan, after the augmented Lagrangian, if there is an ObstacleCost;
-      the plan of smoothing, after a descent in which constraints may be violated at a price;
-    the start itself;
-    the start, after such a descent.
-
-If none of these converges, the plan that violates the constraints least is the answer. It is INFEASIBLE if two starts
-lead to plans whose violation is stationary and equally large.
+`ATTEMPTS` says which, when, and in which order. If none of them converges, the plan that violates the constraints least
+is the answer. It is INFEASIBLE if two starts lead to plans whose violation is stationary and equally large.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,98 +48,107 @@ class Known:
 
 
 class Ladder:
-    """Tries one start after another for a plan that keeps the constraints."""
+    """Tries one start after another for a plan that keeps the constraints.
 
-    def __init__(self, run: SolveRun, known: Known) -> None:
+    Attributes:
+      guess, start: the start, and the rollout of its policy. stay: whether only plans from that rollout are tried.
+      given: whether the start is to be kept to. guided: whether there is an ObstacleCost, with which smoothing chooses
+        the side on which obstacles are passed. elastic: whether violations have a price.
+      smoothed: the plan of smoothing without the constraints, once it is known.
+      untried: whether the interior point has not yet begun from the start itself.
+      converged: whether an attempt has.
+    """
+
+    def __init__(self, run: SolveRun, known: Known, *, stay: bool = False) -> None:
         self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
-        self._point, self._stages = InteriorRun(run), run.stages
+        self._point, self._stages, self.guess, self.stay = InteriorRun(run), run.stages, run.initial_guess, stay
         self._allowed = self._point.allowed
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
-        self._given: RunResult | None = None
-        self._smoothed: Motion | None = None
-        self._untried: RunResult | None = None  # the start, until the interior point has begun there
-        # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
-        self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
+        self.smoothed: Motion | None = None
+        self.guided = any(cost.weight for cost in run.problem.obstacle_costs)
+        self.elastic = run.settings.elastic is not None
+        self.given = self.guess.trajectory is not None or bool(self.guess.gain.any()) or stay
         if run.settings.penalty is None:
             self._point.without_multipliers()
+        self.start = self._point.start()
+        kept = (self.given or run.settings.start is not None) and self.start.violation <= self._allowed
+        self._given = self.start if kept else None  # the answer must not be worse
+        self.untried = self.may_start = stay or not known.from_start  # the runs of a search have the same start
 
-    def climb(self, *, stay: bool = False) -> RunResult:
-        """Try the rungs in turn; with `stay`, only rungs that begin from the rollout of the first policy."""
-        guess = self._run.initial_guess
-        start = self._point.start()
-        given = guess.trajectory is not None or guess.gain.any() or stay
-        if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
-            self._given = start  # the answer must not be worse
-        rungs: list[Callable[[], RunResult | None]] = []
-        retried = False  # whether the start itself would be tried twice
-        if (found := guess.found) is not None:
-            rungs.append(lambda: self._remember(self._point.finish(found)))
-        if guess.multipliers and any(one.values.any() for one in guess.multipliers):
-            values = tuple(one.values for one in guess.multipliers)
-            rungs.append(lambda: self._interior(copied(start), LITTLE, multipliers=values))
-        if stay and self._guided:
-            rungs.append(self._refined)
-        if given:
-            # A sketch of a path is not near the answer, even if standing still keeps the constraints.
-            begin = guess.trajectory or start
-            kept = start.violation <= self._allowed and np.allclose(begin.states, start.states)
-            rungs.append(lambda: self._interior(copied(begin), LITTLE if kept else MUCH))
-            retried = not kept and np.array_equal(begin.states, start.states)
-        if not stay:
-            rungs += [self._from_valley, lambda: self._augmented(start), lambda: self._at_a_price(self._smoothed)]
-        if stay or not self._known.from_start:  # the runs of a search have the same start
-            self._untried = None if retried else start
-            rungs += [self._from_itself, lambda: self._from_start(start)]
-        for rung in rungs:
-            result = rung()
-            if result is not None and result.success:
-                if not self._worse(result):
+    @property
+    def converged(self) -> bool:
+        return self._best is not None and self._best.success
+
+    def climb(self) -> RunResult:
+        """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
+        for attempt in ATTEMPTS:
+            if self._budget.over or not attempt.when(self):
+                continue
+            found = attempt.make(self)
+            if found is not None and found.success:
+                if not self._worse(found):
                     break
                 self._best = None  # the given plan is better
-            if self._budget.over:
-                break
-        if not self._budget.over and (self._best is None or not self._best.success):
-            self._free()
-        return self._answer(start)
+        return self._answer()
 
-    def _free(self) -> None:
+    def finish_found(self) -> RunResult | None:
+        """Finish the optimum that a search for a free duration has found."""
+        assert self.guess.found is not None
+        return self._remember(self._point.finish(self.guess.found))
+
+    def from_neighbour(self) -> RunResult | None:
+        """From the start, with the multipliers of another solution."""
+        return self._interior(
+            copied(self.start), LITTLE, multipliers=tuple(one.values for one in self.guess.multipliers)
+        )
+
+    def from_given(self) -> RunResult | None:
+        """From the given trajectory, or the rollout of the given policy."""
+        # A sketch of a path is not near the answer, even if standing still keeps the constraints.
+        begin = self.guess.trajectory or self.start
+        near = self.start.violation <= self._allowed and np.allclose(begin.states, self.start.states)
+        self.untried &= near or not np.array_equal(begin.states, self.start.states)
+        return self._interior(copied(begin), LITTLE if near else MUCH)
+
+    def from_best_without_constraints(self) -> RunResult | None:
         """From the best plan, by Newton's method without the constraints: they may not act at the optimum."""
         best = self._best
         if best is None or not best.violation <= self._allowed or not np.isfinite(best.cost):
-            return
+            return None
         best = best.kept()
         self._point.without_multipliers()
         self._run.work.take(best.states, best.controls, best.cost)
         found = self._run.newton(detail=best.detail, patient=True)
-        if found.success and found.violation == 0:
-            self._remember(replace(found, multipliers=()))
+        if not found.success or found.violation > 0:
+            return None
+        return self._remember(replace(found, multipliers=()))
 
-    def _from_valley(self) -> RunResult | None:
+    def from_valley(self) -> RunResult | None:
         """From the plan of smoothing without the constraints."""
         run = self._run
-        run.smooth(GUIDED if self._guided else OPENING)
+        run.smooth(GUIDED if self.guided else OPENING)
         ending = run.checked_ending()
         settled = ending.success or ending.outcome == declarations.IN_VALLEY
         plan = run.work.arrays.last if settled else run.work.best  # the plan of least cost so far
         if ending is not run.ending or not np.isfinite(run.work.cost):
             return None
-        self._smoothed = copied(plan)
+        self.smoothed = copied(plan)
         if self._budget.stop.due:
             return None
-        if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
-            return self._interior(self._smoothed, MUCH)
+        if ending.outcome != declarations.IN_VALLEY or (not self.guided and self._budget.log[-1].violation):
+            return self._interior(self.smoothed, MUCH)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
         checkpoint = run.checkpoint()
         found = run.newton()
         if found.success and found.violation == 0:
             return self._remember(found)
-        bottom = copied(found) if found.success else self._smoothed
+        bottom = copied(found) if found.success else self.smoothed
         run.go_on(checkpoint)
-        if self._budget.stop.due or (self._guided and self._cuts(bottom)):
+        if self._budget.stop.due or (self.guided and self._cuts(bottom)):
             return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
-        return self._interior(bottom, LITTLE if self._guided else MUCH)
+        return self._interior(bottom, LITTLE if self.guided else MUCH)
 
     def _cuts(self, plan: Motion) -> bool:
         """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
@@ -159,32 +157,36 @@ class Ladder:
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
         return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
 
-    def _from_itself(self) -> RunResult | None:
-        """From the start, once."""
-        start, self._untried = self._untried, None
-        return None if start is None else self._interior(copied(start), MUCH)
+    def from_start(self) -> RunResult | None:
+        """From the start itself."""
+        self.untried = False
+        return self._interior(copied(self.start), MUCH)
 
-    def _from_start(self, start: RunResult) -> RunResult | None:
+    def from_start_at_a_price(self) -> RunResult | None:
+        """From the start, after a descent at a price."""
         self._known.from_start = True
-        return self._at_a_price(copied(start))
+        return self._at_a_price(copied(self.start))
 
-    def _refined(self) -> RunResult | None:
-        """From the plan of damped iterations on the augmented Lagrangian."""
+    def from_damped(self) -> RunResult | None:
+        """From the start, after damped iterations on the augmented Lagrangian."""
         with self._budget.limited(REFINED):
             found = damped_from_rollout(self._run)
         return self._after_multipliers(found)
 
-    def _augmented(self, start: RunResult) -> RunResult | None:
+    def from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
 
         If that plan costs more than the start, the method has diverged.
         """
         run = self._run
-        if self._smoothed is None or run.settings.elastic is not None or not self._guided:
-            return None
         with self._budget.limited(AUGMENTED):
             found = meet_constraints(run, run.result(run.ending), stale=STALE)
-        return self._after_multipliers(found, most=start.cost)
+        return self._after_multipliers(found, most=self.start.cost)
+
+    def from_smoothed_at_a_price(self) -> RunResult | None:
+        """From the plan of smoothing, after a descent at a price."""
+        assert self.smoothed is not None
+        return self._at_a_price(self.smoothed)
 
     def _after_multipliers(self, found: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
@@ -195,14 +197,12 @@ class Ladder:
             return None
         return self._interior(plan, LITTLE)
 
-    def _at_a_price(self, plan: Motion | None) -> RunResult | None:
+    def _at_a_price(self, plan: Motion) -> RunResult | None:
         """From the plan of a descent in which constraints may be violated at a price.
 
         If the descent makes no progress at one price, a start that keeps the constraints, such as standing still, is
         tried before the next price.
         """
-        if plan is None or self._run.settings.elastic is not None:
-            return None
         for price in PRICES:
             priced = self._restore(plan, price)
             if priced is None:
@@ -213,8 +213,8 @@ class Ladder:
                 return None
             if priced.near or price == PRICES[-1]:
                 found = self._interior(plan, MUCH)
-            elif self._untried is not None and self._untried.violation <= self._allowed:
-                found = self._from_itself()
+            elif self.untried and self.start.violation <= self._allowed:
+                found = self.from_start()
             else:
                 continue
             if found is not None and found.success:
@@ -270,11 +270,11 @@ class Ladder:
         """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding."""
         return self._given is not None and self._run.costs_more(found, self._given)
 
-    def _answer(self, start: RunResult) -> RunResult:
+    def _answer(self) -> RunResult:
         """The best result, certified."""
         run, stop = self._run, self._budget.stop
-        best = start if self._best is None else self._best
-        priced = run.settings.elastic is not None and best.success
+        best = self.start if self._best is None else self._best
+        priced = self.elastic and best.success
         if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
@@ -291,3 +291,61 @@ class Ladder:
                 detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
+
+
+class Attempt(NamedTuple):
+    """One of the attempts to keep the constraints.
+
+    Attributes:
+      words: the plan from which the interior point begins. when: whether it is tried. make: tries it.
+    """
+
+    words: str
+    when: Callable[[Ladder], bool]
+    make: Callable[[Ladder], RunResult | None]
+
+
+ATTEMPTS = (
+    Attempt(
+        "the optimum of the search for a free duration, which is only finished",
+        lambda tried: tried.guess.found is not None,
+        Ladder.finish_found,
+    ),
+    Attempt(
+        "the plan of another solution, with its multipliers",
+        lambda tried: any(one.values.any() for one in tried.guess.multipliers),
+        Ladder.from_neighbour,
+    ),
+    Attempt(
+        "the start, after damped iterations on the augmented Lagrangian",
+        lambda tried: tried.stay and tried.guided,
+        Ladder.from_damped,
+    ),
+    Attempt("a trajectory or a policy that the caller gave", lambda tried: tried.given, Ladder.from_given),
+    Attempt(
+        "the plan of smoothing without the constraints, after a few iterations",
+        lambda tried: not tried.stay,
+        Ladder.from_valley,
+    ),
+    Attempt(
+        "that plan, after the augmented Lagrangian",
+        lambda tried: tried.smoothed is not None and tried.guided and not tried.elastic,
+        Ladder.from_multipliers,
+    ),
+    Attempt(
+        "that plan, after a descent in which constraints may be violated at a price",
+        lambda tried: tried.smoothed is not None and not tried.elastic,
+        Ladder.from_smoothed_at_a_price,
+    ),
+    Attempt("the start itself", lambda tried: tried.untried, Ladder.from_start),
+    Attempt(
+        "the start, after such a descent",
+        lambda tried: tried.may_start and not tried.elastic,
+        Ladder.from_start_at_a_price,
+    ),
+    Attempt(
+        "the best plan so far, by Newton's method without the constraints",
+        lambda tried: not tried.converged,
+        Ladder.from_best_without_constraints,
+    ),
+)

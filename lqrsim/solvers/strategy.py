@@ -137,7 +137,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
-        return Ladder(run, known).climb(stay=True)
+        return Ladder(run, known, stay=True).climb()
     found = damped_from_rollout(run)
     if not found.stuck:
         return found
