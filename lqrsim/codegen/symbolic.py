@@ -100,7 +100,7 @@ def kept(
 def _writers() -> str:
     """The source of the modules that write the cached files, because these depend on it."""
     package = Path(__file__).parents[1]
-    files = [package / "codegen" / "symbolic.py"]
+    files = [package / "codegen" / f"{name}.py" for name in ("edge_pushing", "symbolic")]
     files += [
         package / "problem" / f"{name}.py"
         for name in ("dynamics", "costs", "constraints", "collision_spheres", "noise")
@@ -201,16 +201,37 @@ def _worked_out(expression: Any) -> Any:
     return expression.replace(sympy.floor, _floor())
 
 
+def smooth_almost_everywhere(expression: Any) -> Any:
+    """Replace distributions by zero: they are zero except at kinks and jumps, where there is no derivative."""
+    import sympy
+
+    kinds = (sympy.sign, sympy.Heaviside)
+    if not expression.has(sympy.DiracDelta, *kinds):
+        return expression
+    expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
+    for kind in kinds:
+        expression = expression.replace(kind, lambda *arguments, kind=kind: kind(*arguments).rewrite(sympy.Piecewise))
+    return expression
+
+
 def write_function(
-    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, of: str, returns: str | None = None
+    name: str,
+    arguments: str,
+    data: str,
+    assignments: Mapping[str, Any],
+    *,
+    of: str,
+    returns: str | None = None,
+    steps: Sequence[tuple[Any, Any]] | None = None,
 ) -> str:
-    """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
+    """Source of a function that evaluates SymPy expressions.
 
     Args:
       name, arguments: signature of the function. data: the argument with the parameters p0, p1, ....
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
       of: the name of the user's function in messages.
       returns: the target, among `assignments`, whose value is returned.
+      steps: (symbol, expression), in order, which the expressions share; by default their common subexpressions.
 
     Raises:
       InputError: an expression cannot be printed.
@@ -234,26 +255,18 @@ def write_function(
                 return f"({product})" if exponent > 0 else f"(1/({product}))"
             return super()._print_Pow(expr, rational=rational)
 
-    def smooth_almost_everywhere(expression: Any) -> Any:
-        """Replace distributions by zero: they are zero except at kinks and jumps, where there is no derivative."""
-        expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
-        for kind in (sympy.sign, sympy.Heaviside):
-            expression = expression.replace(
-                kind, lambda *arguments, kind=kind: kind(*arguments).rewrite(sympy.Piecewise)
-            )
-        return expression
-
-    assignments = {target: smooth_almost_everywhere(value) for target, value in assignments.items()}
+    values = [smooth_almost_everywhere(value) for value in assignments.values()]
     printer = Printer({"fully_qualified_modules": False})
-    shared, reduced = sympy.cse(list(assignments.values()), symbols=sympy.numbered_symbols("s"))
-    used = set().union(*(e.free_symbols for e in [*reduced, *(value for _, value in shared)]))
+    if steps is None:
+        steps, values = sympy.cse(values, symbols=sympy.numbered_symbols("s"))
+    used = set().union(*(e.free_symbols for e in [*values, *(value for _, value in steps)]))
     lines = [f"def {name}({arguments}):"]
     for symbol in sorted((s for s in used if str(s)[0] in "xupw"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
         letter, index = str(symbol)[0], str(symbol)[1:]
         lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
     try:
-        lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
-        for target, value in zip(assignments, reduced, strict=True):
+        lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in steps]
+        for target, value in zip(assignments, values, strict=True):
             sign = "+=" if target.endswith("+") else "="
             lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
     except (PrintMethodNotImplementedError, ValueError, RecursionError) as error:

@@ -150,7 +150,9 @@ def rate_jacobian(x, u, p, out, fx, fu) -> None:
 
 
 def rate_curvature(x, u, p, w, curve) -> None:
-    """Write the nonzero second derivatives of `sum_i w[i] f[i]`, in the entries that `step_curvature.py` lists."""
+    """Write the second derivatives of `sum_i w[i] f[i]` that may be nonzero, in the entries that `step_curvature.py`
+    lists; of symmetric pairs the one below the diagonal.
+    """
 
 
 def value(x, u, t, data) -> float:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.edge_pushing import weighted_hessian
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import (
@@ -29,8 +30,9 @@ from lqrsim.results.coordinates import Coordinates, Limits
 if TYPE_CHECKING:
     from lqrsim.scenes.contact_modes import ContactModes
 
-# The largest number of operations of a formula that is differentiated twice; the largest takes about five seconds.
-LONGEST = 1500
+# The largest number of steps of second derivatives. A thousand take 0.6 s to derive and 1 s to compile; the aeroplane
+# of `experiments/altro_problems.py` takes 2,300.
+MOST_STEPS = 10_000
 
 
 class Dynamics:
@@ -304,7 +306,7 @@ class Dynamics:
         if self.level != "symbolic":
             return by_jacobians
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("second derivatives", LONGEST, *names, *self.constants.items())
+        details = ("second derivatives", MOST_STEPS, *names, *self.constants.items())
         made = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
         support = tuple(made["support"])
         if not made["source"]:  # the formula would be too long
@@ -356,26 +358,22 @@ class Dynamics:
     def _trace_curvature(self) -> dict[str, Any]:
         """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
 
-        A formula of more than LONGEST operations has no source: deriving it would take minutes.
+        There is no source if it would take more than MOST_STEPS.
         """
         import sympy
 
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
         rates, x, u = self._traced()
-        if sum(sympy.count_ops(rate) for rate in rates) > LONGEST:
+        weights = [sympy.Symbol(f"w{i}", real=True) for i in range(len(rates))]
+        found = weighted_hessian(rates, weights, [*x, *u], most=MOST_STEPS)
+        if found is None:
             return {"source": "", "support": []}
-        z = [*x, *u]
-        total = sum(sympy.Symbol(f"w{i}", real=True) * rate for i, rate in enumerate(rates))
-        slopes = [sympy.diff(total, one) for one in z]
-        curves = {(i, j): slopes[i].diff(z[j]) for i in range(n + m) for j in range(i, n + m)}
-        curves = {pair: curve for pair, curve in curves.items() if curve != 0}
+        steps, curves = found
         support = sorted({i for pair in curves for i in pair})
         place = {i: k for k, i in enumerate(support)}
-        values = {f"curve[{place[i]}, {place[j]}]": curve for (i, j), curve in curves.items()}
-        values |= {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in curves.items()}
+        values = {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in curves.items()}
         of = f"{self.name}(x, u, p)"
         return {
-            "source": symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of),
+            "source": symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of, steps=steps),
             "support": support,
         }
 

@@ -1,0 +1,176 @@
+"""The Hessian of a weighted sum of formulas, by one sweep backwards through their operations: edge pushing.
+
+The formulas are taken apart into operations, equal ones into one. The sum depends on the last operations of the
+formulas. The sweep replaces an operation v = f(a, b, ...), the last first, by its arguments, until the sum depends on
+the variables. Each time its gradient g and Hessian H change by the chain rule:
+
+    g[a] += g[v] f_a
+    H[a, b] += g[v] f_ab + H[v, v] f_a f_b
+    H[a, p] += H[v, p] f_a                              for all other p
+
+So what formulas share is differentiated once, and the effort grows with the number of operations. Written out, a
+formula and its derivatives can be a hundred times as long.
+
+R. M. Gower and M. P. Mello, A new framework for the computation of Hessians, Optimization Methods and Software 27(2),
+2012.
+"""
+
+import itertools
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+from lqrsim.codegen.symbolic import smooth_almost_everywhere
+
+
+class Operations:
+    """Operations on symbols and numbers, in the order in which they can be done.
+
+    Attributes:
+      steps: (symbol, operation), each operation once.
+    """
+
+    def __init__(self) -> None:
+        self.steps: list[tuple[Any, Any]] = []
+        self._names: dict[Any, Any] = {}
+
+    def of(self, formulas: Sequence[Any]) -> list[Any]:
+        """The names of formulas: symbols, negative symbols or numbers. Common subexpressions become one."""
+        import sympy
+
+        shared, reduced = sympy.cse(formulas, symbols=sympy.numbered_symbols("c", real=True))
+        for symbol, expression in shared:
+            self._names[symbol] = self.name(expression)
+        return [self.name(expression) for expression in reduced]
+
+    def name(self, expression: Any) -> Any:
+        """The name of an expression, after a step for each operation in it; a condition is no step."""
+        import sympy
+
+        if expression in self._names:
+            return self._names[expression]
+        if not expression.args:
+            return expression
+        operation = expression.func(*[self.name(part) for part in expression.args])
+        found = self.step(operation) if isinstance(operation, sympy.Expr) else operation
+        self._names[expression] = found
+        return found
+
+    def step(self, operation: Any) -> Any:
+        """The name of one operation, or of a sum or product of names as a whole."""
+        import sympy
+
+        if not operation.args or (-operation).is_Symbol:
+            return operation
+        if operation not in self._names:
+            self._names[operation] = sympy.Symbol(f"s{len(self.steps)}", real=True)
+            self.steps.append((self._names[operation], operation))
+        return self._names[operation]
+
+
+class WeightedSum:
+    """A weighted sum as a function of some symbols: its gradient and Hessian, whose entries are lists of terms.
+
+    Args:
+      operations: where steps are added. order: the symbols that depend on the variables, and their places.
+    """
+
+    def __init__(self, operations: Operations, order: dict[Any, int]) -> None:
+        self._operations, self._order = operations, order
+        self._gradient: dict[Any, list[Any]] = defaultdict(list)
+        self._hessian: dict[Any, dict[Any, list[Any]]] = defaultdict(lambda: defaultdict(list))
+        # Terms whose sum is positive where the sum depends on a symbol. It does not where the symbol is only in other
+        # cases of a Piecewise; its derivatives there may be infinite, and a product with zero would be NaN.
+        self._uses: dict[Any, list[Any]] = defaultdict(list)
+
+    def begin(self, result: Any, weight: Any) -> None:
+        """Add a formula, given its name."""
+        for symbol in result.free_symbols & self._order.keys():  # at most one
+            self._gradient[symbol].append(weight * result.diff(symbol))
+            self._uses[symbol].append(1)
+
+    def replace(self, symbol: Any, operation: Any) -> None:
+        """Replace a symbol by the operation that it names."""
+        import sympy
+
+        if symbol not in self._uses:
+            return
+        weight, uses = self._named(self._gradient.pop(symbol)), self._uses.pop(symbol)
+        row = {other: self._named(terms) for other, terms in self._hessian.pop(symbol, {}).items()}
+        curved = row.pop(symbol, 0)
+        for other in row:
+            del self._hessian[other][symbol]
+        used = 1 if 1 in uses else self._named(uses)
+
+        def slope_where_used(slope: Any) -> Any:
+            if used != 1 and not slope.is_number:
+                slope = sympy.Piecewise((slope, used > 0), (0, True))
+            return self._operations.name(slope)
+
+        inputs = sorted(operation.free_symbols & self._order.keys(), key=self._order.__getitem__)
+        slopes = {a: smooth_almost_everywhere(operation.diff(a)) for a in inputs}
+        slopes = {a: slope for a, slope in slopes.items() if slope != 0}
+        names = {a: slope_where_used(slope) for a, slope in slopes.items()}
+        for i, a in enumerate(slopes):
+            share = 1
+            if operation.is_Piecewise:
+                cases = [(int(case.has(a)), condition) for case, condition in operation.args]
+                share = self._operations.name(sympy.Piecewise(*cases))
+            self._uses[a].append(self._named([used * share]))
+            self._gradient[a].append(weight * names[a])
+            for b in list(slopes)[i:]:
+                self._add(a, b, weight * slope_where_used(slopes[a].diff(b)) + curved * names[a] * names[b])
+            for other, value in row.items():
+                self._add(a, other, (2 if other == a else 1) * value * names[a])
+
+    def second(self, a: Any, b: Any) -> Any:
+        """The name of the second derivative by two symbols."""
+        return self._named(self._hessian[a].get(b, ()))
+
+    def _add(self, a: Any, b: Any, term: Any) -> None:
+        if term != 0:
+            self._hessian[a][b].append(term)
+            if a != b:
+                self._hessian[b][a].append(term)
+
+    def _named(self, terms: Sequence[Any]) -> Any:
+        import sympy
+
+        return self._operations.step(sympy.Add(*terms))
+
+
+def weighted_hessian(
+    formulas: Sequence[Any], weights: Sequence[Any], variables: Sequence[Any], *, most: int
+) -> tuple[list[tuple[Any, Any]], dict[tuple[int, int], Any]] | None:
+    """The second derivatives of `sum_i weights[i] formulas[i]`.
+
+    At kinks and jumps they are what `smooth_almost_everywhere` makes of distributions.
+
+    Args:
+      formulas: real SymPy expressions.
+      weights: a symbol for each formula, which is in none of them.
+      variables: symbols.
+      most: largest number of steps.
+
+    Returns:
+      Steps (symbol, operation), in order, and in terms of these the second derivatives by variables i <= j that are not
+      always zero, as (i, j) -> expression. None if there would be more steps.
+    """
+    operations = Operations()
+    results = operations.of([smooth_almost_everywhere(formula) for formula in formulas])
+    order = {symbol: i for i, symbol in enumerate(variables)}
+    forward = []
+    for symbol, operation in operations.steps:
+        if not operation.free_symbols.isdisjoint(order):
+            order[symbol] = len(order)
+            forward.append((symbol, operation))
+    total = WeightedSum(operations, order)
+    for result, weight in zip(results, weights, strict=True):
+        total.begin(result, weight)
+    for symbol, operation in reversed(forward):
+        total.replace(symbol, operation)
+        if len(operations.steps) > most:
+            return None
+    pairs = itertools.combinations_with_replacement(enumerate(variables), 2)
+    curves = {(i, j): total.second(a, b) for (i, a), (j, b) in pairs}
+    return operations.steps, {pair: curve for pair, curve in curves.items() if curve != 0}

@@ -1,0 +1,230 @@
+"""Second derivatives of formulas, against SymPy's of the formulas written out, recurrences and differences."""
+
+import hashlib
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from altro.airplane import airplane
+from compiling import run
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from sampling import examples
+from sympy import Abs, Heaviside, Max, Min, Mod, Piecewise, atan2, cos, exp, floor, log, sign, sin, sqrt, tanh
+
+import lqrsim as ls
+from lqrsim import rotations
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.edge_pushing import weighted_hessian
+from lqrsim.errors import Array
+
+# Each maps numbers of size 1 to numbers of size 1, so that rounding stays what it is. Some are undefined in a case of
+# theirs that does not apply.
+NODES: tuple[Callable[[Any, Any, Any], Any], ...] = (
+    lambda a, b, c: (a + b - 2 * c) / 3,
+    lambda a, b, c: a * b * c / 2 - a / 3,
+    lambda a, b, c: a * b / (1 + c**2),
+    lambda a, b, c: a**2 / 2 - b**3 / 4,
+    lambda a, b, c: (1 + a**2) ** (tanh(b) / 2),
+    lambda a, b, c: sqrt(1 + a**2) * sin(b),
+    lambda a, b, c: cos(a + 2 * b),
+    lambda a, b, c: exp(-(a**2)) * atan2(b, 1 + c**2),
+    lambda a, b, c: log(1 + a**2) / sqrt(2 + b**2),
+    lambda a, b, c: Abs(a) * b,
+    lambda a, b, c: Max(a, b, c) ** 2,
+    lambda a, b, c: a * Min(b, 0.3 * c),
+    lambda a, b, c: sign(a) * b + Heaviside(b) * c,
+    lambda a, b, c: (floor(3 * a) / 3 + Mod(b, 1)) * c / 2,
+    lambda a, b, c: Piecewise((a * b, a > c), (sin(b), b < 0.2), (c, True)),
+    lambda a, b, c: Piecewise((sqrt(a) * b, a > 0), (a * c, (b > 0) & (c < 0.5)), (0, True)),
+    lambda a, b, c: Piecewise((sin(log(a * b)) * c, (a > 0) & (b > 0)), (c**2 / 2, True)),
+    lambda a, b, c: sum(rotations.rotate([a, b, c], [c, 1, a])) / 2,
+    lambda a, b, c: sum(rotations.vector_rate([a, b / 2, c / 2], [b, 1, a])) / 3,
+)
+
+
+def drawn(choose: Callable[[int], int], symbols: list[Any]) -> list[Any]:
+    """Two formulas that share what they are made of."""
+    made = [*symbols, sympy.Rational(1, 3)]
+    for _ in range(2 + choose(4)):
+        made.append(NODES[choose(len(NODES))](*[made[-1 - choose(len(made))] for _ in range(3)]))
+    return [sympy.sympify(one) for one in made[-2:]]
+
+
+def dynamics_of(formulas: list[Any], symbols: list[Any]) -> ls.Dynamics:
+    """Their rates are formulas of two states, a control and a parameter."""
+
+    def rates(x: Any, u: Any, p: Any) -> list[Any]:
+        values = dict(zip(symbols, [*x, *u, p.number], strict=True))
+        return [sympy.sympify(one).subs(values, simultaneous=True) for one in formulas]
+
+    return ls.Dynamics(rates, states={"a": "", "b": ""}, controls={"c": ""}, parameters={"number": 0.7})
+
+
+def compiled_hessian(dynamics: ls.Dynamics, x: Array, u: Array, weights: Array) -> Array:
+    """The Hessian (W, W) of the weighted rates, by compiled code."""
+    made = dynamics._trace_curvature()
+    support, size = made["support"], len(x) + len(u)
+    curve, found = np.zeros((len(support), len(support))), np.zeros((size, size))
+    if support:
+        run(made["source"], "rate_curvature", x, u, dynamics.data, weights, curve)
+    found[np.ix_(support, support)] = np.tril(curve) + np.tril(curve, -1).T
+    return found
+
+
+def ratio_in_digits(name: str) -> Callable[[Any], Any]:
+    """`sine_ratio` and the others, and their derivatives, with many digits."""
+    base, _, order = name.partition("_d")
+    angle = {
+        "sine_ratio": lambda r: mpmath.sin(r) / r,
+        "cosine_ratio": lambda r: (1 - mpmath.cos(r)) / r**2,
+        "cotangent_ratio": lambda r: (1 - r / 2 * mpmath.cot(r / 2)) / r**2,
+    }[base]
+    return lambda s: mpmath.diff(lambda square: angle(mpmath.sqrt(square)), s, int(order or 0))
+
+
+def exact_hessian(formulas: list[Any], weights: Array, variables: list[Any], symbols: list[Any], at: Array) -> Array:
+    """That of the formulas written out, by SymPy, evaluated with 40 digits."""
+    names = [name + end for name in rotations.RATIOS for end in ("", "_d1", "_d2")]
+    modules = [{name: ratio_in_digits(name) for name in names}, "mpmath"]
+    total = sympy.Add(*[sympy.Float(float(w), 40) * one for w, one in zip(weights, formulas, strict=True)])
+    with mpmath.workdps(40):
+        entries = [[symbolic.smooth_almost_everywhere(total.diff(a).diff(b)) for b in variables] for a in variables]
+        # SymPy puts a case's zero into another case, where it does not apply: its logarithm is infinite.
+        assume(not any(entry.has(sympy.zoo, sympy.nan) for row in entries for entry in row))
+        values = sympy.lambdify(symbols, entries, modules=modules)(*[mpmath.mpf(float(one)) for one in at])
+    return np.array([[float(one) for one in row] for row in values])
+
+
+@settings(max_examples=examples(60))
+@given(draw=st.data(), seed=st.integers(0, 2**32 - 1))
+def test_of_drawn_formulas(draw: st.DataObject, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    symbols = list(sympy.symbols("x0 x1 u0 p0", real=True))
+    formulas = drawn(lambda count: draw.draw(st.integers(0, count - 1)), symbols)
+    dynamics = dynamics_of(formulas, symbols)
+    traced, *_ = dynamics._traced()  # with remainders and jumps worked out
+    at, weights = np.append(rng.uniform(-1, 1, 3), 0.7), rng.uniform(-1, 1, 2)
+    wanted = exact_hessian(traced, weights, symbols[:3], symbols, at)
+    found = compiled_hessian(dynamics, at[:2].copy(), at[2:3].copy(), weights)
+    # Some hundred operations on numbers of size 1, whose derivatives grow.
+    np.testing.assert_allclose(found, wanted, atol=1e-11 * max(1.0, np.abs(wanted).max()))
+
+
+@pytest.mark.parametrize(
+    ("formulas", "support"),
+    [
+        (lambda a, b, c, p: [a + p * b, 0], []),
+        (lambda a, b, c, p: [p, 3], []),
+        (lambda a, b, c, p: [a, sin(b) * p], [1]),
+        (lambda a, b, c, p: [c**2, a - c], [2]),
+        (lambda a, b, c, p: [a, -b * c], [1, 2]),
+        (lambda a, b, c, p: [floor(a) + sign(b), Abs(c)], []),
+    ],
+    ids=["linear", "constant", "a state", "a control", "a product", "kinks"],
+)
+def test_support(formulas: Callable[..., list[Any]], support: list[int]) -> None:
+    """What the rates are not curved in has no entries."""
+    symbols = list(sympy.symbols("x0 x1 u0 p0", real=True))
+    assert dynamics_of(formulas(*symbols), symbols)._trace_curvature()["support"] == support
+
+
+def test_a_case_that_does_not_apply_may_be_undefined() -> None:
+    """Its derivatives are infinite or NaN, also those of what only such cases use."""
+
+    def rates(x: Any, u: Any, p: Any) -> list[Any]:
+        inner = sqrt(x[0])
+        first = Piecewise((inner * x[1] + exp(inner), x[0] > 0), (x[1] ** 2, True))
+        return [first, Piecewise((inner**3 * u[0], x[0] > 0), (u[0] ** 2, True))]
+
+    dynamics = ls.Dynamics(rates, states={"a": "", "b": ""}, controls={"c": ""})
+    for a in (-0.5, 0.0):
+        found = compiled_hessian(dynamics, np.array([a, 0.3]), np.array([0.2]), np.array([1.0, 3.0]))
+        np.testing.assert_array_equal(found, np.diag([0.0, 2.0, 6.0]))
+    found = compiled_hessian(dynamics, np.array([4.0, 0.3]), np.array([0.2]), np.array([1.0, 3.0]))
+    # d2/da2 of 0.3 a^0.5 + exp(a^0.5) + 0.6 a^1.5 at 4.
+    second = -0.25 * 0.3 / 8 + np.exp(2) * (1 / 16 - 1 / 32) + 0.45 / 2
+    np.testing.assert_allclose(found, [[second, 0.25, 9.0], [0.25, 0, 0], [9.0, 0, 0]], rtol=1e-13)
+
+
+def test_the_effort_grows_with_the_number_of_operations() -> None:
+    """Each turn of a map uses the last value twice: written out, ten turns are thousands of operations."""
+    x, weight = sympy.symbols("x0 w0", real=True)
+    formula, counts = x, []
+    value, first, second = 0.4, 1.0, 0.0
+    for _ in range(10):
+        formula = sin(formula) * (2 + formula)
+        s, c = np.sin(value), np.cos(value)
+        slope = c * (2 + value) + s
+        second = (2 * c - s * (2 + value)) * first**2 + slope * second
+        value, first = s * (2 + value), slope * first
+        found = weighted_hessian([formula], [weight], [x], most=1000)
+        assert found is not None
+        counts.append(len(found[0]))
+    assert sympy.count_ops(formula) > 3000
+    assert len(set(np.diff(counts)[1:])) == 1
+    assert weighted_hessian([formula], [weight], [x], most=counts[-1] // 2) is None
+    dynamics = ls.Dynamics(lambda x, u, p: [formula], states={"a": ""}, controls={"b": ""})
+    hessian = compiled_hessian(dynamics, np.array([0.4]), np.zeros(1), np.ones(1))
+    # Ten turns of a map that stretches by up to 2 round by some 1e-13.
+    np.testing.assert_allclose(hessian, [[second, 0], [0, 0]], rtol=1e-11)
+
+
+def test_of_an_aeroplane() -> None:
+    """The largest formula of the experiments, by second differences with 60 digits, whose error is some 1e-25."""
+    dynamics = airplane()
+    rates, x, u = dynamics._traced()
+    rng = np.random.default_rng(0)
+    attitude, speed = rng.normal(size=4), np.array([6.0, 0.5, -0.4])
+    at = np.concatenate([rng.normal(size=3), attitude, speed, rng.normal(size=3), [90.0, 100.0, 110.0, 95.0]])
+    weights, size, step = rng.normal(size=13), 17, mpmath.mpf(10) ** -15
+    with mpmath.workdps(60):
+        function = sympy.lambdify([*x, *u], rates, modules="mpmath", cse=True)
+        weighed, point = [mpmath.mpf(float(one)) for one in weights], [mpmath.mpf(float(one)) for one in at]
+
+        def value(*moves: tuple[int, int]) -> Any:
+            moved = point[:]
+            for i, sign in moves:
+                moved[i] += sign * step
+            return mpmath.fdot(weighed, function(*moved))
+
+        wanted = np.zeros((size, size))
+        for i, j in itertools.combinations_with_replacement(range(size), 2):
+            ends = [one * other * value((i, one), (j, other)) for one in (1, -1) for other in (1, -1)]
+            wanted[i, j] = wanted[j, i] = float(mpmath.fsum(ends) / (4 * step**2))
+    found = compiled_hessian(dynamics, at[:13].copy(), at[13:].copy(), weights)
+    np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(wanted).max())
+
+
+SCRIPT = """
+import hashlib
+import lqrsim as ls
+from sympy import Max, Piecewise, sqrt
+
+def rates(x, u, p):
+    far = sqrt(x[0] ** 2 + x[1] ** 2)
+    return [Piecewise((far * u[0], far > p.size), (Max(far, x[1], u[0]) ** 2, x[1] < 0), (x[0] * u[0], True)), far ** 3]
+
+own = ls.Dynamics(rates, states={"a": "", "b": ""}, controls={"c": ""}, parameters={"size": 1.0})
+for dynamics in (own, ls.Quadrotor().dynamics):
+    print(dynamics._trace_curvature()["source"])
+"""
+
+
+def test_each_process_writes_the_same() -> None:
+    """Compiled code is found again by its source."""
+
+    def digest(seed: str) -> str:
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, check=True)
+        assert done.stdout
+        return hashlib.sha256(done.stdout).hexdigest()
+
+    assert len({digest(seed) for seed in ("0", "1", "2")}) == 1
