@@ -6,7 +6,7 @@
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -295,6 +295,13 @@ class KeepsClear:
             self.shape["radius"] = check_number(f"{who}: radius", radius, at_least=0.0)
         self.world, self.balls, self.geoms = world, balls, geoms
         self.radius: float = self.shape.get("radius", 0.0 if balls is None else float(balls.radii.max()))
+
+    @property
+    def kept_clear(self) -> "KeepsClear":
+        return self
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
     @property
     def moving(self) -> bool:

@@ -31,7 +31,7 @@ from lqrsim.errors import (
     numbers_of,
 )
 from lqrsim.kernels import state_bound
-from lqrsim.problem.costs import OfFunction, ProblemPart, bound_at, rows_ahead
+from lqrsim.problem.costs import OfFormula, ProblemPart, bound_at, rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
@@ -57,6 +57,7 @@ class ConstraintTerm(Term):
       shared: number of values that all rows share, such as the centres of balls; they are computed once per step. If it
         is not 0, the source must define `places` and `places_jacobian`, as in `SphereCenters`. Then `value` and `slope`
         get these values (shared,) and their derivatives (shared, n) in place of x and u.
+      convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
     """
 
     rows: int
@@ -65,6 +66,7 @@ class ConstraintTerm(Term):
     equality: bool = False
     final_only: bool = False
     shared: int = 0
+    convex: bool = False
 
     @property
     def _defines(self) -> Mapping[str, int]:
@@ -74,7 +76,7 @@ class ConstraintTerm(Term):
     def __post_init__(self) -> None:
         keep(self, rows=check_count("ConstraintTerm: rows", self.rows, at_least=0))
         check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
-        for name in ("uses_control", "equality", "final_only"):
+        for name in ("uses_control", "equality", "final_only", "convex"):
             keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
@@ -85,8 +87,34 @@ class ConstraintTerm(Term):
 class Constraint(ProblemPart[ConstraintTerm]):
     """A constraint."""
 
+    def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
+        """The final values that it requires of states, by their indices.
 
-class SymbolicConstraint(OfFunction, Constraint):
+        Args:
+          dynamics: dynamics of the system.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
+        return {}
+
+    def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
+        """The low and the high bound, each a number or (K,) for K knots, of each state that it bounds, by its index.
+
+        Args:
+          dynamics: dynamics of the system.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
+        return {}
+
+    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
+        """As `bound_at`, beside constraints that require final values of states, by their indices."""
+        return bound_at(self, dynamics, times)
+
+
+class SymbolicConstraint(OfFormula, Constraint):
     """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
 
         def slower_than_2(x, u, p):  # a planar speed, in m/s
@@ -191,8 +219,7 @@ class GoalState(Constraint):
         else:
             self.goal = check_array("GoalState: goal", goal, (None,))
 
-    def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
-        """The goal of each state with a goal, by index. Raises InputError if the goal does not fit."""
+    def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
         names, goal = dynamics.state_coordinates.names, self.goal
         if isinstance(goal, dict):
             return dynamics.state_coordinates._by_name("GoalState: states", goal, check_number)
@@ -203,12 +230,16 @@ class GoalState(Constraint):
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        rows = list(self._numbers(dynamics).items())
+        rows = list(self.final_states(dynamics).items())
         described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         data = _bound_data([(i, 1.0, np.inf, np.array([number])) for i, number in rows])
         return ConstraintTerm(
             source_of(state_bound), data, len(rows), described.__getitem__, equality=True, final_only=True
         )
+
+    def with_added_state(self, dynamics: Dynamics) -> "GoalState":
+        names = dynamics.state_coordinates.names  # numbers by unit would also apply to the added state
+        return GoalState({names[i]: number for i, number in self.final_states(dynamics).items()})
 
 
 class StateBounds(Constraint):
@@ -250,27 +281,25 @@ class StateBounds(Constraint):
         }
         return other
 
-    def _of(self, dynamics: Dynamics) -> dict[int, tuple[Side, Side]]:
-        """(low, high) of each bounded state, by index. Of what is left of a plan, all of them may be infinite."""
-
+    def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
         def sides(field: str, given: object) -> tuple[Side, Side]:
             return given  # pyright: ignore[reportReturnType]
 
         return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, sides)
 
+    def with_added_state(self, dynamics: Dynamics) -> "StateBounds":
+        names = dynamics.state_coordinates.names  # as for a GoalState
+        return StateBounds({names[i]: sides for i, sides in self.state_bounds(dynamics).items()})
+
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self._bind_to_goal(dynamics, {}, 0)
+        return self._bind_beside(dynamics, np.zeros(1), {})
 
-    def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
-        """As `bind`, if some states, by their indices, must be at a goal after this number of steps.
-
-        Raises:
-          InputError: a goal is outside the bounds.
-        """
+    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
+        """Raises InputError if a goal is outside the bounds."""
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         rows, described = [], []
         for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
-            for i, sides in self._of(dynamics).items():
+            for i, sides in self.state_bounds(dynamics).items():
                 name, numbers = names[i], np.atleast_1d(sides[side])
                 acts = np.isfinite(numbers)
                 if not (acts.any() or isinstance(sides[side], np.ndarray)):
@@ -279,18 +308,18 @@ class StateBounds(Constraint):
                 if i in goals and sign * (goals[i] - numbers[-1]) < 0:
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
-                rows.append((i, sign, steps - 1 if i in goals else np.inf, numbers))
+                rows.append((i, sign, len(times) - 2 if i in goals else np.inf, numbers))
                 described.append(wanted)
-        return ConstraintTerm(source_of(state_bound), _bound_data(rows), len(rows), described.__getitem__)
+        return ConstraintTerm(source_of(state_bound), _bound_data(rows), len(rows), described.__getitem__, convex=True)
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
-    """The values that all GoalStates require, by the index of the state. Raises InputError if two of them contradict
-    each other.
+    """The final values that all constraints require, by the index of the state. Raises InputError if two of them
+    contradict each other.
     """
     goals: dict[int, float] = {}
     for constraint in constraints:
-        for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
+        for i, number in constraint.final_states(dynamics).items():
             if goals.setdefault(i, number) != number:
                 name = dynamics.state_coordinates.names[i]
                 raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one goal")
@@ -303,20 +332,17 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array
     Raises:
       InputError: the constraints do not fit the system, or each other.
     """
-    goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
-    _check_bounds([one for one in constraints if isinstance(one, StateBounds)], dynamics, len(times))
+    goals, terms = goals_of(constraints, dynamics), []
+    _check_bounds([one.state_bounds(dynamics) for one in constraints], dynamics, len(times))
     for constraint in constraints:
-        if isinstance(constraint, StateBounds):
-            term = constraint._bind_to_goal(dynamics, goals, steps)
-        else:
-            term = bound_at(constraint, dynamics, times)
+        term = constraint._bind_beside(dynamics, times, goals)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
 
 
-def _check_bounds(bounds: Sequence[StateBounds], dynamics: Dynamics, knots: int) -> None:
+def _check_bounds(found: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
     """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
-    names, found = dynamics.state_coordinates.names, [one._of(dynamics) for one in bounds]
+    names = dynamics.state_coordinates.names
     for i, sides in (item for one in found for item in one.items()):
         for side in sides:
             if isinstance(side, np.ndarray) and len(side) != knots:

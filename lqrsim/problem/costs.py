@@ -106,7 +106,11 @@ _BoundTerm = TypeVar("_BoundTerm", bound=Term)
 
 
 class ProblemPart(abc.ABC, Generic[_BoundTerm]):
-    """A cost or a constraint, which can be bound to any system that it fits."""
+    """A cost or a constraint, which can be bound to any system that it fits.
+
+    All that others ask of one is a method here, in `Cost` or in `Constraint`, with the answer of most; a kind with
+    another answer overrides it.
+    """
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> _BoundTerm:
@@ -128,6 +132,24 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     def moving(self) -> bool:
         """Whether the term changes with time; see `bound_at`."""
         return self.by_knot
+
+    @property
+    def kept_clear(self) -> KeepsClear | None:
+        """The obstacles that it keeps the robot clear of, with the robot's shape; None for others."""
+        return None
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        """The same for a system with one more state, the last, of which it is independent: for a free duration.
+
+        Args:
+          dynamics: dynamics of the system without that state.
+
+        Raises:
+          InputError: its kind cannot be stated for one more state.
+        """
+        raise InputError(
+            f"duration: got a {type(self).__name__} beside it, which cannot have one more state, want none"
+        )
 
     def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
         """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
@@ -186,12 +208,21 @@ class OfFunction:
     def _data(self) -> Array:
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
+
+class OfFormula(OfFunction):
+    """A cost or a constraint that is stated as a formula, with parameters."""
+
     def _set_formula(self, function: Callable[..., Any], parameters: Mapping[str, float] | None, instead: str) -> None:
         """Check and keep a function of symbols."""
         if level_of(function, None) == "compiled":
             raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
         check_signature(function, ("x", "u", "p"))
         self.function, self.parameters = function, symbolic.check_parameters(parameters)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        other, function, n = copy.copy(self), self.function, len(dynamics.state_coordinates)
+        other.function = lambda x, u, p: function(x[:n], u, p)
+        return other
 
 
 class Cost(ProblemPart[CostTerm]):
@@ -201,6 +232,49 @@ class Cost(ProblemPart[CostTerm]):
     def name(self) -> str:
         """The name in messages."""
         return type(self).__name__
+
+    @property
+    def state_reference(self) -> "QuadraticCost | None":
+        """What it is near the states that it draws to; None for a cost that draws to none.
+
+        A problem's start and goal are those of its initial and its final cost.
+        """
+        return None
+
+    @property
+    def control_reference(self) -> "ControlCost | None":
+        """What it is near the controls that it draws to, as solvers start from; None for a cost that draws to none."""
+        return None
+
+    @property
+    def contact_curvature(self) -> float:
+        """Its second derivative in the distance to an obstacle, in 1/m^2, at contact; 0 if it does not act.
+
+        The search for ways round obstacles weighs paths by it.
+        """
+        return 0.0
+
+    def times(self, factor: float) -> "Cost":
+        """The cost times a number. Costs with a state reference or obstacles have it: the search changes their weights.
+
+        Args:
+          factor: the number, not negative.
+
+        Raises:
+          InputError: a cost of another kind.
+        """
+        raise InputError(f"{self.name}: got no method times(factor), want it to return the cost times a number")
+
+    def moved_to(self, state: Array) -> "Cost":
+        """The cost with another state as reference. Costs with a state reference have it: a viewer moves goals.
+
+        Args:
+          state: (n,).
+
+        Raises:
+          InputError: a cost of another kind.
+        """
+        raise InputError(f"{self.name}: got no method moved_to(state), want it to return the cost about a state")
 
     def _in(self, dynamics: Dynamics) -> "Cost":
         """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
@@ -225,6 +299,9 @@ class CostSum(Cost):
 
     def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
         return CostSum(tuple(term.ahead(steps, horizon=horizon) for term in self.terms))
+
+    def with_added_state(self, dynamics: Dynamics) -> "CostSum":
+        return CostSum(tuple(term.with_added_state(dynamics) for term in self.terms))
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
@@ -317,11 +394,17 @@ class _SquareCost(Cost):
             return self
 
         weight, about = self._known
-        other = copy.copy(self)
-        other._numbers = (
+        return self._with(
             rows_ahead(weight, steps, horizon) if weight.ndim == 3 else weight,
             rows_ahead(about, steps, horizon) if about.ndim == 2 else about,
         )
+
+    def times(self, factor: float) -> Self:
+        return self._with(factor * self.weight, self.about)
+
+    def _with(self, weight: Array, about: Array) -> Self:
+        other = copy.copy(self)
+        other._numbers = weight, about
         return other
 
     def _in(self, dynamics: Dynamics) -> "_SquareCost":
@@ -426,6 +509,20 @@ class QuadraticCost(_SquareCost):
             raise InputError(f"{self.name}: about: got none, want {want}")
         super().__init__(weight, about, longer)
 
+    @property
+    def state_reference(self) -> "QuadraticCost":
+        return self
+
+    def moved_to(self, state: Array) -> Self:
+        return self._with(self.weight, state)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        weight, about = (
+            np.pad(array, [(0, 0)] * (array.ndim - axes) + [(0, 1)] * axes)
+            for array, axes in ((self.weight, 2), (self.about, 1))
+        )
+        return self._with(weight, about)
+
 
 class ControlCost(_SquareCost):
     """`1/2 (u - about)' weight (u - about)`.
@@ -445,6 +542,13 @@ class ControlCost(_SquareCost):
 
     def __init__(self, weight: PerKnot, *, about: PerKnot | None = None, longer: bool = False) -> None:
         super().__init__(weight, about, longer)
+
+    @property
+    def control_reference(self) -> "ControlCost":
+        return self
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
 
 class LimitCost(Cost):
@@ -477,6 +581,9 @@ class LimitCost(Cost):
         ]
         numbers = np.array([len(rows), *np.ravel(rows)], dtype=np.float64)
         return CostTerm(source_of(limit_cost), numbers, exact_hessian=False)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
 
 class ObstacleCost(KeepsClear, Cost):
@@ -525,6 +632,13 @@ class ObstacleCost(KeepsClear, Cost):
         other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
         return other
 
+    def times(self, factor: float) -> "ObstacleCost":
+        return self.weighing(factor * self.weight)
+
+    @property
+    def contact_curvature(self) -> float:
+        return self.weight * self.sharpness**2
+
     def bind(self, dynamics: Dynamics) -> CostTerm:
         return self._bind_at(dynamics, np.zeros(1))
 
@@ -555,12 +669,10 @@ class ObstacleCost(KeepsClear, Cost):
 
 def weighing_obstacles(cost: Cost, times: float) -> CostSum:
     """The cost with the weights of its obstacles multiplied."""
-    return CostSum(
-        tuple(one.weighing(times * one.weight) if isinstance(one, ObstacleCost) else one for one in terms_of(cost))
-    )
+    return CostSum(tuple(one if one.kept_clear is None else one.times(times) for one in terms_of(cost)))
 
 
-class SymbolicCost(OfFunction, Cost):
+class SymbolicCost(OfFormula, Cost):
     """A cost stated as a formula.
 
     Args:

@@ -72,7 +72,7 @@ class Ladder:
         self._smoothed: Motion | None = None
         self._untried: RunResult | None = None  # the start, until the interior point has begun there
         # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
-        self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
+        self._guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
         if run.settings.penalty is None:
             self._point.without_multipliers()
 

@@ -65,23 +65,24 @@ class MovableGoal:
                 f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
         (self._number,) = found
-        self.place = self._cost.about[self._position]
+        self.place = self._reference.about[self._position]
 
     @property
-    def _cost(self) -> QuadraticCost:
-        cost = self._terms[self._number]
-        assert isinstance(cost, QuadraticCost)
-        return cost
+    def _reference(self) -> QuadraticCost:
+        reference = self._terms[self._number].state_reference
+        assert reference is not None
+        return reference
 
     def _weighs_place(self, term: Cost) -> bool:
-        return isinstance(term, QuadraticCost) and bool(term.weight[self._position].any())
+        reference = term.state_reference
+        return reference is not None and bool(reference.weight[self._position].any())
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
-        about = self._cost.about.copy()
+        about = self._reference.about.copy()
         about[self._position] = place
         terms = list(self._terms)
-        terms[self._number] = QuadraticCost(self._cost.weight, about=about)
+        terms[self._number] = terms[self._number].moved_to(about)
         return terms[0] if len(terms) == 1 else CostSum(tuple(terms))
 
 
