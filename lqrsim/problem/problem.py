@@ -24,10 +24,11 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
-from lqrsim.problem.costs import Cost, CostTerm, QuadraticCost, bound_at, in_system, terms_of
+from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
+from lqrsim.problem.quadratic_cost import QuadraticCost, about_state
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.rollout import Rollout
@@ -186,7 +187,7 @@ class Problem:
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
         return tuple(
-            check_kind(f"{type(cost).__name__}.bind", bound_at(cost, self.dynamics, self.times), CostTerm, "a CostTerm")
+            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
         )
 
@@ -206,8 +207,7 @@ class Problem:
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
         start = FixedState(here)
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
-            term = copy.copy(self._terms["initial"][0])
-            keep(term, data=np.concatenate([here, term.data[len(here) :]]))
+            term = about_state(self._terms["initial"][0], here)
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
         other = self._with(initial=start, _terms=self._terms | {"initial": (term,)})
@@ -439,12 +439,10 @@ class Problem:
         for name, terms in (*self._terms.items(), ("constraints", self.constraint_terms)):
             parts.append(f"{name} {len(terms)}")  # the same terms may be of another part
             for term in terms:
-                parts += [term.code.digest, term.data]
+                parts += term.digested
                 functions += term.functions
-                if isinstance(term, ConstraintTerm) and (term.equality or term.final_only):
-                    parts.append(repr((term.equality, term.final_only)))
         if self._noise_term is not None:
-            parts += [self._noise_term.code.digest, self._noise_term.data, repr(self.risk)]
+            parts += [*self._noise_term.digested, repr(self.risk)]
             functions += self._noise_term.functions
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight)))

@@ -14,9 +14,8 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.constraints import SymbolicConstraint
-from lqrsim.problem.costs import SymbolicCost
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory

@@ -17,7 +17,7 @@ from lqrsim.control.replan_rule import ActivePlan
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
-from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of
+from lqrsim.problem.costs import Cost, CostSum, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, spaces_of
@@ -59,23 +59,14 @@ class MovableGoal:
                 f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost, whose goal can be moved"
             )
         self._terms = terms_of(problem.final_cost)
-        found = [i for i, term in enumerate(self._terms) if self._weighs_place(term)]
+        references = enumerate(term.state_reference for term in self._terms)
+        found = [(i, one) for i, one in references if one is not None and one.weight[self._position].any()]
         if len(found) != 1:
             raise InputError(
                 f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
-        (self._number,) = found
+        ((self._number, self._reference),) = found
         self.place = self._reference.about[self._position]
-
-    @property
-    def _reference(self) -> QuadraticCost:
-        reference = self._terms[self._number].state_reference
-        assert reference is not None
-        return reference
-
-    def _weighs_place(self, term: Cost) -> bool:
-        reference = term.state_reference
-        return reference is not None and bool(reference.weight[self._position].any())
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
