@@ -11,6 +11,7 @@ import functools
 import importlib
 import inspect
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -83,24 +84,27 @@ class Source:
 
 
 def source_of(module: ModuleType | str, **constants: Constant) -> Source:
-    """The kernels of a module: its functions, as far as they are in the subset.
+    """The kernels of a module: its functions in the subset of Python that `codegen/language.py` defines.
 
-    They may use what they import from `lqrsim.kernels` and `math`, and the module's numbers and tuples of numbers.
+    They may use what they import from `math` and `lqrsim.kernels`, and the module's numbers and tuples of numbers.
 
     Args:
-      module: the module, or its name: `__name__` in the file of a cost or constraint.
+      module: `__name__`, in the file of a cost or constraint; or a module.
       **constants: numbers and tuples of numbers, in place of the module's.
 
     Raises:
-      AttributeError: the module declares no such constant.
-      InputError: the module is no file.
+      InputError: the module is no file that was imported, or declares no such constant.
     """
-    home = module if isinstance(module, ModuleType) else importlib.import_module(module)
-    for name in constants:
-        getattr(home, name)
+    check_kind("source_of: module", module, (str, ModuleType), "__name__, in the file of a cost or constraint")
+    home = sys.modules.get(module) if isinstance(module, str) else module
     if not getattr(home, "__file__", None):
-        raise InputError(f"source_of: got {home.__name__}, which is no file, want a module in one; or a text")
-    return Source(home.__name__, constants=tuple(sorted(constants.items())), what=home.__name__)
+        raise InputError(f"source_of: module: got {excerpt(module)}, want a file that was imported; or a text for it")
+    for name, number in constants.items():
+        if not (_is_constant(getattr(home, name, None)) and _is_constant(number)):
+            want = "a number or a tuple of numbers, in place of one that the file declares"
+            raise InputError(f"source_of: {name}: got {excerpt(number)}, want {want}")
+    name = str(getattr(home, "__name__", ""))
+    return Source(name, constants=tuple(sorted(constants.items())), what=name)
 
 
 def text_source(text: str, what: str = "source") -> Source:

@@ -215,18 +215,19 @@ class Cost(ProblemPart[CostTerm]):
         Raises:
           InputError: a cost of another kind.
         """
-        raise InputError(f"{self.name}: got no method times(factor), want it to return the cost times a number")
+        raise InputError(f"{self.name}: got no method times, want it to return the cost times a number")
 
-    def moved_to(self, state: Array) -> "Cost":
+    def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
         """The cost with another state as reference. Costs with a state reference have it: a viewer moves goals.
 
         Args:
           state: (n,).
+          dynamics: dynamics of the system.
 
         Raises:
           InputError: a cost of another kind.
         """
-        raise InputError(f"{self.name}: got no method moved_to(state), want it to return the cost about a state")
+        raise InputError(f"{self.name}: got no method moved_to, want it to return the cost about a state")
 
     def _in(self, dynamics: Dynamics) -> "Cost":
         """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""

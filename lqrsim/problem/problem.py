@@ -28,7 +28,7 @@ from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
-from lqrsim.problem.quadratic_cost import QuadraticCost, about_state
+from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.rollout import Rollout
@@ -292,24 +292,29 @@ class Problem:
         """The state (n,) that the initial cost or FixedState specifies; None if neither does."""
         if isinstance(self.initial, FixedState):
             return self.initial.numbers
-        reference = _only_reference(self.initial)
+        reference = self._only_reference(self.initial)
         return None if reference is None else reference.about
 
     @property
     def goal(self) -> Array | None:
         """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
-        reference = _only_reference(self.final_cost)
+        reference = self._only_reference(self.final_cost)
         return self._with_goal_states(None if reference is None else reference.about)
 
     @property
     def weighed_goal(self) -> Array | None:
         """The goal, with NaN for states that have neither a weight nor a GoalState; None if all of it is NaN."""
-        reference = _only_reference(self.final_cost)
+        reference = self._only_reference(self.final_cost)
         goal = np.full(len(self.dynamics.state_coordinates), np.nan)
         if reference is not None:
             goal = np.where(reference.weight.any(axis=1), reference.about, np.nan)
         goal = self._with_goal_states(goal)
         return None if goal is None or np.isnan(goal).all() else goal
+
+    def _only_reference(self, cost: Cost) -> QuadraticCost | None:
+        """The reference of the only term of a cost that has one; None if none has, or several."""
+        found = references_of(cost, self.dynamics)
+        return found[0][1] if len(found) == 1 else None
 
     def _with_goal_states(self, goal: Array | None) -> Array | None:
         """The goal, completed by the GoalStates; None if some entries are still unknown."""
@@ -525,12 +530,6 @@ class Problem:
         """The place and the remedy if a state, which may have NaNs, is inside an obstacle; else None."""
         found = (one.in_world(self.dynamics, time).inside(state) for one in kept)
         return next((one for one in found if one is not None), None)
-
-
-def _only_reference(cost: Cost) -> QuadraticCost | None:
-    """The states that a cost draws to; None if none of its terms draws to states, or several do."""
-    found = [one for term in terms_of(cost) if (one := term.state_reference) is not None]
-    return found[0] if len(found) == 1 else None
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

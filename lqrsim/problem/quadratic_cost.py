@@ -21,7 +21,7 @@ from lqrsim.errors import (
     numbers_of,
 )
 from lqrsim.kernels.declarations import M, N
-from lqrsim.problem.costs import Cost, CostTerm
+from lqrsim.problem.costs import Cost, CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 
@@ -97,7 +97,7 @@ class _SquareCost(Cost):
         other._numbers = weight, about
         return other
 
-    def _in(self, dynamics: Dynamics) -> "_SquareCost":
+    def _in(self, dynamics: Dynamics) -> Self:
         space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
         if self._numbers is None:
             weight = self._given["weight"]
@@ -175,7 +175,7 @@ class QuadraticCost(_SquareCost):
     def state_reference(self) -> "QuadraticCost":
         return self
 
-    def moved_to(self, state: Array) -> Self:
+    def moved_to(self, state: Array, dynamics: Dynamics) -> Self:
         return self._with(self.weight, state)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
@@ -232,6 +232,12 @@ def _by_name(space: Coordinates, field: str, given: Mapping[str, object]) -> Arr
     for i, one in found.items():
         out[..., i] = one
     return out
+
+
+def references_of(cost: Cost, dynamics: Dynamics) -> list[tuple[Cost, QuadraticCost]]:
+    """The terms of a cost that draw to states, each with its reference, in the order of a system."""
+    found = [(term, term.state_reference) for term in terms_of(cost)]
+    return [(term, one._in(dynamics)) for term, one in found if one is not None]
 
 
 def about_state(term: CostTerm, state: Array) -> CostTerm:

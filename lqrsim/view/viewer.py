@@ -19,6 +19,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, terms_of
 from lqrsim.problem.problem import Problem
+from lqrsim.problem.quadratic_cost import references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.rollout import Rollout
@@ -58,23 +59,23 @@ class MovableGoal:
             raise InputError(
                 f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost, whose goal can be moved"
             )
-        self._terms = terms_of(problem.final_cost)
-        references = enumerate(term.state_reference for term in self._terms)
-        found = [(i, one) for i, one in references if one is not None and one.weight[self._position].any()]
+        self._dynamics, self._cost = problem.dynamics, problem.final_cost
+        references = references_of(self._cost, self._dynamics)
+        found = [(term, one) for term, one in references if one.weight[self._position].any()]
         if len(found) != 1:
             raise InputError(
                 f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
-        ((self._number, self._reference),) = found
+        ((self._drawing, self._reference),) = found
         self.place = self._reference.about[self._position]
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
         about = self._reference.about.copy()
         about[self._position] = place
-        terms = list(self._terms)
-        terms[self._number] = terms[self._number].moved_to(about)
-        return terms[0] if len(terms) == 1 else CostSum(tuple(terms))
+        moved = self._drawing.moved_to(about, self._dynamics)
+        terms = tuple(moved if term is self._drawing else term for term in terms_of(self._cost))
+        return terms[0] if len(terms) == 1 else CostSum(terms)
 
 
 def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
