@@ -122,11 +122,11 @@ class _SquareCost(Cost):
         return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        weight, about = self._in(dynamics)._known
-        size, by_knot = weight.shape[-1], self.by_knot
-        counts = [about.size // size, weight.size // size**2] if by_knot else []
+        own = self._in(dynamics)
+        (weight, about), size = own._known, own.weight.shape[-1]
+        counts = [about.size // size, weight.size // size**2] if own.by_knot else []
         data = np.concatenate([counts, about.ravel(), weight.ravel()])
-        kernel = source_of(__name__, CONTROL=self.controls, BY_KNOT=by_knot)
+        kernel = source_of(__name__, CONTROL=self.controls, BY_KNOT=own.by_knot)
         return CostTerm(kernel, data, uses_control=self.controls)
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
@@ -179,11 +179,8 @@ class QuadraticCost(_SquareCost):
         return self._with(self.weight, state)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
-        weight, about = (
-            np.pad(array, [(0, 0)] * (array.ndim - axes) + [(0, 1)] * axes)
-            for array, axes in ((self.weight, 2), (self.about, 1))
-        )
-        return self._with(weight, about)
+        pairs = (self.weight, 2), (self.about, 1)
+        return self._with(*(np.pad(one, [(0, 0)] * (one.ndim - axes) + [(0, 1)] * axes) for one, axes in pairs))
 
 
 class ControlCost(_SquareCost):
