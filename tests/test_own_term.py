@@ -15,6 +15,7 @@ from lqrsim.codegen.compiled_module import module_of
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import source_of
 from lqrsim.problem import quadratic_cost
+from lqrsim.solvers.multistart import passable
 from lqrsim.view.viewer import MovableGoal
 
 PLACE, WEIGHT, WIDTH = {"x": 1.5, "y": 1.0}, 8.0, 0.4
@@ -138,6 +139,23 @@ def test_costs_that_cannot_have_another_state_say_so() -> None:
     own = ls.FunctionCost(function, depends_on=("vx",))
     with pytest.raises(ls.InputError, match="duration: got a FunctionCost beside it"):
         ls.smooth(stated(OWN + own, duration=(1.0, 9.0)))
+
+
+class Half(ls.Constraint):
+    """x <= 2, said to be a convex set or not."""
+
+    def __init__(self, convex: bool) -> None:
+        self.convex = convex
+
+    def bind(self, dynamics: ls.Dynamics) -> ls.types.ConstraintTerm:
+        value = "def value(x, u, t, row, data):\n    return data[0] - x[1]\n\n\n"
+        slope = "def slope(x, u, t, row, data, gradient):\n    gradient[1] -= 1.0\n"
+        return ls.types.ConstraintTerm(value + slope, np.array([2.0]), 1, str, convex=self.convex)
+
+
+def test_no_way_is_sought_round_convex_sets() -> None:
+    kept = [Half(True), Half(False), ls.Clearance(WORLD, radius=0.1), ls.StateBounds(x=(-1.0, 9.0))]
+    assert passable(stated(OWN, constraints=kept)) == [False, True, True, False]
 
 
 def test_sources_that_are_no_files_of_kernels_are_refused() -> None:

@@ -1,7 +1,6 @@
 """A soft limit of states: class and kernel."""
 
 from collections.abc import Mapping
-from typing import Self
 
 import numpy as np
 
@@ -41,9 +40,6 @@ class LimitCost(Cost):
         ]
         numbers = np.array([len(rows), *np.ravel(rows)], dtype=np.float64)
         return CostTerm(source_of(__name__), numbers, exact_hessian=False)
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
-        return self
 
 
 # The kernel. `data` has the number of bounds, and for each bound: the index of the state, 1 for a lower bound or -1 for
