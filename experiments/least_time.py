@@ -19,7 +19,8 @@ from paper.common import figure
 from runner import FolderSettings, Result, opening, progress, run, table
 
 import lqrsim as ls
-from lqrsim.problem.costs import CostSum, ObstacleCost
+from lqrsim.problem.costs import CostSum
+from lqrsim.problem.obstacle_cost import ObstacleCost
 
 
 @dataclass(frozen=True, kw_only=True)

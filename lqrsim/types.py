@@ -1,6 +1,7 @@
 """Records that functions return or take, for annotations and extensions."""
 
 from lqrsim.capsules import Capsule
+from lqrsim.codegen.sources import source_of
 from lqrsim.control.chance_constrained import SafePlan
 from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.replan_rule import ReplanRecord
@@ -49,4 +50,5 @@ __all__ = [
     "TotalCost",
     "Tube",
     "Verification",
+    "source_of",
 ]

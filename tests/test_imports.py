@@ -57,11 +57,11 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics", "linear_quadratic"),
-        ("collision_spheres", "noise"),
+        ("collision_spheres", "noise", "residual"),
         ("collision_shape",),
         ("costs",),
         ("constraints",),
-        ("clearance", "plain_term"),
+        ("clearance", "formulas", "limit_cost", "obstacle_cost", "plain_term", "quadratic_cost", "state_bounds"),
         ("problem",),
     ),
     "solvers": (

@@ -10,7 +10,8 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import InputError
-from lqrsim.problem.costs import LimitCost, terms_of
+from lqrsim.problem.costs import terms_of
+from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 
 

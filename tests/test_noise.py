@@ -492,7 +492,7 @@ def test_bounds_under_noise_that_depends_on_the_plan(seed: int) -> None:
         return 0.5 * float(np.sum((F @ u + f) ** 2))
 
     bound: Any = problem.constraints[0]
-    ((i, (low, high)),) = bound._of(problem.dynamics).items()
+    ((i, (low, high)),) = bound.state_bounds(problem.dynamics).items()
     G, g = np.array(slopes)[:, i], np.array(ats)[:, i]
 
     own = cost(solution.trajectory.controls.ravel())

@@ -401,6 +401,8 @@ def test_numbers_by_name_or_unit_are_those_in_order(
     np.testing.assert_array_equal(named.goal, listed.goal)
     np.testing.assert_array_equal(named.start, in_order(start))
     np.testing.assert_array_equal(named.nominal_control, [1.0])
+    bound = ls.QuadraticCost(weight, about=about).bind(named.dynamics)
+    np.testing.assert_array_equal(bound.data, listed.terms("final_cost")[0].data)
     again = named.with_costs(final_cost=ls.QuadraticCost(push, about=about))
     np.testing.assert_array_equal(again.goal, in_order(about))
 

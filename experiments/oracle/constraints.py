@@ -71,17 +71,17 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
         function = partial(_spare, obstacles, list(space.position), constraint.radius + constraint.margin)
         return Kept(function, np.tile(changeable[:, None], (1, len(obstacles))), False)
     if isinstance(constraint, ls.GoalState):
-        goal = constraint._numbers(dynamics)
+        goal = constraint.final_states(dynamics)
         indices, wanted = list(goal), np.array(list(goal.values()))
         return Kept(lambda z: z[..., indices] - wanted, np.tile(at_end[:, None], (1, len(indices))), True)
     if isinstance(constraint, ls.StateBounds):
-        bounds = constraint._of(dynamics).items()
+        bounds = constraint.state_bounds(dynamics).items()
         rows = [(i, sign, bound[side]) for side, sign in ((0, 1), (1, -1)) for i, bound in bounds]
         rows = [(i, sign, np.broadcast_to(bound, steps + 1)) for i, sign, bound in rows if np.isfinite(bound).any()]
         indices, signs = (np.array([row[column] for row in rows]) for column in (0, 1))
         numbers = np.stack([bound for *_, bound in rows], axis=1)
         goals = [one for one in problem.constraints if isinstance(one, ls.GoalState)]
-        fixed = {i for one in goals for i in one._numbers(dynamics)}
+        fixed = {i for one in goals for i in one.final_states(dynamics)}
         acts = np.stack([changeable & ~(at_end & (i in fixed)) for i in indices], axis=1) & np.isfinite(numbers)
         numbers = np.where(acts, numbers, 0.0)
         return Kept(lambda z: signs * (z[..., indices] - numbers), acts, False)

@@ -104,7 +104,7 @@ def parameters(problem: ls.Problem) -> Array:
         if isinstance(one, ls.SymbolicConstraint):
             found.append(np.array(list(one.parameters.values())))
         elif isinstance(one, ls.GoalState):
-            found.append(np.array(list(one._numbers(problem.dynamics).values())))
+            found.append(np.array(list(one.final_states(problem.dynamics).values())))
     return np.concatenate(found)
 
 
@@ -148,7 +148,7 @@ def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, 
     if isinstance(constraint, ls.StateBounds):  # which are bounds of the variables
         return _Rows(ca.SX(0, 1))
     if isinstance(constraint, ls.GoalState):
-        places = list(constraint._numbers(problem.dynamics))
+        places = list(constraint.final_states(problem.dynamics))
         return _Rows(x[places] - given(len(places)), equality=True, at_end=True)
     if isinstance(constraint, ls.SymbolicConstraint):
         numbers = given(len(constraint.parameters))
@@ -197,7 +197,7 @@ def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
     high = -low
     for one in problem.constraints:
         if isinstance(one, ls.StateBounds):
-            for i, (least, most) in one._of(problem.dynamics).items():
+            for i, (least, most) in one.state_bounds(problem.dynamics).items():
                 last = problem.steps if i in fixed else problem.steps + 1
                 low[1:last, i] = np.maximum(low[1:last, i], least)
                 high[1:last, i] = np.minimum(high[1:last, i], most)

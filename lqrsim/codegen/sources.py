@@ -1,7 +1,8 @@
 """Functions in the kernels' subset, and the meaning of the names in them.
 
-A `Source` is a module of `lqrsim/kernels` or a text. Its open names are filled in: constants, such as the indices of
-the position, and functions, such as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
+A `Source` is a module or a text. A module of `lqrsim/kernels` is all kernels; that of a cost or constraint has its
+kernels beside its class. Open names are filled in: constants, such as the indices of the position, and functions, such
+as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
 a source, for the printer to LLVM IR (`printer.py`) and for plain Python (`plain.py`).
 """
 
@@ -10,6 +11,7 @@ import functools
 import importlib
 import inspect
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -26,6 +28,7 @@ WORDS = (
     "stack", "zeros", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
     "power_of_two", "inline", "outline", "compact", "exact",
 )  # fmt: skip
+PACKAGE = __name__.partition(".")[0]
 PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
 
 Constant = bool | int | float | tuple[Any, ...]
@@ -36,7 +39,7 @@ class Source:
     """Functions in the kernels' subset; `source_of` and `text_source` make it.
 
     Attributes:
-      module: name of a module in `lqrsim/kernels`; empty for a text. text: text that defines functions.
+      module: name of a module; empty for a text. text: text that defines functions.
       constants: (name, number or tuple of numbers), which replace the module's.
       fills: (name, source, name there) of functions that fill declarations of the module or its imports, or replace
         their functions.
@@ -60,7 +63,7 @@ class Source:
     def digest(self) -> str:
         """A hash of everything that defines the source."""
         filled = (f"{name}={source.digest}.{there}" for name, source, there in self.fills)
-        own = _module_text(self.module) if self.module else ""
+        own = _text_of(self.module) if self.module else ""
         return sha256(self.module, own, self.text, repr(self.constants), *filled)
 
     def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
@@ -80,19 +83,28 @@ class Source:
         return isinstance(Scope(self, {}).find(name), ScopedFunction)
 
 
-def source_of(module: ModuleType, **constants: Constant) -> Source:
-    """The functions of a module of `lqrsim/kernels`.
+def source_of(module: ModuleType | str, **constants: Constant) -> Source:
+    """The kernels of a module: its functions in the subset of Python that `codegen/language.py` defines.
+
+    They may use what they import from `math` and `lqrsim.kernels`, and the module's numbers and tuples of numbers.
 
     Args:
-      module: module of the kernels.
+      module: `__name__`, in the file of a cost or constraint; or a module.
       **constants: numbers and tuples of numbers, in place of the module's.
 
     Raises:
-      AttributeError: the module declares no such constant.
+      InputError: the module is no file that was imported, or declares no such constant.
     """
-    for name in constants:
-        getattr(module, name)
-    return Source(module.__name__, constants=tuple(sorted(constants.items())), what=module.__name__)
+    check_kind("source_of: module", module, (str, ModuleType), "__name__, in the file of a cost or constraint")
+    home = sys.modules.get(module) if isinstance(module, str) else module
+    if not getattr(home, "__file__", None):
+        raise InputError(f"source_of: module: got {excerpt(module)}, want a file that was imported; or a text for it")
+    for name, number in constants.items():
+        if not (_is_constant(getattr(home, name, None)) and _is_constant(number)):
+            want = "a number or a tuple of numbers, in place of one that the file declares"
+            raise InputError(f"source_of: {name}: got {excerpt(number)}, want {want}")
+    name = str(getattr(home, "__name__", ""))
+    return Source(name, constants=tuple(sorted(constants.items())), what=name)
 
 
 def text_source(text: str, what: str = "source") -> Source:
@@ -181,6 +193,7 @@ class _Parsed:
 
     functions: dict[str, ast.FunctionDef]
     imports: dict[str, tuple[str, str]]  # name here -> module, name there
+    text: str  # of the functions
 
 
 class Scope:
@@ -240,7 +253,7 @@ class Scope:
             return self._declared(name)
         if module == records.__name__:
             return _record(name)
-        return self._module(module).find(name) if module.startswith(f"{kernels.__name__}.") else None
+        return self._module(module).find(name) if _is_kernels(module) else None
 
     def _declared(self, name: str) -> Meaning | None:
         """The meaning of a name in `declarations.py`: a size, a word, a filled-in function, or a constant."""
@@ -287,9 +300,26 @@ def _record(name: str) -> Record | None:
     return Record(name, kind._fields) if isinstance(kind, type) and hasattr(kind, "_fields") else None
 
 
+def _is_kernels(module: str) -> bool:
+    return module.startswith(f"{kernels.__name__}.")
+
+
 @functools.cache
 def _module_text(module: str) -> str:
     return inspect.getsource(importlib.import_module(module))
+
+
+@functools.cache
+def _text_of(module: str) -> str:
+    """What defines a module's kernels: its functions, and the constants in them, for what else stands in a user's file
+    changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
+    """
+    if module.startswith(f"{PACKAGE}."):
+        return _module_text(module)
+    home, parsed = importlib.import_module(module), _parsed_module(module)
+    names = {node.id for own in parsed.functions.values() for node in ast.walk(own) if isinstance(node, ast.Name)}
+    constants = ((name, getattr(home, name, None)) for name in sorted(names))
+    return "\n".join([parsed.text, *(f"{name} = {value!r}" for name, value in constants if _is_constant(value))])
 
 
 @functools.cache
@@ -307,15 +337,15 @@ def _left_open(module: str) -> frozenset[str]:
     """The names that can be filled in for a module: its functions, and the declarations that it and its imports use."""
     parsed = _parsed_module(module)
     declared = {name for home, name in parsed.imports.values() if home == declarations.__name__}
-    others = {home for home, _ in parsed.imports.values() if home not in _WITHOUT_FUNCTIONS}
+    others = {home for home, _ in parsed.imports.values() if _is_kernels(home) and home not in _WITHOUT_FUNCTIONS}
     return frozenset(declared | parsed.functions.keys()).union(*(_left_open(home) for home in others))
 
 
-_WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__, "math")
+_WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__)
 
 
 def _parse(text: str) -> _Parsed:
-    functions, imports = {}, {}
+    functions, imports, lines, texts = {}, {}, text.splitlines(), []
     try:
         tree = ast.parse(text)
     except (
@@ -328,6 +358,7 @@ def _parse(text: str) -> _Parsed:
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node
+            texts += lines[min([node.lineno, *(one.lineno for one in node.decorator_list)]) - 1 : node.end_lineno]
         elif isinstance(node, ast.ImportFrom):
             imports |= {one.asname or one.name: (str(node.module), one.name) for one in node.names}
-    return _Parsed(functions, imports)
+    return _Parsed(functions, imports, "\n".join(texts))

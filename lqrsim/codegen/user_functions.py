@@ -408,6 +408,11 @@ class Term:
         return check_source(type(self).__name__, self.source, self._defines)
 
     @property
+    def digested(self) -> list[str | Array]:
+        """What the hash of a problem has of it, besides its functions."""
+        return [self.code.digest, self.data]
+
+    @property
     def numbers(self) -> int:
         """Number of entries in compiled code's data that belong to this term."""
         return len(self.functions) + len(self.data)

@@ -160,10 +160,15 @@ def value(x, u, t, data) -> float:
     return 0.0
 
 
+def loss(r, row, data) -> tuple[float, float, float]:
+    """The cost of a row of a residual, and its first and second derivative in r: the files of costs."""
+    return 0.0, 0.0, 0.0
+
+
 def constraint_value(x, u, t, row, data) -> float:
     """One value of a constraint: nonnegative, or zero for an equality, where it is satisfied.
 
-    `value` of `clearance.py`, `distance_constraint.py`, `state_bound.py`.
+    `value` of `residual_constraint.py`, and of the files of constraints.
     """
     return 0.0
 
@@ -175,16 +180,15 @@ def constraint_slope(x, u, t, row, data, gradient) -> None:
 def places(x, data, out) -> None:
     """Write the centres of a robot's balls, three coordinates each, ball by ball.
 
-    `user_functions.py`, `mjcf_places.py`; for costs and constraints of distances and errors, these themselves:
-    `distances` of `mjcf_distances.py`, `errors` of `mjcf_sites.py`.
+    `user_functions.py`, `mjcf_places.py`; for costs and constraints of a residual, its rows: `residual` of
+    `mjcf_distances.py`, and of the files of costs and constraints.
     """
 
 
 def places_jacobian(x, data, out, slopes) -> None:
     """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N).
 
-    `differences.py`, `user_functions.py`; `distances_jacobian` of `mjcf_distances.py`, `errors_jacobian` of
-    `mjcf_sites.py`.
+    `differences.py`, `user_functions.py`; `residual_jacobian` beside the residual.
     """
 
 

@@ -38,13 +38,13 @@ LARGEST, PAIRS, PAIR = 3, 4, 6  # indices of the largest distance and the pairs 
 TOUCHING = 1e-12  # m; the segment between two geoms that touch has no direction
 
 
-def distances(x, data, out):
+def residual(x, data, out):
     """Write the least distance of each row, in metres; at most the largest distance of interest."""
     which, segments, nowhere = stack(ROWS), stack(ROWS, 6), stack(1)
     find(x, nowhere, -1, data, 0, out, which, segments)
 
 
-def distances_jacobian(x, data, out, slopes):
+def residual_jacobian(x, data, out, slopes):
     """Write the distances and their derivatives in the states (any, N), which are zero on entry."""
     which, segments = stack(ROWS), stack(ROWS, 6)
     find_with_slopes(x, data, 0, out, slopes, which, segments)

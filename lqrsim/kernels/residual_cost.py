@@ -1,36 +1,41 @@
-"""`1/2 sum of weight * error^2` for errors from a model. Written in the kernels' subset.
+"""The sum of a loss of each row of a residual, which depends on the states. Written in the kernels' subset.
 
-`data` has the data of the errors, and from AT on a weight for each error. `places` and `places_jacobian` are the errors
-here.
+`places` and `places_jacobian` are the residual here. `data` begins with its data.
 """
 
-from lqrsim.kernels.declarations import N, places, places_jacobian, stack
+from lqrsim.kernels.declarations import N, loss, places, places_jacobian, stack
 from lqrsim.kernels.linear_algebra import clear
 
-AT = 0
-ROWS = 1  # number of errors
-MOVED = 1  # number of states, from the first on, that the errors depend on
+ROWS = 1  # number of rows
+MOVED = 1  # number of states, from the first on, that the residual depends on
+FIRST_STEP = 0  # the first step at which it acts: 1 for what cannot change at a given start
 
 
 def value(x, u, t, data):
     """The cost."""
-    errors, total = stack(ROWS), 0.0
-    places(x, data, errors)
-    for row in range(ROWS):
-        total += 0.5 * data[AT + row] * errors[row] * errors[row]
+    total = 0.0
+    if t >= FIRST_STEP:
+        residual = stack(ROWS)
+        places(x, data, residual)
+        for row in range(ROWS):
+            cost, _, _ = loss(residual[row], row, data)
+            total += cost
     return total
 
 
 def derivatives(x, u, t, data, hessian, gradient):
-    """Add the Hessian and the gradient, and return the cost. The errors' own curvature is left out."""
-    errors, moves, total = stack(ROWS), stack(ROWS, N), 0.0
-    clear(moves, ROWS, N)
-    places_jacobian(x, data, errors, moves)
-    for row in range(ROWS):
-        weight = data[AT + row]
-        total += 0.5 * weight * errors[row] * errors[row]
-        for i in range(MOVED):
-            gradient[i] += weight * errors[row] * moves[row, i]
-            for j in range(MOVED):
-                hessian[i, j] += weight * moves[row, i] * moves[row, j]
+    """Add the Hessian and the gradient, and return the cost. The residual's own curvature is left out."""
+    total = 0.0
+    if t >= FIRST_STEP:
+        residual, moves = stack(ROWS), stack(ROWS, N)
+        clear(moves, ROWS, N)
+        places_jacobian(x, data, residual, moves)
+        for row in range(ROWS):
+            cost, slope, curvature = loss(residual[row], row, data)
+            total += cost
+            if slope != 0 or curvature != 0:
+                for i in range(MOVED):
+                    gradient[i] += slope * moves[row, i]
+                    for j in range(MOVED):
+                        hessian[i, j] += curvature * moves[row, i] * moves[row, j]
     return total

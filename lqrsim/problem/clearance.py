@@ -1,18 +1,18 @@
-"""The constraint that a robot keeps clear of obstacles."""
+"""The constraint that a robot keeps clear of obstacles: class and kernel."""
 
 import copy
+from collections.abc import Callable
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_number, real
-from lqrsim.kernels import clearance, distance_constraint
-from lqrsim.problem.collision_shape import CollisionGeoms, GeomsInWorld, KeepsClear
+from lqrsim.kernels.declarations import ROW, N, stack
+from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
-from lqrsim.problem.costs import rows_ahead
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -52,12 +52,9 @@ class Clearance(KeepsClear, Constraint):
     def by_knot(self) -> bool:
         return isinstance(self.margin, np.ndarray)
 
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
-        super().ahead(steps, horizon=horizon)
-        if not isinstance(self.margin, np.ndarray):
-            return self
+    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
         other = copy.copy(self)
-        other.margin = rows_ahead(self.margin, steps, horizon)
+        other.margin = cut(np.asarray(self.margin))
         return other
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
@@ -73,21 +70,7 @@ class Clearance(KeepsClear, Constraint):
         if margins.shape[1] not in (1, len(world)):
             want = f"{len(world)}, one per obstacle: {', '.join(world.names)}"
             raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
-        if isinstance(shape, GeomsInWorld):
-            found = shape.geoms.bind(dynamics, world, float(margins.max()) + 2 * shape.geoms.size)
-            if -1 in found.obstacles and margins.shape[1] > 1:
-                want = f"one number for a knot, as there are {len(world)} obstacles"
-                raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
-            rows, shared = list(zip(found.parts, found.obstacles, strict=True)), max(1, len(found.parts))
-            kernel = source_of(distance_constraint, AT=found.numbers, ROWS=shared)
-            own = [*margins.shape, *np.maximum(found.obstacles, 0), *margins.ravel()]
-        else:
-            found, tables, count = shape.centers, world.tables(times), len(shape.radii)
-            rows, shared = [(name, number) for name in shape.names for number in range(len(world))], 3 * count
-            kernel = source_of(clearance, AXES=shape.moved_by)
-            if found is not None:
-                kernel = source_of(clearance, AT=found.numbers, BALLS=count)
-            own = [*margins.shape, len(world), len(tables), *shape.radii, *margins.ravel(), *tables.ravel()]
+        rows = [(name, number) for name in shape.names for number in range(len(world))]
 
         def describe(row: int) -> str:
             part, number = rows[row]
@@ -97,16 +80,18 @@ class Clearance(KeepsClear, Constraint):
             where = f"obstacle {world.names[number]!r}" if number >= 0 else "all obstacles"
             return f"a clearance of {said} m{who} to {where}"
 
-        if found is None:
-            return ConstraintTerm(kernel, np.array(own), len(rows), describe)
-        return ConstraintTerm(
-            source=found.filling(kernel),
-            data=np.concatenate([found.data, own]),
-            rows=len(rows),
-            describe=describe,
-            shared=shared,
-            functions=found.functions,
-        )
+        distances = shape.distances(float(margins.max()) + 2 * float(shape.radii.max()))
+        if distances is not None:
+            if -1 in distances.obstacles and margins.shape[1] > 1:
+                want = f"one number for a knot, as there are {len(world)} obstacles"
+                raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+            rows = list(zip(distances.parts, distances.obstacles, strict=True))
+            columns = [max(number, 0) % margins.shape[1] for number in distances.obstacles]
+            return ConstraintTerm.of_residual(distances, margins, columns, describe)
+        tables, shared = world.tables(times), 0 if shape.centers is None else 3 * len(shape.radii)
+        own = np.array([*margins.shape, len(world), len(tables), *shape.radii, *margins.ravel(), *tables.ravel()])
+        source, data, functions = shape.placed(__name__, own)
+        return ConstraintTerm(source, data, len(rows), describe, shared=shared, functions=functions)
 
 
 def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
@@ -118,3 +103,63 @@ def _checked_margin(margin: float | npt.ArrayLike) -> float | Array:
     if not margins.size:
         raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
     return margins
+
+
+# The kernel: distances to obstacles minus the required distances. The robot is a point at its position, or a set of
+# balls. For balls, `value` and `slope` take the centres and their Jacobian in place of state and control; see
+# `augmented_lagrangian.py`.
+#
+# From AT on, `data` has the numbers below, then the margins and the tables, step by step. The last margins and the last
+# table hold from their step on. There is a row for each obstacle, first for the first ball, then for the next. Its
+# margin has the index `row` modulo the number of margins per step. AT is 0 for a point. For balls, the entries before
+# AT are those that `places` reads.
+AT = 0
+# From there on: numbers of steps with margins, of margins at a step, of obstacles, and of steps with a table of these;
+# then the radius of each ball, or of the point.
+STEPS, EACH, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
+BALLS = 0  # number of balls; 0 for a point
+AXES = (0, 1, 2)  # states that are the position of a point; two in a plane, with third coordinate 0
+
+
+def value(x, u, t, row, data):
+    """The distance of one ball to one obstacle, minus its radius and the margin."""
+    a, b, c = place(x, row, data)
+    steps, each = int(data[AT + STEPS]), int(data[AT + EACH])
+    margin = data[AT + RADII + max(BALLS, 1) + min(t, steps - 1) * each + row % each]
+    least = data[AT + RADII + ball_of(row, data)] + margin
+    return signed_distance(data, obstacle_at(t, row, data), a, b, c) - least
+
+
+def slope(x, u, t, row, data, gradient):
+    """Add its gradient (W,)."""
+    normal, curve = stack(3), stack(3, 3)
+    a, b, c = place(x, row, data)
+    signed_distance_derivatives(data, obstacle_at(t, row, data), a, b, c, normal, curve)
+    if BALLS:
+        first = 3 * ball_of(row, data)
+        for i in range(N):
+            for j in range(3):
+                gradient[i] += normal[j] * u[first + j, i]
+    else:
+        for i in range(len(AXES)):
+            gradient[AXES[i]] += normal[i]
+
+
+def place(x, row, data):
+    """The centre of a row's ball, or the position of a robot that is a point."""
+    if BALLS:
+        first = 3 * ball_of(row, data)
+        return x[first], x[first + 1], x[first + 2]
+    return x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0
+
+
+def ball_of(row, data):
+    """The number of the ball that a row is about; 0 for a point."""
+    return row // int(data[AT + OBSTACLES]) if BALLS else 0
+
+
+def obstacle_at(t, row, data):
+    """The index at which the numbers of a row's obstacle begin."""
+    obstacles, margins = int(data[AT + OBSTACLES]), int(data[AT + STEPS]) * int(data[AT + EACH])
+    obstacle = obstacles * min(t, int(data[AT + TABLES]) - 1) + (row % obstacles if BALLS else row)
+    return AT + RADII + max(BALLS, 1) + margins + ROW * obstacle

@@ -6,17 +6,18 @@
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.distances import distances_with_normals, signed_distance, signed_distance_displaced
-from lqrsim.codegen.sources import Source
-from lqrsim.codegen.user_functions import Term
+from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, evaluate, evaluate_slopes
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.residual import Residual
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import ROW, World
 from lqrsim.scenes.world import signed_distance as signed_distance_of_one
@@ -25,25 +26,14 @@ TOUCHING = 1e-9  # m; how deep in an obstacle geoms may be that only touch it
 
 
 @dataclass(frozen=True, eq=False)
-class GeomDistances(Term):
-    """Distances between parts of a robot and obstacles, made for one system: the source to compile, and its data.
-
-    The source defines `distances(x, data, out)`, which writes one number per row, and `distances_jacobian(x, data, out,
-    slopes)`, which writes the distances, and the nonzero derivatives in the states (rows, N) to an array of zeros.
+class GeomDistances(Residual):
+    """Distances between parts of a robot and obstacles, made for one system.
 
     Attributes:
-      parts: for messages, the name of each row's part of the robot. obstacles: the number of each row's obstacle, or -1
-        for the nearest obstacle.
-      moved: number of states, from the first one on, that the distances depend on.
+      obstacles: the number of each row's obstacle, or -1 for the nearest obstacle.
     """
 
-    parts: tuple[str, ...]
     obstacles: tuple[int, ...]
-    moved: int
-
-    def filling(self, kernel: Source) -> Source:
-        """A kernel of costs or constraints whose open function `places` is filled with the distances."""
-        return kernel.filled(places=(self.code, "distances"), places_jacobian=(self.code, "distances_jacobian"))
 
 
 class CollisionGeoms(abc.ABC):
@@ -119,6 +109,18 @@ class ShapeInWorld:
     def in_plane(self) -> bool:
         """Whether the places are in the plane of the robot's position."""
         return len(self.dynamics.state_coordinates.position) == 2 if self.centers is None else self.centers.in_plane
+
+    def distances(self, reach: float) -> GeomDistances | None:
+        """The distances of geoms up to `reach` in m; None for balls, whose distances have second derivatives."""
+        return None
+
+    def placed(self, module: str, own: Array) -> tuple[Source, Array, tuple[UserFunction, ...]]:
+        """The kernel of a module for these balls, with AT, BALLS and AXES; its data with its own; and its functions."""
+        centers, axes = self.centers, self.moved_by
+        if centers is None:
+            return source_of(module, AXES=axes), own, ()
+        kernel = source_of(module, AT=centers.numbers, BALLS=len(self.radii), AXES=axes)
+        return centers.filling(kernel), np.concatenate([centers.data, own]), centers.functions
 
     def places(self, states: Array) -> Array:
         """The places at states (..., n)."""
@@ -207,11 +209,14 @@ class GeomsInWorld(ShapeInWorld):
 
     @property
     def moved_by(self) -> tuple[int, ...]:
-        return tuple(range(self.geoms.bind(self.dynamics, self.world, 0.0).moved))
+        return tuple(range(self.distances(0.0).moved))
 
     @property
     def in_plane(self) -> bool:
         return False
+
+    def distances(self, reach: float) -> GeomDistances:
+        return self.geoms.bind(self.dynamics, self.world, reach)
 
     def places(self, states: Array) -> Array:
         return states[..., None, :]
@@ -295,6 +300,13 @@ class KeepsClear:
             self.shape["radius"] = check_number(f"{who}: radius", radius, at_least=0.0)
         self.world, self.balls, self.geoms = world, balls, geoms
         self.radius: float = self.shape.get("radius", 0.0 if balls is None else float(balls.radii.max()))
+
+    @property
+    def kept_clear(self) -> "KeepsClear":
+        return self
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self
 
     @property
     def moving(self) -> bool:

@@ -22,22 +22,13 @@ from lqrsim.errors import (
     excerpt,
     keep,
 )
-from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import KeepsClear
 from lqrsim.problem.constraints import EQUALITY_TOLERANCE, Constraint, ConstraintTerm, bind_all, by_name, goals_of
-from lqrsim.problem.costs import (
-    ControlCost,
-    Cost,
-    CostTerm,
-    ObstacleCost,
-    QuadraticCost,
-    bound_at,
-    in_system,
-    terms_of,
-)
+from lqrsim.problem.costs import Cost, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.plain_term import violated
+from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.rollout import Rollout
@@ -196,7 +187,7 @@ class Problem:
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
         return tuple(
-            check_kind(f"{type(cost).__name__}.bind", bound_at(cost, self.dynamics, self.times), CostTerm, "a CostTerm")
+            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
         )
 
@@ -216,8 +207,7 @@ class Problem:
         here = check_array("state", state, (len(self.dynamics.state_coordinates),))
         start = FixedState(here)
         if isinstance(self.initial, FixedState):  # four times as fast as a new cost
-            term = copy.copy(self._terms["initial"][0])
-            keep(term, data=np.concatenate([here, term.data[len(here) :]]))
+            term = about_state(self._terms["initial"][0], here)
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
         other = self._with(initial=start, _terms=self._terms | {"initial": (term,)})
@@ -302,24 +292,29 @@ class Problem:
         """The state (n,) that the initial cost or FixedState specifies; None if neither does."""
         if isinstance(self.initial, FixedState):
             return self.initial.numbers
-        abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
-        return abouts[0] if len(abouts) == 1 else None
+        reference = self._only_reference(self.initial)
+        return None if reference is None else reference.about
 
     @property
     def goal(self) -> Array | None:
         """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
-        abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
-        return self._with_goal_states(abouts[0] if len(abouts) == 1 else None)
+        reference = self._only_reference(self.final_cost)
+        return self._with_goal_states(None if reference is None else reference.about)
 
     @property
     def weighed_goal(self) -> Array | None:
         """The goal, with NaN for states that have neither a weight nor a GoalState; None if all of it is NaN."""
-        abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        reference = self._only_reference(self.final_cost)
         goal = np.full(len(self.dynamics.state_coordinates), np.nan)
-        if len(abouts) == 1:
-            goal = np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+        if reference is not None:
+            goal = np.where(reference.weight.any(axis=1), reference.about, np.nan)
         goal = self._with_goal_states(goal)
         return None if goal is None or np.isnan(goal).all() else goal
+
+    def _only_reference(self, cost: Cost) -> QuadraticCost | None:
+        """The reference of the only term of a cost that has one; None if none has, or several."""
+        found = references_of(cost, self.dynamics)
+        return found[0][1] if len(found) == 1 else None
 
     def _with_goal_states(self, goal: Array | None) -> Array | None:
         """The goal, completed by the GoalStates; None if some entries are still unknown."""
@@ -352,7 +347,7 @@ class Problem:
     @property
     def nominal_controls(self) -> Array:
         """u*, (m,); or (T, m) if the control cost has one for each step."""
-        costs = [cost for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
+        costs = [one for cost in terms_of(self.stage_cost) if (one := cost.control_reference) is not None]
         if not costs:
             return np.zeros(len(self.dynamics.control_coordinates))
         if len(costs) == 1:
@@ -364,14 +359,15 @@ class Problem:
         return np.linalg.solve(sum(weights), pulls)[..., 0]
 
     @property
-    def obstacle_costs(self) -> tuple[ObstacleCost, ...]:
-        """The terms that keep the robot clear of obstacles."""
-        return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
+    def obstacle_costs(self) -> tuple[Any, ...]:
+        """The terms that keep the robot clear of obstacles: each an `ObstacleCost`, or of a user's own kind."""
+        return tuple(cost for cost in terms_of(self.stage_cost) if cost.kept_clear is not None)
 
     @property
     def kept_clear(self) -> tuple[KeepsClear, ...]:
         """The costs and constraints that keep the robot clear of obstacles."""
-        return (*self.obstacle_costs, *(one for one in self.constraints if isinstance(one, Clearance)))
+        parts = *terms_of(self.stage_cost), *self.constraints
+        return tuple(kept for part in parts if (kept := part.kept_clear) is not None)
 
     def terms(self, which: str) -> tuple[CostTerm, ...]:
         """The bound terms of `initial`, `stage_cost` or `final_cost`.
@@ -448,12 +444,10 @@ class Problem:
         for name, terms in (*self._terms.items(), ("constraints", self.constraint_terms)):
             parts.append(f"{name} {len(terms)}")  # the same terms may be of another part
             for term in terms:
-                parts += [term.code.digest, term.data]
+                parts += term.digested
                 functions += term.functions
-                if isinstance(term, ConstraintTerm) and (term.equality or term.final_only):
-                    parts.append(repr((term.equality, term.final_only)))
         if self._noise_term is not None:
-            parts += [self._noise_term.code.digest, self._noise_term.data, repr(self.risk)]
+            parts += [*self._noise_term.digested, repr(self.risk)]
             functions += self._noise_term.functions
         if self.duration is not None:
             parts.append(repr((self.duration, self.time_weight)))
@@ -486,7 +480,8 @@ class Problem:
 
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot starts inside an obstacle."""
-        found = None if self.start is None else self._inside(self.obstacle_costs, self.start, self.begin)
+        kept = [cost.kept_clear for cost in self.obstacle_costs]
+        found = None if self.start is None else self._inside(kept, self.start, self.begin)
         if found is not None:
             where, advice = found
             raise InputError(f"initial: got a start {where}, want it clear{advice}")
@@ -515,7 +510,7 @@ class Problem:
             raise InputError(f"rollout: got {got}, want the problem's: {want}")
         found: dict[str, Array] = {}
         for constraint, term in zip(self.constraints, self.constraint_terms, strict=True):
-            if not isinstance(constraint, KeepsClear):
+            if constraint.kept_clear is None:
                 runs = rollout.states, rollout.applied, rollout.counts
                 for name, by, knots in violated(term, *runs, EQUALITY_TOLERANCE):
                     own = np.stack([by, rollout.times[knots]], axis=1)

@@ -24,9 +24,12 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
-from lqrsim.problem.constraints import StateBounds
-from lqrsim.problem.costs import ControlCost, Cost, LimitCost, ObstacleCost, QuadraticCost
+from lqrsim.problem.costs import Cost
+from lqrsim.problem.limit_cost import LimitCost
+from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
+from lqrsim.problem.state_bounds import StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics

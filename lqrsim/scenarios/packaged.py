@@ -20,8 +20,9 @@ from lqrsim.errors import (
     keep,
     keep_positive,
 )
-from lqrsim.problem.costs import ControlCost, ObstacleCost, QuadraticCost
+from lqrsim.problem.obstacle_cost import ObstacleCost
 from lqrsim.problem.problem import Problem
+from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.goal import Target
 from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot

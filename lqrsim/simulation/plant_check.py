@@ -10,7 +10,6 @@ import numpy.typing as npt
 from scipy import special
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, check_seed
-from lqrsim.problem.constraints import StateBounds
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
@@ -204,7 +203,7 @@ def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> tuple[
     names = robot.dynamics.state_coordinates.names
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for one in () if problem is None else problem.constraints:
-        for i, (least, most) in one._of(robot.dynamics).items() if isinstance(one, StateBounds) else ():
+        for i, (least, most) in one.state_bounds(robot.dynamics).items():
             low[i], high[i] = max(low[i], np.min(least)), min(high[i], np.max(most))  # the widest of all knots
     for name, least, mean, most in zip(names, low, middle, high, strict=True):
         if not least <= mean <= most:

@@ -98,7 +98,7 @@ def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResul
     overflows.
     """
     problem, budget = run.problem, run.budget
-    if not (run.settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
+    if not (run.settings.safeguard and any(cost.contact_curvature for cost in problem.obstacle_costs)):
         return run, found
     plain = problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, 0.0))
     without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))

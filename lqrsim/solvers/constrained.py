@@ -66,7 +66,7 @@ class Ladder:
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self.smoothed: Motion | None = None
-        self.guided = any(cost.weight for cost in run.problem.obstacle_costs)
+        self.guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
         self.elastic = run.settings.elastic is not None
         self.given = self.guess.trajectory is not None or bool(self.guess.gain.any()) or stay
         if run.settings.penalty is None:
@@ -83,13 +83,13 @@ class Ladder:
     def climb(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
         for attempt in ATTEMPTS:
-            if self._budget.over or not attempt.when(self):
-                continue
-            found = attempt.make(self)
+            found = attempt.make(self) if attempt.when(self) else None
             if found is not None and found.success:
                 if not self._worse(found):
                     break
                 self._best = None  # the given plan is better
+            if self._budget.over:
+                break
         return self._answer()
 
     def finish_found(self) -> RunResult | None:

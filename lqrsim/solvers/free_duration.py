@@ -5,20 +5,17 @@ Runge-Kutta step over `dt` becomes a step over `share * dt`. The interior point 
 once. With the duration found, the problem is an ordinary one, and the plan is already at its optimum.
 """
 
-import copy
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.clearance import Clearance
-from lqrsim.problem.constraints import Constraint, GoalState, StateBounds, SymbolicConstraint
-from lqrsim.problem.costs import ControlCost, Cost, CostSum, ObstacleCost, QuadraticCost, SymbolicCost, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
@@ -34,8 +31,6 @@ MOST = 300  # largest number of iterations
 # Number of shorter durations that are tried, factor between them, and number of iterations for each.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a search that failed goes on
-
-Stated = TypeVar("Stated", SymbolicCost, SymbolicConstraint)
 
 
 def solve_for_duration(
@@ -204,19 +199,16 @@ def with_duration(problem: Problem) -> Problem:
     if isinstance(initial, FixedState):
         initial = FixedState(np.append(initial.numbers, stated))
     else:
-        initial = CostSum(tuple(_longer_cost(cost, n) for cost in terms_of(initial)))
-    stage, final = (
-        tuple(_longer_cost(cost, n) for cost in terms_of(costs)) for costs in (problem.stage_cost, problem.final_cost)
-    )
+        initial = initial.with_added_state(dynamics)
     priced = SymbolicCost(lambda x, u, p: p.weight * x[n], parameters={"weight": problem.time_weight}, convex=True)
     bounds = SymbolicConstraint(
         lambda x, u, p: [x[n] - p.low, p.high - x[n]], parameters={"low": low, "high": high}, at="final"
     )
     return Problem(
         dynamics=_scaled(dynamics, stated), dt=problem.dt, steps=problem.steps, initial=initial,
-        stage_cost=CostSum(stage), final_cost=CostSum((*final, priced)), control_limits=problem.control_limits,
-        constraints=(*(_longer(one, dynamics) for one in problem.constraints), bounds),
-        begin=problem.begin,
+        stage_cost=problem.stage_cost.with_added_state(dynamics),
+        final_cost=problem.final_cost.with_added_state(dynamics) + priced, control_limits=problem.control_limits,
+        constraints=(*(one.with_added_state(dynamics) for one in problem.constraints), bounds), begin=problem.begin,
     )  # fmt: skip
 
 
@@ -247,45 +239,3 @@ def _unused(name: str, names: Collection[str]) -> str:
     while name in names:
         name += "_"
     return name
-
-
-def _longer_cost(cost: Cost, n: int) -> Cost:
-    """A cost of n states as a cost of n + 1 states, independent of the last state."""
-    if isinstance(cost, QuadraticCost):
-        weight, about = (
-            np.pad(array, [(0, 0)] * (array.ndim - axes) + [(0, 1)] * axes)
-            for array, axes in ((cost.weight, 2), (cost.about, 1))
-        )
-        return QuadraticCost(weight, about=about, longer=cost.longer)
-    if isinstance(cost, SymbolicCost):
-        return _of_fewer(cost, n)
-    if isinstance(cost, (ControlCost, ObstacleCost)):
-        return cost
-    raise InputError(
-        f"duration: got a {type(cost).__name__} beside it, want QuadraticCost, ControlCost, ObstacleCost and"
-        " SymbolicCost, which can be stated for one more state"
-    )
-
-
-def _longer(constraint: Constraint, dynamics: Dynamics) -> Constraint:
-    """A constraint on the states of these dynamics as a constraint on n + 1 states, independent of the last."""
-    names = dynamics.state_coordinates.names  # numbers by unit would also apply to the last state
-    if isinstance(constraint, GoalState):
-        return GoalState({names[i]: number for i, number in constraint._numbers(dynamics).items()})
-    if isinstance(constraint, StateBounds):
-        return StateBounds({names[i]: sides for i, sides in constraint._of(dynamics).items()})
-    if isinstance(constraint, SymbolicConstraint):
-        return _of_fewer(constraint, len(names))
-    if isinstance(constraint, Clearance):
-        return constraint
-    raise InputError(
-        f"duration: got a {type(constraint).__name__} beside it, want GoalState, StateBounds, Clearance and"
-        " SymbolicConstraint, which can be stated for one more state"
-    )
-
-
-def _of_fewer(stated: Stated, n: int) -> Stated:
-    """A formula of n states as a formula of more."""
-    other, function = copy.copy(stated), stated.function
-    other.function = lambda x, u, p: function(x[:n], u, p)
-    return other

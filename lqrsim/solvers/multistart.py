@@ -12,8 +12,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.constraints import StateBounds
-from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of, weighing_obstacles
+from lqrsim.problem.costs import CostSum, terms_of, weighing_obstacles
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
@@ -147,8 +146,7 @@ def along_paths(problem: Problem, moving: Sequence[int], cost: float) -> dict[st
 def passable(problem: Problem) -> list[bool]:
     """Whether a robot may pass each constraint on one side or another: whether it is an inequality of states."""
     return [
-        not (term.equality or term.final_only or term.uses_control or isinstance(constraint, StateBounds))
-        for constraint, term in zip(problem.constraints, problem.constraint_terms, strict=True)
+        not (term.equality or term.final_only or term.uses_control or term.convex) for term in problem.constraint_terms
     ]
 
 
@@ -158,12 +156,9 @@ def reweighted(problem: Problem, times: float) -> Problem:
 
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """
-
-    def heavier(cost: Cost) -> Cost:
-        return QuadraticCost(times * cost.weight, about=cost.about) if isinstance(cost, QuadraticCost) else cost
-
     stage, final = (weighing_obstacles(cost, times) for cost in (problem.stage_cost, problem.final_cost))
-    return problem.with_costs(stage_cost=stage, final_cost=CostSum(tuple(map(heavier, final.terms))))
+    heavier = (one if one.state_reference is None else one.times(times) for one in final.terms)
+    return problem.with_costs(stage_cost=stage, final_cost=CostSum(tuple(heavier)))
 
 
 def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
@@ -239,8 +234,8 @@ def pull(problem: Problem) -> float:
         return 0.0
     if np.array_equal(problem.start[moving], problem.goal[moving]):
         return 0.0
-    costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
-    return max((PULL * cost.weight * cost.sharpness**2 for cost in costs), default=0.0)
+    costs = [cost for cost in problem.obstacle_costs if len(cost.kept_clear.world)]
+    return max((PULL * cost.contact_curvature for cost in costs), default=0.0)
 
 
 def _moving(problem: Problem) -> list[int]:
@@ -249,7 +244,7 @@ def _moving(problem: Problem) -> list[int]:
     if position:
         return position
     pairs = zip(terms_of(problem.stage_cost), problem.terms("stage_cost"), strict=True)
-    return sorted({i for cost, term in pairs if isinstance(cost, ObstacleCost) for i in term.nonconvex_in or ()})
+    return sorted({i for cost, term in pairs if cost.kept_clear is not None for i in term.nonconvex_in or ()})
 
 
 def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m") -> list[tuple[str, Array]]:

@@ -17,8 +17,9 @@ from lqrsim.control.replan_rule import ActivePlan
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
-from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of
+from lqrsim.problem.costs import Cost, CostSum, terms_of
 from lqrsim.problem.problem import Problem
+from lqrsim.problem.quadratic_cost import references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.rollout import Rollout
@@ -58,31 +59,23 @@ class MovableGoal:
             raise InputError(
                 f"goal: got a GoalState that holds {', '.join(held)}, want a QuadraticCost, whose goal can be moved"
             )
-        self._terms = terms_of(problem.final_cost)
-        found = [i for i, term in enumerate(self._terms) if self._weighs_place(term)]
+        self._dynamics, self._cost = problem.dynamics, problem.final_cost
+        references = references_of(self._cost, self._dynamics)
+        found = [(term, one) for term, one in references if one.weight[self._position].any()]
         if len(found) != 1:
             raise InputError(
                 f"goal: got {len(found)} QuadraticCosts of the position in final_cost, want one to move its goal"
             )
-        (self._number,) = found
-        self.place = self._cost.about[self._position]
-
-    @property
-    def _cost(self) -> QuadraticCost:
-        cost = self._terms[self._number]
-        assert isinstance(cost, QuadraticCost)
-        return cost
-
-    def _weighs_place(self, term: Cost) -> bool:
-        return isinstance(term, QuadraticCost) and bool(term.weight[self._position].any())
+        ((self._drawing, self._reference),) = found
+        self.place = self._reference.about[self._position]
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
-        about = self._cost.about.copy()
+        about = self._reference.about.copy()
         about[self._position] = place
-        terms = list(self._terms)
-        terms[self._number] = QuadraticCost(self._cost.weight, about=about)
-        return terms[0] if len(terms) == 1 else CostSum(tuple(terms))
+        moved = self._drawing.moved_to(about, self._dynamics)
+        terms = tuple(moved if term is self._drawing else term for term in terms_of(self._cost))
+        return terms[0] if len(terms) == 1 else CostSum(terms)
 
 
 def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:

@@ -198,6 +198,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             }.items()
             for method, given in (("__add__", {"other": cost}), ("ahead", {"steps": 2, "horizon": "moving"}))
         },
+        "source_of": ({"module": "lqrsim.problem.quadratic_cost", "CONTROL": True},),
         "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
         "Clearance": ({"world": world, "radius": 0.2, "margin": 0.1},),
         "Clearance of balls": ({"call": ls.Clearance, "world": world, "balls": balls, "margin": 0.1},),

@@ -1,15 +1,102 @@
-"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. Written in the kernels' subset.
+"""The cost of coming near obstacles: class and kernel."""
 
-The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on, `data` has the
-numbers below, and the tables of obstacles. The last table holds for all later steps. The data for `places` comes before
-AT.
-"""
+import copy
 
+import numpy as np
+
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array, check_number
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
 from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
+from lqrsim.problem.collision_shape import CollisionGeoms, KeepsClear
+from lqrsim.problem.collision_spheres import CollisionSpheres
+from lqrsim.problem.costs import Cost, CostTerm
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.scenes.world import World
 
+FAR = 16.0  # times 1 / sharpness: the distance beyond which geoms cost nothing in an ObstacleCost, instead of exp(-FAR)
+
+
+class ObstacleCost(KeepsClear, Cost):
+    """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
+
+    Paper: Sec. VI-A, with the sharpness made explicit. The cost does not act at t = 0, where the state is given. For a
+    robot in the plane (two position coordinates), the world is seen from above or cut by the plane; see
+    `World.seen_by`.
+
+    For a robot of several balls, the cost is summed over the balls, too. Its Hessian is then computed in the centres of
+    the balls and mapped to the states by the Jacobian of the centres. Second derivatives of the centres are left out.
+
+    Args:
+      world: the obstacles.
+      radius: radius of the robot at its position, in metres.
+      balls: the robot's balls, in place of `radius`, as `robot.balls`. The attribute `radius` is then the largest one.
+      geoms: the colliding geoms of a robot from an MJCF, as `robot.geoms`, with MuJoCo's distances. The sum is then
+        over bodies and obstacles. Pairs farther apart than D = 16 / sharpness cost nothing; for the others, the
+        exponential's tangent at D, `exp(-16) * (1 + sharpness * (D - distance))`, is taken off. Give exactly one of
+        `radius`, `balls` and `geoms`.
+      sharpness: sharpness in 1/m.
+      weight: cost of touching one obstacle, with one ball, for one step.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        radius: float | None = None,
+        balls: CollisionSpheres | None = None,
+        geoms: CollisionGeoms | None = None,
+        sharpness: float = 10.0,
+        weight: float = 1.0,
+    ) -> None:
+        self._set_shape(world, radius, balls, geoms)
+        self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
+        self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+
+    def weighing(self, weight: float) -> "ObstacleCost":
+        """The same cost with another weight.
+
+        Args:
+          weight: cost of touching one obstacle, with one ball, for one step.
+        """
+        other = copy.copy(self)
+        other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+        return other
+
+    def times(self, factor: float) -> "ObstacleCost":
+        return self.weighing(factor * self.weight)
+
+    @property
+    def contact_curvature(self) -> float:
+        return self.weight * self.sharpness**2
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        return self._bind_at(dynamics, np.zeros(1))
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+        shape, reach = self.in_world(dynamics), FAR / self.sharpness
+        distances = shape.distances(reach)
+        if distances is not None:
+            numbers, axes = np.array([self.sharpness, self.weight, reach]), tuple(range(distances.moved))
+            return CostTerm.of_residual(
+                distances, source_of(__name__, AT=distances.numbers), numbers, first=1, nonconvex_in=axes, factor=WEIGHT
+            )
+        tables = shape.world.tables(times)
+        sizes = self.sharpness, self.weight, len(shape.world), len(tables)
+        numbers = np.concatenate([sizes, shape.radii, tables.ravel()])
+        source, data, functions = shape.placed(__name__, numbers)
+        return CostTerm(
+            source, data, nonconvex_in=shape.moved_by or None, factor=len(data) - len(numbers) + WEIGHT,
+            functions=functions, exact_hessian=shape.centers is None,
+        )  # fmt: skip
+
+
+# The kernel. The robot is a point at its position, or a set of balls; the cost is then summed over these. From AT on,
+# `data` has the numbers below, and the tables of obstacles. The last table holds for all later steps. The data for
+# `places` comes before AT.
 AT = 0
+FARTHEST = 2  # for geoms; see `loss`
 # From there on: sharpness, weight, numbers of obstacles and of steps with a table of these; then the radius of each
 # ball, or of the point.
 SHARPNESS, WEIGHT, OBSTACLES, TABLES, RADII = 0, 1, 2, 3, 4
@@ -118,3 +205,20 @@ def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
         for k in range(3):
             stiffness[j, k] = curves[j, k]
     return total
+
+
+def loss(distance, row, data):
+    """The cost of a distance of geoms, its first and its second derivative.
+
+    From AT on, `data` has the sharpness, the weight, and the distance beyond which there is no cost. The tangent there
+    is subtracted, so that neither the cost nor its slope jumps.
+    """
+    sharpness, weight, farthest = data[AT + SHARPNESS], data[AT + WEIGHT], data[AT + FARTHEST]
+    cost, least, beyond = exponential(-sharpness * distance), exponential(-sharpness * farthest), farthest - distance
+    if beyond > 0:
+        return (
+            weight * (cost - least * (1 + sharpness * beyond)),
+            -weight * sharpness * (cost - least),
+            weight * sharpness * sharpness * cost,
+        )
+    return 0.0, 0.0, 0.0

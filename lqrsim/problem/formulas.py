@@ -1,0 +1,261 @@
+"""Costs and constraints that are stated as functions: formulas of symbols, and numba or plain Python functions."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.user_functions import (
+    axes_of,
+    check_depends_on,
+    check_derivative,
+    check_signature,
+    level_of,
+    name_of,
+    with_derivatives,
+)
+from lqrsim.errors import Array, InputError, check_flag, check_name
+from lqrsim.kernels import differences, user_functions
+from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
+from lqrsim.problem.costs import Cost, CostTerm
+from lqrsim.problem.dynamics import Dynamics
+
+
+class OfFunction:
+    """A cost or a constraint that is stated as a function, with parameters."""
+
+    function: Callable[..., Any]
+    parameters: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    @property
+    def _data(self) -> Array:
+        return np.array(list(self.parameters.values()), dtype=np.float64)
+
+
+class OfFormula(OfFunction):
+    """A cost or a constraint that is stated as a formula, with parameters."""
+
+    def _set_formula(self, function: Callable[..., Any], parameters: Mapping[str, float] | None, instead: str) -> None:
+        """Check and keep a function of symbols."""
+        if level_of(function, None) == "compiled":
+            raise InputError(f"{type(self).__name__}: got the numba function {name_of(function)}, want {instead}")
+        check_signature(function, ("x", "u", "p"))
+        self.function, self.parameters = function, symbolic.check_parameters(parameters)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        other, function, n = copy.copy(self), self.function, len(dynamics.state_coordinates)
+        other.function = lambda x, u, p: function(x[:n], u, p)
+        return other
+
+
+class SymbolicCost(OfFormula, Cost):
+    """A cost stated as a formula.
+
+    Args:
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression. For an initial or final
+        cost it must not depend on u.
+      parameters: name -> value, as in `Dynamics`.
+      convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        *,
+        parameters: Mapping[str, float] | None = None,
+        convex: bool = False,
+    ) -> None:
+        self._set_formula(function, parameters, "FunctionCost for it")
+        self.convex = check_flag("SymbolicCost: convex", convex)
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        details = ("cost", *names, tuple(self.parameters))
+        made = symbolic.kept(
+            self.function, details, lambda: self._trace(*names), source=str, nonconvex_in=list, uses_control=bool
+        )
+        return CostTerm(
+            made["source"],
+            self._data,
+            nonconvex_in=None if self.convex or not made["nonconvex_in"] else tuple(made["nonconvex_in"]),
+            uses_control=made["uses_control"],
+        )
+
+    def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
+        if len(traced) != 1:
+            raise InputError(f"{self.name}: got {len(traced)} entries, want one: the cost")
+        cost, z = traced[0], [*x, *u]
+        slopes = [cost.diff(symbol) for symbol in z]
+        curves = {(i, j): slope.diff(symbol) for i, slope in enumerate(slopes) for j, symbol in enumerate(z)}
+        targets = {"cost": cost}
+        targets |= {f"gradient[{i}]+": slope for i, slope in enumerate(slopes) if slope != 0}
+        targets |= {f"hessian[{i}, {j}]+": curve for (i, j), curve in curves.items() if curve != 0}
+        value = symbolic.write_function("value", "x, u, t, data", "data", {"cost": cost}, of=self.name, returns="cost")
+        derivatives = symbolic.write_function(
+            "derivatives", "x, u, t, data, hessian, gradient", "data", targets, of=self.name, returns="cost"
+        )
+        return {
+            "source": f"{value}\n\n{derivatives}",
+            "nonconvex_in": sorted({i for (i, _), curve in curves.items() if curve != 0}),
+            "uses_control": bool(cost.free_symbols & set(u)),
+        }
+
+
+class SymbolicConstraint(OfFormula, Constraint):
+    """A constraint stated as a formula: `f(x, u) >= 0`, or `f(x, u) = 0` with `equality`.
+
+        def slower_than_2(x, u, p):  # a planar speed, in m/s
+            return p.speed**2 - x.vx**2 - x.vy**2
+
+        ls.SymbolicConstraint(slower_than_2, parameters={"speed": 2.0})
+
+    A constraint that depends on the control acts at all steps that have a control, so not at the last knot. A
+    constraint on the state alone acts at the last knot, too. It does not act at a start that is given exactly, because
+    that cannot change.
+
+    Args:
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
+        must be nonnegative. Either all of them depend on u, or none does. All are solved to the same tolerance, so
+        choose units in which values of about 1 matter.
+      parameters: name -> value, as in `Dynamics`.
+      equality: whether the expressions must be zero, within 1e-6, or `constraint_tolerance` if that is smaller.
+      at: "all" steps, or only the "final" step, at which the expressions must not depend on u.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        *,
+        parameters: Mapping[str, float] | None = None,
+        equality: bool = False,
+        at: str = "all",
+    ) -> None:
+        self._set_formula(function, parameters, "one of SymPy symbols")
+        self.equality = check_flag("SymbolicConstraint: equality", equality)
+        self.at = check_name("SymbolicConstraint: at", at, STEPS)
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        names = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        details = ("constraint", *names, tuple(self.parameters))
+        made = symbolic.kept(
+            self.function, details, lambda: self._trace(*names), source=str, rows=int, with_control=list
+        )
+        with_control, rows = made["with_control"], made["rows"]
+        if self.at == "final" and with_control:
+            raise InputError(
+                f"{self.name}: got an entry that depends on u, want none at the final step, which has no u"
+            )
+        if 0 < len(with_control) < rows:
+            raise InputError(
+                f"{self.name}: got {rows} entries of which {len(with_control)} depend on u, want all of them or none:"
+                " state the others as another SymbolicConstraint"
+            )
+        kind = "zero" if self.equality else "not negative"
+        return ConstraintTerm(
+            source=made["source"],
+            data=self._data,
+            rows=rows,
+            describe=lambda row: f"that {self.name}{f'[{row}]' if rows > 1 else ''} is {kind}",
+            uses_control=bool(with_control),
+            equality=self.equality,
+            final_only=self.at == "final",
+        )
+
+    def _trace(self, states: Sequence[str], controls: Sequence[str]) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, states, controls, list(self.parameters))
+        if not traced:
+            raise InputError(f"{self.name}: got no entries, want at least one: each must be nonnegative, or zero")
+        parts, choices = [], {"value": [], "slope": []}
+        for row, entry in enumerate(traced):
+            if not entry.free_symbols & {*x, *u}:
+                raise InputError(f"{self.name}: got {entry} as entry {row}, want it to depend on x or u")
+            slopes = {f"gradient[{i}]+": entry.diff(symbol) for i, symbol in enumerate([*x, *u])}
+            slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+            value, slope = f"value_{row}(x, u, data)", f"slope_{row}(x, u, data, gradient)"
+            parts.append(_written(value, {"entry": entry}, self.name, returns="entry"))
+            parts.append(_written(slope, slopes, self.name))
+            choices["value"].append(f"    if row == {row}:\n        return {value}")
+            choices["slope"].append(f"    if row == {row}:\n        {slope}")
+        value = "\n".join(["def value(x, u, t, row, data):", *choices["value"], "    return 0.0"])
+        slope = "\n".join(["def slope(x, u, t, row, data, gradient):", *choices["slope"]])
+        return {
+            "source": "\n\n".join([*parts, value, slope]) + "\n",
+            "rows": len(traced),
+            "with_control": [row for row, entry in enumerate(traced) if entry.free_symbols & set(u)],
+        }
+
+
+class FunctionCost(OfFunction, Cost):
+    """A cost given as a numba or plain Python function, for costs that `SymbolicCost` cannot express.
+
+    Args:
+      function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.
+      derivatives: `derivatives(x, u, p, gradient, hessian)`, which writes to gradient (n+m,) and hessian (n+m, n+m),
+        states before controls; both are zero on entry. Without derivatives, both are central differences, accurate to
+        about six digits, at two evaluations for every pair of entries in `depends_on`.
+      depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
+      parameters: name -> value, as in `Dynamics`.
+      convex: set it if the Hessian is positive semidefinite everywhere, to save the projection.
+      level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], float],
+        *,
+        derivatives: Callable[..., None] | None = None,
+        depends_on: Sequence[str] | None = None,
+        parameters: Mapping[str, float] | None = None,
+        convex: bool = False,
+        level: str | None = None,
+    ) -> None:
+        self.function, self.derivatives = function, derivatives
+        self.convex = check_flag("FunctionCost: convex", convex)
+        self.level = level_of(function, level)
+        if self.level == "symbolic":
+            if level is not None:
+                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled' or 'plain'; or use SymbolicCost")
+            self.level = "plain"
+        self.depends_on = check_depends_on("FunctionCost", depends_on, "states and controls, at least one")
+        if self.depends_on == ():  # a constant: nothing to minimise
+            wanted = "a tuple of names of states and controls, at least one"
+            raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
+        self.parameters = symbolic.check_parameters(parameters)
+        check_signature(function, ("x", "u", "p"))
+        if derivatives is not None:
+            check_derivative(
+                "FunctionCost: derivatives", derivatives, function, self.level, "x, u, p, gradient, hessian"
+            )
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
+        axes, unused = axes_of("FunctionCost", self.depends_on, names)
+        functions = with_derivatives(
+            self.function, {"values": 1, "unused": unused}, self.derivatives, ((n + m,), (n + m, n + m)),
+            level=self.level, states=n, controls=m, parameters=tuple(self.parameters),
+        )  # fmt: skip
+        source = source_of(user_functions)
+        if self.derivatives is None:
+            source = source_of(differences, AXES=axes).filled(value=source)
+        return CostTerm(
+            source,
+            self._data,
+            nonconvex_in=None if self.convex else axes,
+            uses_control=any(axis >= n for axis in axes),
+            functions=functions,
+        )
+
+
+def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:
+    name, arguments = signature.removesuffix(")").split("(")
+    return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)

@@ -1,0 +1,199 @@
+"""Bounds and goals of states: classes and kernel."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array, InputError, check_array, check_items, check_number, numbers_of
+from lqrsim.problem.constraints import Constraint, ConstraintTerm, Side, by_name
+from lqrsim.problem.dynamics import Dynamics
+
+Bounds = tuple[npt.ArrayLike, npt.ArrayLike]  # low and high, as given
+
+
+class GoalState(Constraint):
+    """The final state equals a goal: `x_T = goal`. A final cost only draws the state to it.
+
+        ls.GoalState(x=1.0, velocity=0.0)
+
+    Args:
+      goal: (n,) the state, in the states' units; or a dictionary of name or unit: number, for some of the states, such
+        as {"m/s": 0} for all velocities. Angles count whole turns, as for a QuadraticCost.
+      **named: name of a state -> number, in place of a dictionary.
+
+    Raises:
+      InputError: no goal, a number that is not finite, or a state that is named twice.
+    """
+
+    def __init__(self, goal: npt.ArrayLike | Mapping[str, float] | None = None, /, **named: float) -> None:
+        self.goal: Array | dict[str, float]
+        if goal is None or named or isinstance(goal, Mapping):
+            self.goal = by_name("GoalState", goal, named, "a number", check_number)
+        else:
+            self.goal = check_array("GoalState: goal", goal, (None,))
+
+    def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
+        names, goal = dynamics.state_coordinates.names, self.goal
+        if isinstance(goal, dict):
+            return dynamics.state_coordinates._by_name("GoalState: states", goal, check_number)
+        if len(goal) != len(names):
+            each = f"one for each of {', '.join(names)}"
+            raise InputError(f"GoalState: goal: got {len(goal)} numbers, want {len(names)}, {each}")
+        return dict(enumerate(goal.tolist()))
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
+        rows = list(self.final_states(dynamics).items())
+        described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
+        data = _bound_data([(i, 1.0, np.inf, np.array([number])) for i, number in rows])
+        return ConstraintTerm(
+            source_of(__name__), data, len(rows), described.__getitem__, equality=True, final_only=True
+        )
+
+    def with_added_state(self, dynamics: Dynamics) -> "GoalState":
+        names = dynamics.state_coordinates.names  # numbers by unit would also apply to the added state
+        return GoalState({names[i]: number for i, number in self.final_states(dynamics).items()})
+
+
+class StateBounds(Constraint):
+    """Bounds on states, `low <= x_t <= high`, at each step except a start that is given exactly.
+
+        ls.StateBounds(height=(0.1, 2.0), velocity=(-np.inf, 1.5))
+        ls.StateBounds(height=(lows, 2.0))  # a lower bound for each knot
+
+    At the end, the bounds do not act on a state that a GoalState fixes. A goal may therefore lie on a bound.
+
+    Either bound may have one number for each of the T+1 knots; where it is infinite, it does not act. A waypoint, or a
+    gate that is open for a while, is such a bound. Numbers belong to knots, also with a free duration. When a
+    `Replanner` plans again, they move with time as a reference does, see `QuadraticCost`.
+
+    Args:
+      bounds: a dictionary of name or unit of a state: (low, high), in its unit, each a number or (T+1,) numbers. An
+        infinite number means no bound. A name takes precedence over a unit.
+      **named: name of a state -> (low, high), in place of a dictionary.
+
+    Raises:
+      InputError: no bounds, no finite bound for a state, low not below high, or a state that is named twice.
+    """
+
+    def __init__(self, bounds: Mapping[str, Bounds] | None = None, /, **named: Bounds) -> None:
+        self.bounds = by_name("StateBounds", bounds, named, "(low, high)", _bound)
+
+    @property
+    def by_knot(self) -> bool:
+        return any(isinstance(side, np.ndarray) for sides in self.bounds.values() for side in sides)
+
+    def _with_rows(self, cut: Callable[[Array], Array]) -> Self:
+        def later(side: Side) -> Side:
+            return cut(side) if isinstance(side, np.ndarray) else side
+
+        other = copy.copy(self)
+        other.bounds = {name: (later(low), later(high)) for name, (low, high) in self.bounds.items()}
+        return other
+
+    def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
+        def sides(field: str, given: object) -> tuple[Side, Side]:
+            return given  # pyright: ignore[reportReturnType]
+
+        return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, sides)
+
+    def with_added_state(self, dynamics: Dynamics) -> "StateBounds":
+        names = dynamics.state_coordinates.names  # as for a GoalState
+        return StateBounds({names[i]: sides for i, sides in self.state_bounds(dynamics).items()})
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        return self._bind_beside(dynamics, np.zeros(1), {})
+
+    def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
+        """Raises InputError if a goal is outside the bounds."""
+        names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
+        rows, described = [], []
+        for side, sign, word in ((0, 1.0, "at least"), (1, -1.0, "at most")):
+            for i, sides in self.state_bounds(dynamics).items():
+                name, numbers = names[i], np.atleast_1d(sides[side])
+                acts = np.isfinite(numbers)
+                if not (acts.any() or isinstance(sides[side], np.ndarray)):
+                    continue
+                wanted = f"{name} of {word} {_quantities(numbers[acts] if acts.any() else numbers, units[i])}"
+                if i in goals and sign * (goals[i] - numbers[-1]) < 0:
+                    goal = _quantity(goals[i], units[i])
+                    raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
+                rows.append((i, sign, len(times) - 2 if i in goals else np.inf, numbers))
+                described.append(wanted)
+        return ConstraintTerm(source_of(__name__), _bound_data(rows), len(rows), described.__getitem__, convex=True)
+
+
+def _bound(field: str, given: object) -> tuple[Side, Side]:
+    """(low, high), each a number or numbers (K,), at least one of them finite."""
+    want = "(low, high), each a number or one for each knot; infinite for no bound"
+    sides = check_items(field, given, object, want)
+    if len(sides) != 2:
+        raise InputError(f"{field}: got {len(sides)} items, want {want}")
+    low, high = (_side(f"{field}: {name}", side) for name, side in zip(("low", "high"), sides, strict=True))
+    if isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and len(low) != len(high):
+        raise InputError(f"{field}: got {len(low)} and {len(high)} numbers, want one for each knot in both")
+    lows, highs = np.broadcast_arrays(np.atleast_1d(low), np.atleast_1d(high))
+    wrong = np.flatnonzero(~(lows < highs)).tolist()
+    if wrong or not (np.isfinite(lows).any() or np.isfinite(highs).any()):
+        at = wrong[0] if wrong else 0
+        knot = f" at knot {at}" if wrong and len(lows) > 1 else ""
+        raise InputError(
+            f"{field}: got {lows[at]:g} to {highs[at]:g}{knot}, want low below high, and one of them finite"
+        )
+    return low, high
+
+
+def _side(field: str, given: object) -> Side:
+    """A bound, or one for each knot. Raises InputError for anything else."""
+    numbers = numbers_of(field, given, "a number, or one for each knot")
+    numbers = check_array(field, numbers, (None,) if numbers.ndim else (), infinite=True)
+    if not numbers.size:
+        raise InputError(f"{field}: got no numbers, want one, or one for each knot")
+    return numbers if numbers.ndim else numbers.item()
+
+
+def _bound_data(rows: Sequence[tuple[int, float, float, Array]]) -> Array:
+    """The numbers of the kernel: of each row the state, the sign, the last step, and one bound or K of them."""
+    knots = max(len(bounds) for *_, bounds in rows)
+    table = [[i, sign, last, *np.broadcast_to(bounds, knots)] for i, sign, last, bounds in rows]
+    return np.concatenate([[knots], np.ravel(table)])
+
+
+def _quantity(number: float, unit: str) -> str:
+    return f"{number:g} {unit}".rstrip()
+
+
+def _quantities(numbers: Array, unit: str) -> str:
+    """The least and the greatest number, or the one that all are."""
+    low, high = numbers.min(), numbers.max()
+    return _quantity(low, unit) if low == high else f"{low:g} to {_quantity(high, unit)}"
+
+
+# The kernel: the distance of a state to a bound, positive on the feasible side. `data` has the number of knots K with a
+# bound of their own, and then for each row the index of the state, 1 for a lower or -1 for an upper bound, the last
+# step at which it holds, and K bounds, infinite at knots without one. The last bound holds from its knot on.
+INDEX, SIGN, LAST, BOUNDS = 0, 1, 2, 3
+
+
+def value(x, u, t, row, data):
+    """The distance; infinite after the last step, and where there is no bound."""
+    first = row_at(row, data)
+    if t > data[first + LAST]:
+        return inf
+    return data[first + SIGN] * (x[int(data[first + INDEX])] - data[first + BOUNDS + min(t, int(data[0]) - 1)])
+
+
+def slope(x, u, t, row, data, gradient):
+    """Add its gradient (W,)."""
+    first = row_at(row, data)
+    gradient[int(data[first + INDEX])] += data[first + SIGN]
+
+
+def row_at(row, data):
+    """The index at which the numbers of a row begin."""
+    return 1 + row * (BOUNDS + int(data[0]))
