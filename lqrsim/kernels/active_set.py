@@ -19,14 +19,10 @@ from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.model_functions import evaluate_constraints
 from lqrsim.kernels.rollouts import larger
 from lqrsim.kernels.stages import (
-    AIM,
     CONTROL,
     EQUALITY,
-    KIND,
     LIMIT,
-    PRICE,
     SIDE,
-    SIZE,
     closed_loop_rollout,
     cost_of_plan,
     direction,
@@ -92,9 +88,8 @@ def begin_active_set(violation, stages, work, mem):
     mem.cost = look_with_own_costates(stages, work.plan, work.costates)
     mem.typical = typical_sizes(stages, work.plan, stages.models.hessian)
     for at in range(rows.size * (stages.steps + 1)):
-        row = at % rows.size
-        at_limit = rows.table[row, KIND] == LIMIT and rows.numbers[at] <= AT_LIMIT * rows.table[row, SIZE]
-        known = rows.table[row, KIND] == EQUALITY or rows.force[at] > 0 or at_limit
+        at_limit = rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * rows.sizes[at]
+        known = rows.kinds[at] == EQUALITY or rows.force[at] > 0 or at_limit
         rows.held[at] = HELD if known and rows.live[at] != 0 else FREE
     measure_plan(violation, stages, work, mem)
 
@@ -117,8 +112,8 @@ def measure_plan(violation, stages, work, mem):
     least = CANCELLED * mem.typical
     mem.scale = max(abs(mem.cost), least) if isfinite(mem.cost) else nan
     steepest, missed, unequal, widest, product = measure(stages, work.plan, rows.numbers, work.gaps)
-    for row in range(rows.size):
-        priced = priced or rows.table[row, PRICE] < inf
+    for at in range(rows.size * (stages.steps + 1)):
+        priced = priced or rows.prices[at] < inf
     mem.kept = 1.0 if priced or (missed <= 0 and unequal <= violation) else 0.0
     mem.stationarity, mem.gap, mem.complementarity = steepest / mem.scale, widest, product / mem.scale
     mem.violation = larger(larger(missed, unequal), 0.0)
@@ -170,10 +165,9 @@ def hold(weight, price, stages, work):
     for at in range(rows.size * (stages.steps + 1)):
         work.curves[at], work.forces[at] = 0.0, rows.force[at] if rows.held[at] != FREE else 0.0
         if rows.held[at] == HELD:
-            row = at % rows.size
-            size = rows.table[row, SIZE]
-            work.curves[at] = (weight if rows.table[row, KIND] == LIMIT else price) / (size * size)
-            work.forces[at] -= work.curves[at] * (rows.numbers[at] - rows.table[row, AIM])
+            size = rows.sizes[at]
+            work.curves[at] = (weight if rows.kinds[at] == LIMIT else price) / (size * size)
+            work.forces[at] -= work.curves[at] * (rows.numbers[at] - rows.targets[at])
 
 
 @compact
@@ -186,12 +180,12 @@ def predict_rows(scale, stages, work):
             work.pressing[at], work.wrong[at] = 0.0, 0.0
             if rows.live[at] == 0:
                 continue
-            size, price, missed = rows.table[row, SIZE], rows.table[row, PRICE], 0.0
+            size, price, missed = rows.sizes[at], rows.prices[at], 0.0
             change = moved(t, row, stages)
             if rows.held[at] == HELD:
                 force = work.forces[at] - work.curves[at] * change
                 work.pressing[at] = force
-                if rows.table[row, KIND] != EQUALITY:
+                if rows.kinds[at] != EQUALITY:
                     missed = min(missed, force * size / scale)
                 if price < inf:
                     missed = min(missed, (price - abs(force)) * size / scale)
@@ -199,7 +193,7 @@ def predict_rows(scale, stages, work):
                 work.pressing[at] = rows.force[at]
                 missed = -(rows.numbers[at] + change) * copysign(1.0, rows.force[at]) / size
             else:
-                missed = (rows.numbers[at] - rows.table[row, AIM] + change) / size
+                missed = (rows.numbers[at] - rows.targets[at] + change) / size
             if missed < -ROUNDING:
                 work.wrong[at] = missed
                 count += 1
@@ -235,9 +229,9 @@ def change_row(at, rows, work):
     """Hold a row; or, if it is held, release it or pay for it."""
     if rows.held[at] != HELD:
         rows.held[at] = HELD
-    elif abs(work.pressing[at]) > rows.table[at % rows.size, PRICE]:
+    elif abs(work.pressing[at]) > rows.prices[at]:
         rows.held[at] = PAID
-        rows.force[at] = copysign(rows.table[at % rows.size, PRICE], work.pressing[at])
+        rows.force[at] = copysign(rows.prices[at], work.pressing[at])
     else:
         rows.held[at] = FREE
 
@@ -248,7 +242,7 @@ def take_step(violation, stages, work, mem):
     rows, changes = stages.rows, stages.changes
     for at in range(rows.size * (stages.steps + 1)):
         force = work.pressing[at]
-        rows.force[at] = force if rows.table[at % rows.size, KIND] == EQUALITY else max(force, 0.0)
+        rows.force[at] = force if rows.kinds[at] == EQUALITY else max(force, 0.0)
     for t in range(stages.steps + 1):
         copy(stages.to_go.gradient[t], N, work.costates[t])
         for i in range(N):
@@ -280,9 +274,10 @@ def roll_out(stages, work, mem):
             if rung < 0:
                 fill(policy.gain[t, i], N, 0.0)
         for row in range(rows.size):
-            if rows.table[row, KIND] == LIMIT and rows.held[rows.size * t + row] == HELD:
-                i = int(rows.table[row, CONTROL])
-                work.plan.controls[t, i] = rows.table[row, SIDE]
+            at = rows.size * t + row
+            if rows.kinds[at] == LIMIT and rows.held[at] == HELD:
+                i = int(rows.limits[row, CONTROL])
+                work.plan.controls[t, i] = rows.limits[row, SIDE]
                 fill(policy.gain[t, i], N, 0.0)
     closed_loop_rollout(stages.steps, 0.0, work.plan, policy, work.limits, stages.model, work.out)
     evaluate_constraints(

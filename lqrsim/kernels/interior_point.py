@@ -32,12 +32,8 @@ from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compa
 from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
-    AIM,
     EQUALITY,
-    KIND,
     LIMIT,
-    PRICE,
-    SIZE,
     adjoint,
     direction,
     look,
@@ -142,10 +138,9 @@ def begin(begun, stages, work, mem):
     mem.pairs, mem.elastic = 0.0, 0.0
     for at in range(rows.size * (steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            if has_slack(row, rows):
+            if has_slack(at, rows):
                 mem.pairs += 1
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 mem.pairs += 1
                 mem.elastic = 1.0
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
@@ -167,15 +162,14 @@ def begin(begun, stages, work, mem):
 def begin_row(at, begun, stages, work, mem):
     """Choose the first slacks and the multiplier of a row."""
     rows = stages.rows
-    row = at % rows.size
-    equality, size, price = rows.table[row, KIND] == EQUALITY, rows.table[row, SIZE], rows.table[row, PRICE]
+    equality, size, price = rows.kinds[at] == EQUALITY, rows.sizes[at], rows.prices[at]
     number, force, least = work.now.numbers[at], 0.0, begun.room * size
     if begun.informed:
         force = begun.known[at]
     if force > 0 and not equality:
         least = min(least, mem.parameter / force)
     slack = 0.0
-    if has_slack(row, rows):
+    if has_slack(at, rows):
         slack = max(number, 0.0) + least if equality else max(number, least)
         middle = mem.parameter / slack
         if begun.informed and not equality:
@@ -183,36 +177,35 @@ def begin_row(at, begun, stages, work, mem):
         elif not begun.informed:
             force = 0.0 if equality else middle
         work.now.slacks.slack[at] = slack
-    if has_excess(row, rows):
+    if has_excess(at, rows):
         work.now.slacks.excess[at] = max(slack - number, BARELY * least)
     far = WITHIN * price if price < inf else inf
     rows.force[at] = min(max(force, -far if equality else 0.0), far)
 
 
-def has_slack(row, rows):
+def has_slack(at, rows):
     """Whether a row has the slack of its lower side: all but equalities without a price."""
-    return rows.table[row, KIND] != EQUALITY or rows.table[row, PRICE] < inf
+    return rows.kinds[at] != EQUALITY or rows.prices[at] < inf
 
 
-def has_excess(row, rows):
+def has_excess(at, rows):
     """Whether a row has the slack of its upper side: rows with a price."""
-    return rows.table[row, PRICE] < inf
+    return rows.prices[at] < inf
 
 
-def regularised(row, rows):
+def regularised(at, rows):
     """Whether a row is an equality without a price."""
-    return rows.table[row, KIND] == EQUALITY and not rows.table[row, PRICE] < inf
+    return rows.kinds[at] == EQUALITY and not rows.prices[at] < inf
 
 
 def above(at, rows):
     """Distance of a row's multiplier from its lower bound."""
-    row = at % rows.size
-    return rows.force[at] + rows.table[row, PRICE] if rows.table[row, KIND] == EQUALITY else rows.force[at]
+    return rows.force[at] + rows.prices[at] if rows.kinds[at] == EQUALITY else rows.force[at]
 
 
 def below(at, rows):
     """Distance of a row's multiplier from its upper bound."""
-    return rows.table[at % rows.size, PRICE] - rows.force[at]
+    return rows.prices[at] - rows.force[at]
 
 
 # The loop.
@@ -302,8 +295,8 @@ def asked(stages, work):
     """The largest change of the multiplier of an equality without a price, times its row's size."""
     rows, largest = stages.rows, 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        if rows.live[at] != 0 and regularised(at % rows.size, rows):
-            largest = larger(largest, abs(work.step.force[at]) * rows.table[at % rows.size, SIZE])
+        if rows.live[at] != 0 and regularised(at, rows):
+            largest = larger(largest, abs(work.step.force[at]) * rows.sizes[at])
     return largest
 
 
@@ -350,10 +343,9 @@ def off_centre(stages, work, mem):
     rows, slacks, largest = stages.rows, work.now.slacks, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            if has_slack(row, rows):
+            if has_slack(at, rows):
                 largest = max(largest, abs(slacks.slack[at] * above(at, rows) - mem.parameter))
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 largest = max(largest, abs(slacks.excess[at] * below(at, rows) - mem.parameter))
     return largest
 
@@ -365,13 +357,13 @@ def models_with_barrier(stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         work.curves[at], work.corrections.slack[at], work.corrections.excess[at] = 0.0, 0.0, 0.0
         if rows.live[at] != 0:
-            row, width = at % rows.size, 0.0
-            if regularised(row, rows):
-                size = rows.table[row, SIZE]
+            width = 0.0
+            if regularised(at, rows):
+                size = rows.sizes[at]
                 width = mem.soft * SOFTNESS * size * size / mem.scale
             else:
                 width = slacks.slack[at] / above(at, rows)
-                if has_excess(row, rows):
+                if has_excess(at, rows):
                     width += slacks.excess[at] / below(at, rows)
             work.curves[at] = 1 / width
     pull_rows(False, work.corrections, stages, work, mem)
@@ -397,10 +389,10 @@ def pull_rows(beyond, corrections, stages, work, mem):
 @compact
 def residual_of(at, corrections, rows, work, mem):
     """Residual of a row in these equations: its value, minus slacks with the desired products."""
-    row, residual = at % rows.size, work.now.numbers[at]
-    if has_slack(row, rows):
+    residual = work.now.numbers[at]
+    if has_slack(at, rows):
         residual -= (mem.parameter - corrections.slack[at]) / above(at, rows)
-    if has_excess(row, rows):
+    if has_excess(at, rows):
         residual += (mem.parameter - corrections.excess[at]) / below(at, rows)
     return residual
 
@@ -429,10 +421,10 @@ def complete(beyond, corrections, out, stages, work, mem):
                 ahead += work.beyond[at]
             change = -work.curves[at] * ahead
             out.force[at] = change
-            if has_slack(row, rows):
+            if has_slack(at, rows):
                 wanted, dual, slack = mem.parameter - corrections.slack[at], above(at, rows), slacks.slack[at]
                 out.slacks.slack[at] = wanted / dual - slack - slack / dual * change
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 wanted, dual, excess = mem.parameter - corrections.excess[at], below(at, rows), slacks.excess[at]
                 out.slacks.excess[at] = wanted / dual - excess + excess / dual * change
 
@@ -459,12 +451,11 @@ def predict(least, stages, work, mem):
     average, after = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            if has_slack(row, rows):
+            if has_slack(at, rows):
                 distance = above(at, rows)
                 average += slacks.slack[at] * distance
                 after += (slacks.slack[at] + primal * step.slacks.slack[at]) * (distance + dual * step.force[at])
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 distance = below(at, rows)
                 average += slacks.excess[at] * distance
                 after += (slacks.excess[at] + primal * step.slacks.excess[at]) * (distance - dual * step.force[at])
@@ -492,11 +483,11 @@ def centre(stages, work, mem):
     ahead, dual_ahead = min(1.0, part + REACH), min(1.0, dual + REACH)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row, force = at % rows.size, dual_ahead * step.force[at]
-            if has_slack(row, rows):
+            force = dual_ahead * step.force[at]
+            if has_slack(at, rows):
                 product = (slacks.slack[at] + ahead * step.slacks.slack[at]) * (above(at, rows) + force)
                 work.others.slack[at] = corrections.slack[at] - lacking(product, mem)
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 product = (slacks.excess[at] + ahead * step.slacks.excess[at]) * (below(at, rows) - force)
                 work.others.excess[at] = corrections.excess[at] - lacking(product, mem)
     if not solve(False, work.others, work.gaps, stages, work, mem):
@@ -529,10 +520,9 @@ def longest(share, slacks, changes, stages):
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            if has_slack(row, rows) and changes.slack[at] < 0:
+            if has_slack(at, rows) and changes.slack[at] < 0:
                 part = min(part, -share * slacks.slack[at] / changes.slack[at])
-            if has_excess(row, rows) and changes.excess[at] < 0:
+            if has_excess(at, rows) and changes.excess[at] < 0:
                 part = min(part, -share * slacks.excess[at] / changes.excess[at])
     return part
 
@@ -543,10 +533,10 @@ def longest_dual(share, changes, stages):
     rows, part = stages.rows, 1.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row, change = at % rows.size, changes[at]
-            if has_slack(row, rows) and change < 0:
+            change = changes[at]
+            if has_slack(at, rows) and change < 0:
                 part = min(part, -share * above(at, rows) / change)
-            if has_excess(row, rows) and change > 0:
+            if has_excess(at, rows) and change > 0:
                 part = min(part, share * below(at, rows) / change)
     return part
 
@@ -680,9 +670,8 @@ def take(part, stages, work, mem):
     dual = longest_dual(boundary(mem), step.force, stages)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            rows.force[at] += (part if regularised(row, rows) else dual) * step.force[at]
-            if is_hard(row, rows):  # its product stays within a factor of the barrier parameter
+            rows.force[at] += (part if regularised(at, rows) else dual) * step.force[at]
+            if is_hard(at, rows):  # its product stays within a factor of the barrier parameter
                 middle = mem.parameter / work.tried.slacks.slack[at]
                 rows.force[at] = min(max(rows.force[at], middle / WIDE), WIDE * middle)
     for t in range(stages.steps + 1):
@@ -711,14 +700,14 @@ def go(part, about, changes, slacks, out, stages):
             good = good and isfinite(out.numbers[at])
             out.slacks.slack[at] = about.slacks.slack[at] + part * slacks.slack[at]
             out.slacks.excess[at] = about.slacks.excess[at] + part * slacks.excess[at]
-            if is_hard(at % rows.size, rows):
+            if is_hard(at, rows):
                 out.slacks.slack[at] = max(out.slacks.slack[at], out.numbers[at])
     return cost if good else nan
 
 
-def is_hard(row, rows):
+def is_hard(at, rows):
     """Whether a row is an inequality without a price."""
-    return rows.table[row, KIND] != EQUALITY and not rows.table[row, PRICE] < inf
+    return rows.kinds[at] != EQUALITY and not rows.prices[at] < inf
 
 
 def missed(at, point):
@@ -732,7 +721,7 @@ def off(point, stages):
     rows, total = stages.rows, gap_of(point, stages)
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            total += abs(missed(at, point)) / rows.table[at % rows.size, SIZE]
+            total += abs(missed(at, point)) / rows.sizes[at]
     return total
 
 
@@ -752,14 +741,13 @@ def merit_of(point, cost, stages, mem):
     rows, logarithms, paid = stages.rows, 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            if has_slack(row, rows):
+            if has_slack(at, rows):
                 logarithms += log(point.slacks.slack[at])
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 logarithms += log(point.slacks.excess[at])
-                both = rows.table[row, KIND] == EQUALITY
+                both = rows.kinds[at] == EQUALITY
                 slack = point.slacks.slack[at] if both else 0.0
-                paid += rows.table[row, PRICE] * (point.slacks.excess[at] + slack)
+                paid += rows.prices[at] * (point.slacks.excess[at] + slack)
     return cost + paid - mem.parameter * logarithms
 
 
@@ -775,12 +763,11 @@ def slope_of_merit(stages, work, mem):
                 slope += stages.models.gradient[t, N + i] * step.changes.controls[t, i]
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            price = rows.table[row, PRICE]
-            if has_slack(row, rows):
-                paid = price if rows.table[row, KIND] == EQUALITY else 0.0
+            price = rows.prices[at]
+            if has_slack(at, rows):
+                paid = price if rows.kinds[at] == EQUALITY else 0.0
                 slope += (paid - mem.parameter / slacks.slack[at]) * step.slacks.slack[at]
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 slope += (price - mem.parameter / slacks.excess[at]) * step.slacks.excess[at]
     return slope
 
@@ -861,11 +848,10 @@ def take_measures(stages, work, mem):
     mem.miss, mem.product = 0.0, 0.0
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] != 0:
-            row = at % rows.size
-            mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.table[row, SIZE])
-            if has_slack(row, rows):
+            mem.miss = larger(mem.miss, abs(missed(at, work.now)) / rows.sizes[at])
+            if has_slack(at, rows):
                 mem.product = larger(mem.product, slacks.slack[at] * above(at, rows))
-            if has_excess(row, rows):
+            if has_excess(at, rows):
                 mem.product = larger(mem.product, slacks.excess[at] * below(at, rows))
     # The product of margin and multiplier; for violated elastic rows, that of the other slack.
     mem.complementarity = (mem.product if mem.elastic != 0 else product) / mem.scale
@@ -885,10 +871,9 @@ def settle(tolerance, violation, begun, stages, work, mem):
     for at in range(rows.size * (stages.steps + 1)):
         rows.force[at] = 0.0
         if rows.live[at] != 0:
-            row = at % rows.size
-            size, price = rows.table[row, SIZE], rows.table[row, PRICE]
+            size, price = rows.sizes[at], rows.prices[at]
             rows.force[at] = min(max(begun.known[at], -price), price)
-            if rows.table[row, KIND] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
+            if rows.kinds[at] == LIMIT and rows.numbers[at] <= AT_LIMIT * size:
                 rows.force[at] = AT_LIMIT * mem.scale / size
     if isfinite(cost):
         look_with_own_costates(stages, plan, work.active.costates)
@@ -925,7 +910,7 @@ def settle_rows(tolerance, violation, stages, work, mem):
         if rows.held[at] == FREE:
             rows.force[at] = 0.0
         elif rows.held[at] == PAID:
-            rows.force[at] = copysign(rows.table[at % rows.size, PRICE], rows.force[at])
+            rows.force[at] = copysign(rows.prices[at], rows.force[at])
     memory.typical = mem.typical
     memory.cost = look(stages, active.plan, active.costates, 0.0)
     measure_plan(violation, stages, active, memory)
@@ -958,8 +943,8 @@ def settle_rows(tolerance, violation, stages, work, mem):
 @compact
 def first_state(at, rows, mem):
     """What a row does in the active set, by its value and multiplier."""
-    row, number, force = at % rows.size, rows.numbers[at], rows.force[at]
-    size, price, equality = rows.table[row, SIZE], rows.table[row, PRICE], rows.table[row, KIND] == EQUALITY
+    number, force = rows.numbers[at], rows.force[at]
+    size, price, equality = rows.sizes[at], rows.prices[at], rows.kinds[at] == EQUALITY
     if price < inf:
         violation = abs(number) if equality else -number
         if violation / size > 1 - abs(force) / price:
@@ -972,5 +957,5 @@ def farthest_from_target(rows, steps):
     largest = 0.0
     for at in range(rows.size * (steps + 1)):
         if rows.held[at] == HELD:
-            largest = larger(largest, abs(rows.numbers[at] - rows.table[at % rows.size, AIM]))
+            largest = larger(largest, abs(rows.numbers[at] - rows.targets[at]))
     return largest

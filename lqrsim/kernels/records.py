@@ -226,20 +226,27 @@ class StageRows(NamedTuple):
     """The rows of all constraints, then those of the control limits, `size` at each step.
 
     Attributes:
-      table: (size, 7) properties of each row; see `stages.py`.
+      limits: (size, 3) for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and
+        its value.
       first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
       acts, live: ((T+1) size,) 1 for rows that can act, and for those that do at the plan, else 0.
       held: ((T+1) size,) what rows do in an active set; see `active_set.py`.
-      numbers: ((T+1) size,) values. force: ((T+1) size,) multipliers.
+      kinds: ((T+1) size,) INEQUALITY, LIMIT or EQUALITY. sizes: typical sizes. targets: the values at which rows are
+        held. prices: the largest multipliers, infinite unless the row is elastic.
+      numbers: ((T+1) size,) values. force: multipliers.
     """
 
     size: int
-    table: Arrays
+    limits: Arrays
     first: Arrays
     support: Arrays
     acts: Arrays
     live: Arrays
     held: Arrays
+    kinds: Arrays
+    sizes: Arrays
+    targets: Arrays
+    prices: Arrays
     numbers: Arrays
     force: Arrays
 

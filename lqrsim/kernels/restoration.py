@@ -18,9 +18,7 @@ from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.rollouts import copy_plan, larger
 from lqrsim.kernels.stages import (
     EQUALITY,
-    KIND,
     LIMIT,
-    SIZE,
     closed_loop_rollout,
     look,
     moved,
@@ -208,10 +206,10 @@ def model_penalties(price, stages, work, mem):
         work.curves[at] = 0.0
         if rows.live[at] == 0:
             continue
-        row, number = at % rows.size, rows.numbers[at]
-        limit, highest = rows.table[row, KIND] == LIMIT, price / rows.table[row, SIZE]
-        lowest = -highest if rows.table[row, KIND] == EQUALITY else 0.0
-        slack, excess = slacks_of(row, number, price, parameter, rows)
+        number = rows.numbers[at]
+        limit, highest = rows.kinds[at] == LIMIT, price / rows.sizes[at]
+        lowest = -highest if rows.kinds[at] == EQUALITY else 0.0
+        slack, excess = slacks_of(at, number, price, parameter, rows)
         room = number if limit else slack
         rows.force[at] = lowest + parameter / room
         if mem.informed == 0:
@@ -224,15 +222,15 @@ def model_penalties(price, stages, work, mem):
         middle = parameter / excess
         high = min(max(highest - work.duals[at], middle / WIDE), middle * WIDE)
         own = 1 / (room / low + excess / high)
-        both = 2 * excess if rows.table[row, KIND] == EQUALITY else slack + excess
+        both = 2 * excess if rows.kinds[at] == EQUALITY else slack + excess
         work.curves[at] = own + min(mem.damping, 1.0) * max(parameter / (slack * both) - own, 0.0)
     mem.informed = 1.0
 
 
-def slacks_of(row, number, price, parameter, rows):
+def slacks_of(at, number, price, parameter, rows):
     """The two slacks of a row, whose difference is its value, that minimise price and barrier."""
-    steep = price / rows.table[row, SIZE]
-    if rows.table[row, KIND] == EQUALITY:
+    steep = price / rows.sizes[at]
+    if rows.kinds[at] == EQUALITY:
         steep *= 2
     size, root = steep * abs(number), hypot(steep * number, 2 * parameter)
     rest = 4 * parameter * parameter / (root + size)  # root - size, without cancelling
@@ -249,13 +247,12 @@ def penalized(cost, numbers, price, stages, mem):
     for at in range(rows.size * (stages.steps + 1)):
         if rows.live[at] == 0:
             continue
-        row = at % rows.size
-        if rows.table[row, KIND] == LIMIT:
+        if rows.kinds[at] == LIMIT:
             total -= parameter * log(numbers[at])
             continue
-        slack, excess = slacks_of(row, numbers[at], price, parameter, rows)
-        paid = excess + slack if rows.table[row, KIND] == EQUALITY else excess
-        total += price / rows.table[row, SIZE] * paid - parameter * (log(slack) + log(excess))
+        slack, excess = slacks_of(at, numbers[at], price, parameter, rows)
+        paid = excess + slack if rows.kinds[at] == EQUALITY else excess
+        total += price / rows.sizes[at] * paid - parameter * (log(slack) + log(excess))
     return total if isfinite(total) else inf
 
 
@@ -265,10 +262,9 @@ def judge(stages, work, mem):
     rows, relative = stages.rows, 0.0
     mem.violation = 0.0
     for at in range(rows.size * (stages.steps + 1)):
-        row = at % rows.size
-        if rows.live[at] != 0 and rows.table[row, KIND] != LIMIT:
-            missed = abs(rows.numbers[at]) if rows.table[row, KIND] == EQUALITY else -rows.numbers[at]
-            mem.violation, relative = larger(mem.violation, missed), larger(relative, missed / rows.table[row, SIZE])
+        if rows.live[at] != 0 and rows.kinds[at] != LIMIT:
+            missed = abs(rows.numbers[at]) if rows.kinds[at] == EQUALITY else -rows.numbers[at]
+            mem.violation, relative = larger(mem.violation, missed), larger(relative, missed / rows.sizes[at])
     mem.near = 1.0 if relative < CLOSE else 0.0
     settled = relative < CLOSE and abs(mem.before - mem.cost) < SLOW * abs(mem.cost)
     mem.close = mem.close + 1 if settled else 0.0
@@ -281,8 +277,7 @@ def share_price(price, stages, work):
     """Write the multipliers after the step relative to the price, from -1 to 1; 0 for limits."""
     rows = stages.rows
     for at in range(rows.size * (stages.steps + 1)):
-        row = at % rows.size
         work.shares[at] = 0.0
-        if rows.live[at] != 0 and rows.table[row, KIND] != LIMIT:
-            lowest = -1.0 if rows.table[row, KIND] == EQUALITY else 0.0
-            work.shares[at] = min(max(work.aims[at] * rows.table[row, SIZE] / price, lowest), 1.0)
+        if rows.live[at] != 0 and rows.kinds[at] != LIMIT:
+            lowest = -1.0 if rows.kinds[at] == EQUALITY else 0.0
+            work.shares[at] = min(max(work.aims[at] * rows.sizes[at] / price, lowest), 1.0)

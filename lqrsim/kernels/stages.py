@@ -45,11 +45,8 @@ SLOWEST = 1e-6  # least effect of a control without limits, relative to the stat
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
-# Columns of `StageRows.table`: the kind of a row; its typical size; its target value in the active set; for a limit,
-# the control, 1 for a lower or -1 for an upper limit, and its value; and the largest multiplier, infinite unless the
-# row is elastic.
-KIND, SIZE, AIM, CONTROL, SIGN, SIDE, PRICE = 0, 1, 2, 3, 4, 5, 6
-INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
+CONTROL, SIGN, SIDE = 0, 1, 2  # columns of `StageRows.limits`
+INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
 def look(stages, plan, costates, least):
@@ -209,9 +206,10 @@ def read_rows(stages, plan, numbers):
             for row in range(count):
                 numbers[rows.size * t + int(rows.first[k]) + row] = values[k][count * t + row]
         for row in range(rows.size):
-            if rows.table[row, KIND] == LIMIT:
-                number = u[int(rows.table[row, CONTROL])] - rows.table[row, SIDE]
-                numbers[rows.size * t + row] = rows.table[row, SIGN] * number
+            at = rows.size * t + row
+            if rows.kinds[at] == LIMIT:
+                number = u[int(rows.limits[row, CONTROL])] - rows.limits[row, SIDE]
+                numbers[at] = rows.limits[row, SIGN] * number
 
 
 def survey(stages, plan):
@@ -274,7 +272,9 @@ def typical_sizes(stages, plan, hessian):
             for i in range(W):
                 far = models.slopes[at, i] * size_of(i, stages)
                 total += far * far
-        rows.table[row, SIZE] = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
+        size = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
+        for t in range(steps + 1):
+            rows.sizes[rows.size * t + row] = size
     cost = 0.0
     for t in range(steps + 1):
         for i in range(W):
@@ -336,11 +336,11 @@ def measure(stages, plan, numbers, gaps):
             at = rows.size * t + row
             if rows.live[at] == 0:
                 continue
-            if rows.table[row, KIND] == EQUALITY:
+            if rows.kinds[at] == EQUALITY:
                 unequal = larger(unequal, abs(numbers[at]))
             else:
                 missed = larger(missed, -numbers[at])
-                if not rows.table[row, PRICE] < inf:
+                if not rows.prices[at] < inf:
                     product = larger(product, abs(numbers[at]) * rows.force[at])
     for i in range(N):
         steepest = larger(steepest, abs(after[i]) * stages.state_size[i] * stages.free[i])

@@ -9,7 +9,6 @@ from lqrsim.errors import Array
 from lqrsim.kernels.active_set import BEGIN, FIRMNESS, PIVOT, PREPARE, ROLL_OUT, TAKE
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
 from lqrsim.kernels.records import Motion
-from lqrsim.kernels.stages import SIZE
 from lqrsim.solvers.interior_point import Measures
 from lqrsim.solvers.settings import INSIDE
 from lqrsim.solvers.stages import Stages
@@ -97,10 +96,10 @@ class ActiveSet:
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Multipliers (T+1, rows) and penalty of each constraint."""
-        owners, table, scale = self.stages.owners, self.stages.about.rows.table, float(self._memory["scale"][0])
+        owners, scale = self.stages.owners, float(self._memory["scale"][0])
         found = []
         for k in range(len(self.stages.problem.constraint_terms)):
-            sizes = table[owners == k, SIZE]
+            sizes = self.stages.row_sizes[owners == k]
             price = FIRMNESS * scale / float(np.median(sizes**2)) if len(sizes) else 1.0
             found.append((self.force[:, owners == k].copy(), price))
         return found

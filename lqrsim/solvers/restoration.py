@@ -10,7 +10,6 @@ from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import NO_PROGRESS, NOT_FINITE, RUNNING
 from lqrsim.kernels.records import RESTORED, Motion
-from lqrsim.kernels.stages import SIZE
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.solvers.budget import ATTENTION
 from lqrsim.solvers.stages import Sizes, Stages
@@ -46,8 +45,7 @@ def restore(
       None if a trajectory is not finite, or there is no step.
     """
     work, memory = stages.restoration
-    stages.about.state_size[...], stages.about.control_size[...] = sizes.states, sizes.controls
-    stages.about.rows.table[:, SIZE] = sizes.rows
+    stages.resize(sizes)
     work.plan.states[...], work.plan.controls[...] = plan
     log, price = np.zeros(most, RESTORED), float(price * sizes.cost)
     functions = functions_of(stages.problem)

@@ -40,7 +40,7 @@ from lqrsim.kernels.records import (
     StageRows,
     StructuredArray,
 )
-from lqrsim.kernels.stages import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, PRICE, SIDE, SIGN, SIZE
+from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, SIDE, SIGN
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
@@ -77,7 +77,8 @@ class Stages:
         self._calls: dict[str, Call] = {}
         zeros, unread, rows = np.zeros, cast(ProblemModel, None), sum(counts) + len(lower) + len(upper)
         self.slopes, self.numbers = zeros((steps + 1, rows, n + m)), zeros((steps + 1, rows))
-        self.force, self.held, self._live, self._acts = (zeros((steps + 1, rows)) for _ in range(4))
+        of_rows = [zeros((steps + 1, rows)) for _ in range(8)]
+        self._acts, self._live, self.held, self._kinds, self._sizes, self._targets, self._prices, self.force = of_rows
         self.models = StageModels(
             zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m)),
             zeros((steps, n, n + m)), zeros((steps, n)), self.slopes.reshape(-1, n + m),
@@ -86,9 +87,9 @@ class Stages:
             steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), unread,
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
-                rows, zeros((rows, PRICE + 1)), np.cumsum([0, *counts])[:-1].astype(np.float64),
+                rows, zeros((rows, 3)), np.cumsum([0, *counts])[:-1].astype(np.float64),
                 zeros((rows, n + m)),
-                *(one.reshape(-1) for one in (self._acts, self._live, self.held, self.numbers, self.force)),
+                *(one.reshape(-1) for one in (*of_rows[:-1], self.numbers, self.force)),
             ),
             self.models, Policy(zeros((steps, m, n)), zeros((steps, m))),
             CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
@@ -122,20 +123,19 @@ class Stages:
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         if problem.goal is not None and problem.start is not None:
             self.about.reach[...] = np.abs(np.nan_to_num(problem.goal - problem.start))
-        table = self.about.rows.table
         limit = self.owners == -1
-        table[:, KIND] = np.where(self.equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
-        table[:, SIZE], table[:, PRICE] = 1.0, np.inf
+        self._kinds[...] = np.where(self.equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
+        self._sizes[...], self._prices[...] = 1.0, np.inf
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
-            table[row, [CONTROL, SIGN, SIDE]] = i, sign, side
+            self.about.rows.limits[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
     def state(self, *, price: float | Array | None = None, margin: float | None = None) -> None:
         """State prices of violations, in cost per unit, for all or each of the rows; or a margin. Limits have none."""
-        table, limit = self.about.rows.table, self.owners == -1
+        limit = self.owners == -1
         if price is not None:
-            table[:, PRICE] = np.where(limit, np.inf, price)
+            self._prices[...] = np.where(limit, np.inf, price)
         if margin is not None:
-            table[:, AIM] = np.where(limit | self.equality, 0.0, margin)
+            self._targets[...] = np.where(limit | self.equality, 0.0, margin)
 
     @property
     def free(self) -> Array:
@@ -225,7 +225,17 @@ class Stages:
         """The sizes that a kernel has just written, with the cost that it returned."""
         self.live[...] = self._live > 0
         about = self.about
-        return Sizes(about.state_size.copy(), about.control_size.copy(), about.rows.table[:, SIZE].copy(), cost)
+        return Sizes(about.state_size.copy(), about.control_size.copy(), self.row_sizes.copy(), cost)
+
+    @property
+    def row_sizes(self) -> Array:
+        """(R,) typical sizes of the rows."""
+        return self._sizes[0]
+
+    def resize(self, sizes: Sizes) -> None:
+        """Use other typical sizes."""
+        self.about.state_size[...], self.about.control_size[...] = sizes.states, sizes.controls
+        self._sizes[...] = sizes.rows
 
     def spread(self, rows: Array) -> Array:
         """Numbers of the live rows (K,) at their places in (T+1, R); others are zero."""
