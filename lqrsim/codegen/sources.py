@@ -2,8 +2,8 @@
 
 A `Source` is a module or a text. A module of `lqrsim/kernels` is all kernels; that of a cost or constraint has its
 kernels beside its class. Open names are filled in: constants, such as the indices of the position, and functions, such
-as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in
-a source, for the printer to LLVM IR (`printer.py`) and for plain Python (`plain.py`).
+as the centres of balls. No text is joined or renamed: a `Scope` resolves the names in a source, for the printer to LLVM
+IR (`printer.py`) and for plain Python (`plain.py`).
 """
 
 import ast
@@ -28,7 +28,6 @@ WORDS = (
     "stack", "zeros", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
     "power_of_two", "inline", "outline", "compact", "exact",
 )  # fmt: skip
-PACKAGE = __name__.partition(".")[0]
 PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
 
 Constant = bool | int | float | tuple[Any, ...]
@@ -96,14 +95,14 @@ def source_of(module: ModuleType | str, **constants: Constant) -> Source:
       InputError: the module is no file that was imported, or declares no such constant.
     """
     check_kind("source_of: module", module, (str, ModuleType), "__name__, in the file of a cost or constraint")
-    home = sys.modules.get(module) if isinstance(module, str) else module
+    name = module if isinstance(module, str) else module.__name__
+    home = sys.modules.get(name)
     if not getattr(home, "__file__", None):
         raise InputError(f"source_of: module: got {excerpt(module)}, want a file that was imported; or a text for it")
-    for name, number in constants.items():
-        if not (_is_constant(getattr(home, name, None)) and _is_constant(number)):
+    for constant, number in constants.items():
+        if not (_is_constant(getattr(home, constant, None)) and _is_constant(number)):
             want = "a number or a tuple of numbers, in place of one that the file declares"
-            raise InputError(f"source_of: {name}: got {excerpt(number)}, want {want}")
-    name = str(getattr(home, "__name__", ""))
+            raise InputError(f"source_of: {constant}: got {excerpt(number)}, want {want}")
     return Source(name, constants=tuple(sorted(constants.items())), what=name)
 
 
@@ -314,7 +313,7 @@ def _text_of(module: str) -> str:
     """What defines a module's kernels: its functions, and the constants in them, for what else stands in a user's file
     changes no compiled code. Of a module of the package it is the whole text, which need not be parsed.
     """
-    if module.startswith(f"{PACKAGE}."):
+    if module.startswith(__name__.partition(".")[0] + "."):
         return _module_text(module)
     home, parsed = importlib.import_module(module), _parsed_module(module)
     names = {node.id for own in parsed.functions.values() for node in ast.walk(own) if isinstance(node, ast.Name)}
