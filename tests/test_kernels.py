@@ -44,8 +44,8 @@ from lqrsim.kernels import (
     certificate,
     cost_to_come_dual,
     cost_to_come_primal,
-    damped_iterations,
     declarations,
+    descent,
     estimation,
     exponential,
     iterations,
@@ -62,6 +62,7 @@ from lqrsim.kernels import (
     state_bound,
 )
 from lqrsim.kernels import stages as stage_kernels
+from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
@@ -69,6 +70,7 @@ from lqrsim.kernels.records import (
     CostModel,
     CostToCome,
     CostToGo,
+    Descent,
     IlqrArrays,
     IterationSettings,
     Limits,
@@ -80,6 +82,7 @@ from lqrsim.kernels.records import (
     QuadraticStage,
     RiccatiArrays,
     SmootherGains,
+    StructuredArray,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
@@ -120,9 +123,8 @@ DIVIDED = {
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
-    "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
-    "newton_iterations", "newton_pass", "finish_at_plan", "convex_value_functions", "optimality",
-    "roll_out_and_keep",
+    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "take_step", "judge",
+    "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
 )  # fmt: skip
 
 
@@ -374,11 +376,11 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
         work.memory["plan_cost"] = np.inf  # or rounding decides which plan is the best, of two that are as good
         replay(source, sizes, "smoother", *with_rows(run._arguments(done, done + 1, log)), but=but)
     run.roll_out()
-    work.memory["merit"] = work.memory["plan_cost"]
-    work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
+    work.begin_descent(DAMPED_STEPS)
+    work.memory["reach"] = float(task != "reach")
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
-        arguments = run._plan_arguments(declarations.DAMP, done, done + 1, log)
+        arguments = steps_of(run, DAMPED_STEPS, done, done + 1, log)
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
@@ -437,7 +439,7 @@ class TestSolvers:
     def test_newton_to_its_end(self) -> None:
         """At once, where that is enough; and where a gap of nothing is asked for, after some more steps."""
         assert descended(problem(steps=3), tolerance=1e9) == declarations.CONVERGED
-        assert descended(problem(steps=3), tolerance=1e9, small_changes=9.0) == declarations.CONVERGED
+        assert descended(problem(steps=3), tolerance=1e9, more=9.0) == declarations.CONVERGED
         assert descended(problem(steps=3), merit=-1e9) == declarations.STALLED
 
     def test_controls_without_a_minimum_get_a_weight_on_their_changes(self) -> None:
@@ -463,10 +465,10 @@ class TestSolvers:
             replay(source, sizes, "ilqr", *with_rows(given))
 
     def test_what_is_done_after_failures(self) -> None:
-        for reach, weight in ((1.0, 0.0), (0.25, 0.0), (0.0, 1e-4)):
+        for share, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
             memory = np.zeros(1, MEMORY_ROW).view(np.recarray)
-            memory["reach"], memory["weight"], memory["ilqr_next"] = reach, weight, 2.0
-            replay(source_of(damped_iterations), SIZES, "tighten_damping", memory[0])
+            memory["share"], memory["reach"], memory["weight"], memory["ilqr_next"] = share, reach, weight, 2.0
+            replay(source_of(descent), SIZES, "tighten", DAMPED_STEPS, memory[0])
         model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
         for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
             model.noise.risk[1] = risk
@@ -508,11 +510,22 @@ class Begun:
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
-    def damped(self, first: int, last: int, task: int = declarations.DAMP, **memory: float) -> tuple[Any, ...]:
+    def descend(self, how: Descent, first: int, last: int, **memory: float) -> tuple[Any, ...]:
+        if first == 0:
+            self.work.begin_descent(how)
         for name, number in memory.items():
             self.work.memory[name] = number
-        given = self.run._plan_arguments(task, first, last, self.log)
+        return replay(self.source, self.sizes, "smoother", *with_rows(steps_of(self.run, how, first, last, self.log)))
+
+    def linearize(self) -> tuple[Any, ...]:
+        given = self.run._linearize_arguments(self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
+
+
+def steps_of(run: SolveRun, how: Descent, first: int, last: int, log: StructuredArray) -> tuple[Any, ...]:
+    """Arguments for steps from the plan."""
+    tolerance = run.final if how is NEWTON_STEPS else run.rough
+    return run._plan_arguments(declarations.DESCEND, how, tolerance, 0.0, first, last, log)
 
 
 def descended(
@@ -527,7 +540,7 @@ def descended(
     run = SolveRun(one, settings, resolve(None, one), begin, Budget(settings.max_iterations))
     run.smooth(1)
     work, log, outcome = run.work, np.zeros(count, LOG), declarations.RUNNING
-    work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
+    work.begin_descent(NEWTON_STEPS)
     for name, number in memory.items():
         work.memory[name] = number
     stage = work.model.stage
@@ -537,7 +550,7 @@ def descended(
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
-            arguments = run._plan_arguments(declarations.FINISH, done, done + 1, log)
+            arguments = steps_of(run, NEWTON_STEPS, done, done + 1, log)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     if not sizes["NOISY"]:
         found = run.result(run.ending)
@@ -634,19 +647,18 @@ class TestRareEnds:
         """A merit that no step can have; then with a weight, which grows, and falls again."""
         one = Begun(problem())
         one.run._loop(*one.run._arguments(0, 2, one.log))
-        cost = float(one.work.memory["plan_cost"])
-        assert one.damped(0, 3, merit=-1e9, reach=1.0, ilqr_next=2.0, plan_cost=cost)[1] == declarations.RUNNING
+        assert one.descend(DAMPED_STEPS, 0, 3, merit=-1e9)[1] == declarations.RUNNING
         assert one.log["method"][:3].tolist() == [declarations.REJECTED] * 3
         assert one.work.memory["reach"] == 0.0
         for weight in (1e-2, 1e-7):
-            one.damped(0, 1, merit=1e9, reach=0.0, weight=weight)
+            one.descend(DAMPED_STEPS, 0, 1, merit=1e9, reach=0.0, weight=weight)
             assert one.work.memory["weight"] == 0.1 * weight * (weight > 1e-6)
-        one.damped(0, 1, merit=1e9, reach=1.0, since_ilqr=float(declarations.PATIENCE))
+        one.descend(DAMPED_STEPS, 0, 1, merit=1e9, since_ilqr=float(descent.PATIENCE))
         assert one.work.memory["reach"] == 0.0
         # Only policy and value functions; of a plan that is no number there are none.
-        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (False, -1)
+        assert one.linearize()[2:] == (False, -1)
         one.work.arrays.best.states[2] = np.nan
-        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (True, 2)
+        assert one.linearize()[2:] == (True, 2)
 
     @pytest.mark.parametrize("noise", [False, *rarely(True)])
     def test_ends_of_ilqr(self, noise: bool) -> None:

@@ -31,16 +31,10 @@ ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), 
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
-ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5, 6
+ITERATE, DESCEND, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5
 
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
-
-# Number of damped iterations after which iLQR is tried.
-PATIENCE = 50
-# Relative improvements that may be rounding, and the number of iterations with only these after which damped ones
-# stall.
-ROUNDING, IDLE = 1e-11, 12
 
 
 # Words of the language; see `codegen/language.py`.

@@ -1,9 +1,9 @@
 """Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
 
-Each function runs the iterations `first` to `last` - 1, and can be called again to continue, because its state is in
-its arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the
-outcome (a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or
--1.
+Each function, as `descend` of `descent.py`, runs the iterations `first` to `last` - 1, and can be called again to
+continue, because its state is in its arrays. The log gets a row per iteration. All return four values: the number of
+iterations so far, the outcome (a name in `declarations.py`), whether a failed pass was the backward one, and
+the step at which it failed, or -1.
 """
 
 from math import inf, isnan, nan
