@@ -66,13 +66,12 @@ from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
+    NO_DESCENT,
     ActiveRows,
     CostModel,
     CostToCome,
     CostToGo,
     Descent,
-    IlqrArrays,
-    IterationSettings,
     Limits,
     LinearStep,
     Measurements,
@@ -450,19 +449,12 @@ class TestSolvers:
             )  # fmt: skip
 
     def test_ilqr(self) -> None:
-        one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
-        states, controls = np.zeros((6, 3)), np.zeros((5, 2))
-        states[0] = (0.0, 0.0, 0.3)
-        work = IlqrArrays(
-            start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
-            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), best=Motion(states, controls),
-            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
-        )  # fmt: skip
-        options = IterationSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
-        source, sizes = compiled.with_form("dual"), sizes_of(one)
-        for task in (declarations.ITERATE, declarations.CERTIFY):
-            given = task, 0, 3, options, compiled.arguments(one), work, np.zeros(4, LOG)
-            replay(source, sizes, "ilqr", *with_rows(given))
+        one = Begun(problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5), start=[0.2, 0.2])
+        assert one.ilqr(0, 3)[0] == 3
+        found = one.run.result(one.run.ending)
+        to_go, out = one.work.arrays.to_go, np.zeros(1, CERTIFICATE)
+        arguments = one.run._check_arguments(declarations.CERTIFY, found, to_go, out)
+        replay(one.source, one.sizes, "ilqr", *with_rows(arguments))
 
     def test_what_is_done_after_failures(self) -> None:
         for share, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
@@ -516,6 +508,12 @@ class Begun:
         for name, number in memory.items():
             self.work.memory[name] = number
         return replay(self.source, self.sizes, "smoother", *with_rows(steps_of(self.run, how, first, last, self.log)))
+
+    def ilqr(self, first: int, last: int, task: int = declarations.ITERATE, **memory: float) -> tuple[Any, ...]:
+        for name, number in memory.items():
+            self.work.memory[name] = number
+        given = self.run._plan_arguments(task, NO_DESCENT, self.run.final, 0.0, first, last, self.log)
+        return replay(self.source, self.sizes, "ilqr", *with_rows(given))
 
     def linearize(self) -> tuple[Any, ...]:
         given = self.run._linearize_arguments(self.log)
@@ -663,36 +661,24 @@ class TestRareEnds:
     @pytest.mark.parametrize("noise", [False, *rarely(True)])
     def test_ends_of_ilqr(self, noise: bool) -> None:
         given = {"noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.05} if noise else {}
-        one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given)
-        source, sizes, log = compiled.with_form("dual"), sizes_of(one), np.zeros(5, LOG)
-        model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
-        work = IlqrArrays(
-            start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
-            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), best=Motion(states, controls),
-            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
-        )  # fmt: skip
-        options = IterationSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
-
-        def iterate(first: int, last: int, task: int = declarations.ITERATE) -> Any:
-            given = task, first, last, options, model, work, log
-            return replay(source, sizes, "ilqr", *with_rows(given))
-
-        assert iterate(0, 2) == (2, declarations.RUNNING, False, -1)
-        assert iterate(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
-        log["cost"][1] = -np.inf  # lower than any
-        assert iterate(2, 3)[1] == (declarations.RUNNING if noise else declarations.STALLED)
+        one = Begun(problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given), start=[0.2, 0.2], tolerance=1e-9)
+        assert one.ilqr(0, 2) == (2, declarations.RUNNING, False, -1)
+        assert one.ilqr(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
+        # A cost that is lower than any.
+        assert one.ilqr(2, 3, plan_cost=-np.inf)[1] == (declarations.RUNNING if noise else declarations.STALLED)
         if noise:
             return
         # Without a minimum, changes of the controls get a weight.
-        model = model._replace(final=with_numbers(model.final, 0, 3, lambda weight: -2 * weight))
-        assert iterate(2, 3)[1] in (declarations.RUNNING, declarations.STALLED)
-        assert work.damping[0] > 0
-        plan = work.best.states.copy()
-        work.best.states[2] = np.nan
-        assert iterate(2, 3)[1:] == (declarations.NOT_FINITE, True, 2)
-        work.best.states[...] = plan
-        work.start[0] = np.nan
-        assert iterate(0, 1)[1] == declarations.NO_START
+        model = one.work.model
+        one.work.model = model._replace(final=with_numbers(model.final, 0, 3, lambda weight: -2 * weight))
+        assert one.ilqr(2, 3)[1] in (declarations.RUNNING, declarations.STALLED)
+        assert one.work.memory["weight"] > 0
+        plan = one.work.best.states.copy()
+        one.work.best.states[2] = np.nan
+        assert one.ilqr(2, 3)[1:] == (declarations.NOT_FINITE, True, 2)
+        one.work.best.states[...] = plan
+        one.work.start[0] = np.nan
+        assert one.ilqr(0, 1)[1] == declarations.NO_START
 
     def test_logs_that_cycle_or_do_not_fall(self) -> None:
         """Costs, and what is said of them."""

@@ -24,7 +24,7 @@ from lqrsim.kernels.declarations import (
     zeros,
 )
 from lqrsim.kernels.descent import descend, judge
-from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
+from lqrsim.kernels.iterations import ilqr_iterations, relative_optimality, smoother_iterations
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
@@ -58,15 +58,16 @@ def smoother(task, first, last, settings, model, work, memory, log):
     return smoother_iterations(first, last, settings, model, work, memory[0], log)
 
 
-def ilqr(task, first, last, settings, model, work, log):
-    """Run iterations of iLQR; or linearise about the plan, or certify it, as `smoother` does."""
+def ilqr(task, first, last, settings, model, work, memory, log):
+    """Run iterations of iLQR; or linearise about the plan, or certify a plan, as `smoother` does."""
     if task >= CERTIFY:
-        certify(settings, task == EVALUATE, work.best, work.policy, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == LINEARIZE:
-        failed, _, _ = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        failed, _, left = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        log[0].optimality = relative_optimality(failed, left, memory[0].plan_cost, 0.0)
         return 0, RUNNING, failed >= 0, failed
-    return ilqr_iterations(first, last, settings, model, work, log)
+    return ilqr_iterations(first, last, settings, model, work, memory[0], log)
 
 
 def lq_passes(steps, dynamics, inverse, stages, constants, work):

@@ -305,6 +305,9 @@ class Descent(NamedTuple):
     patient: bool = True
 
 
+NO_DESCENT = Descent(method=0, changes=0)
+
+
 class IterationSettings(NamedTuple):
     """Limits of a solve's iterations, and tolerances of convergence.
 
@@ -326,7 +329,7 @@ class IterationSettings(NamedTuple):
     guided: bool
     prior_iterations: int
     valley: float = 0.0
-    descent: Descent = Descent(0, 0)
+    descent: Descent = NO_DESCENT
 
 
 class SmootherArrays(NamedTuple):
@@ -563,23 +566,6 @@ class RiccatiArrays(NamedTuple):
     x_hats: Arrays
 
 
-class IlqrArrays(NamedTuple):
-    """All arrays of iLQR.
-
-    Attributes:
-      best: the best trajectory so far. trial: that of a line search. damping: (1,) weight on changes of the controls.
-      certificate: (1,) row of `CERTIFICATE`.
-    """
-
-    start: Arrays
-    policy: Policy
-    to_go: CostToGo
-    best: Motion
-    trial: Motion
-    damping: Arrays
-    certificate: Arrays
-
-
 class Predictor(NamedTuple):
     """The model that predicts estimates over a control period; see `estimation.py`.
 
@@ -632,8 +618,8 @@ def _row(*names: str) -> np.dtype[np.void]:
 # Of a descent: small_changes: number of small changes of cost in a row; idle: number of steps in a row that improved by
 # rounding. failed: the step at which the last pass failed, or -1. negligible: the negligible cost; least: the least
 # cost to which an optimality is relative. final_gap: gap between smoothed states and plan at the end.
-# Of damped steps: reach of the next; weight on changes of the controls; for steps at reach 0, iLQR's, how many remain,
-# how many there will be the next time, and how many others there were since.
+# Of damped steps: reach of the next; weight on changes of the controls, which iLQR has, too; for steps at reach 0,
+# iLQR's, how many remain, how many there will be the next time, and how many others there were since.
 # Of passes about the plan: known: 1 if the next step's was made; its fraction of second-order terms (share), weight on
 # changes of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the
 # merit (promised). more: number of steps that followed an optimal plan.

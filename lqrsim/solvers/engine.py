@@ -20,6 +20,7 @@ from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
     MEMORY,
+    NO_DESCENT,
     CostModel,
     CostToCome,
     CostToGo,
@@ -263,38 +264,40 @@ class SolveRun:
     """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: the start. work: the memory. budget: the iterations and the time.
+      initial_guess: the start. work: the memory. budget: the iterations and the time. entry: the compiled function.
       ending: the state of smoothing; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
         the smoothing before it; see `SmootherSettings`.
     """
 
     def __init__(
-        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
-    ) -> None:
-        self.problem, self.settings = problem, settings
+        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
+        entry: str = "smoother",
+    ) -> None:  # fmt: skip
+        self.problem, self.settings, self.entry = problem, settings, entry
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
         self.work = Workspace(problem, settings, initial_guess, start)
         self._begin(initial_guess, budget)
-        self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._rows))
+        self._loop = self.work.core.lay_out(entry, *self._arguments(0, 0, self._rows))
 
     @classmethod
     def lent(
-        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
-    ) -> "SolveRun":
+        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
+        entry: str = "smoother",
+    ) -> "SolveRun":  # fmt: skip
         """A run, if possible in memory that an earlier solve gave back, because allocating takes time.
 
         The run overwrites the result of the earlier solve, which must have been copied.
         """
-        core, steps = compiled.core(problem, settings.form), problem.steps
+        wanted = entry, compiled.core(problem, settings.form), problem.steps
         with _lending:
-            fitting = (one for one in reversed(_idle) if one.work.core is core and one.problem.steps == steps)
+            fitting = (one for one in reversed(_idle) if (one.entry, one.work.core, one.problem.steps) == wanted)
             run = next(fitting, None) if settings.first_pass == "forward" else None
             if run is not None:
                 _idle.remove(run)
         if run is None:
-            return cls(problem, settings, initial_guess, start, budget)
+            return cls(problem, settings, initial_guess, start, budget, entry)
         run.problem, run.settings = problem, settings
         run.work.begin(problem, settings, initial_guess, start)
         run._begin(initial_guess, budget)
@@ -451,6 +454,11 @@ class SolveRun:
         """Steps from the best plan so far; `gap_tolerance` is the least, for the rest see `Workspace.begin_descent`."""
         self.work.begin_descent(how, added, least)
         arguments = partial(self._plan_arguments, declarations.DESCEND, how, tolerance, gap_tolerance)
+        return self._iterate(arguments, self.work.best)
+
+    def ilqr(self) -> Ending:
+        """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr"."""
+        arguments = partial(self._plan_arguments, declarations.ITERATE, NO_DESCENT, self.final, 0.0)
         return self._iterate(arguments, self.work.best)
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
