@@ -45,8 +45,8 @@ from lqrsim.kernels import (
     certificate,
     cost_to_come_dual,
     cost_to_come_primal,
-    damped_iterations,
     declarations,
+    descent,
     estimation,
     exponential,
     interior_point,
@@ -65,16 +65,17 @@ from lqrsim.kernels import (
     sphere_centers,
 )
 from lqrsim.kernels import stages as stage_kernels
+from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
     MEASURES,
+    NO_DESCENT,
     RESTORED,
     CostModel,
     CostToCome,
     CostToGo,
-    IlqrArrays,
-    IterationSettings,
+    Descent,
     Limits,
     LinearStep,
     Measurements,
@@ -85,6 +86,7 @@ from lqrsim.kernels.records import (
     QuadraticStage,
     RiccatiArrays,
     SmootherGains,
+    StructuredArray,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
@@ -147,9 +149,8 @@ DIVIDED = {
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
-    "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
-    "newton_iterations", "newton_pass", "finish_at_plan", "convex_value_functions", "optimality",
-    "roll_out_and_keep",
+    "smoother_iterations", "descend", "smoothing_step", "newton_step", "pass_about_plan", "take_step", "judge",
+    "value_functions_at_plan", "convex_value_functions", "optimality", "roll_out_and_keep",
 )  # fmt: skip
 
 
@@ -409,11 +410,11 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
         work.memory["plan_cost"] = np.inf  # or rounding decides which plan is the best, of two that are as good
         replay(source, sizes, "smoother", *with_rows(run._arguments(done, done + 1, log)), but=but)
     run.roll_out()
-    work.memory["merit"] = work.memory["plan_cost"]
-    work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
+    work.begin_descent(DAMPED_STEPS)
+    work.memory["reach"] = float(task != "reach")
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
-        arguments = run._plan_arguments(declarations.DAMP, done, done + 1, log)
+        arguments = steps_of(run, DAMPED_STEPS, done, done + 1, log)
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
@@ -472,7 +473,7 @@ class TestSolvers:
     def test_newton_to_its_end(self) -> None:
         """At once, where that is enough; and where a gap of nothing is asked for, after some more steps."""
         assert descended(problem(steps=3), tolerance=1e9) == declarations.CONVERGED
-        assert descended(problem(steps=3), tolerance=1e9, small_changes=9.0) == declarations.CONVERGED
+        assert descended(problem(steps=3), tolerance=1e9, more=9.0) == declarations.CONVERGED
         assert descended(problem(steps=3), merit=-1e9) == declarations.STALLED
 
     def test_controls_without_a_minimum_get_a_weight_on_their_changes(self) -> None:
@@ -483,25 +484,18 @@ class TestSolvers:
             )  # fmt: skip
 
     def test_ilqr(self) -> None:
-        one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
-        states, controls = np.zeros((6, 3)), np.zeros((5, 2))
-        states[0] = (0.0, 0.0, 0.3)
-        work = IlqrArrays(
-            start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
-            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), best=Motion(states, controls),
-            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
-        )  # fmt: skip
-        options = IterationSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
-        source, sizes = compiled.with_form("dual"), sizes_of(one)
-        for task in (declarations.ITERATE, declarations.CERTIFY):
-            given = task, 0, 3, options, compiled.arguments(one), work, np.zeros(4, LOG)
-            replay(source, sizes, "ilqr", *with_rows(given))
+        one = Begun(problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5), start=[0.2, 0.2])
+        assert one.ilqr(0, 3)[0] == 3
+        found = one.run.result(one.run.ending)
+        to_go, out = one.work.arrays.to_go, np.zeros(1, CERTIFICATE)
+        arguments = one.run._check_arguments(declarations.CERTIFY, found, to_go, out)
+        replay(one.source, one.sizes, "ilqr", *with_rows(arguments))
 
     def test_what_is_done_after_failures(self) -> None:
-        for reach, weight in ((1.0, 0.0), (0.25, 0.0), (0.0, 1e-4)):
+        for share, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
             memory = np.zeros(1, MEMORY_ROW).view(np.recarray)
-            memory["reach"], memory["weight"], memory["ilqr_next"] = reach, weight, 2.0
-            replay(source_of(damped_iterations), SIZES, "tighten_damping", memory[0])
+            memory["share"], memory["reach"], memory["weight"], memory["ilqr_next"] = share, reach, weight, 2.0
+            replay(source_of(descent), SIZES, "tighten", DAMPED_STEPS, memory[0])
         model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
         for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
             model.noise.risk[1] = risk
@@ -543,11 +537,28 @@ class Begun:
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
-    def damped(self, first: int, last: int, task: int = declarations.DAMP, **memory: float) -> tuple[Any, ...]:
+    def descend(self, how: Descent, first: int, last: int, **memory: float) -> tuple[Any, ...]:
+        if first == 0:
+            self.work.begin_descent(how)
         for name, number in memory.items():
             self.work.memory[name] = number
-        given = self.run._plan_arguments(task, first, last, self.log)
+        return replay(self.source, self.sizes, "smoother", *with_rows(steps_of(self.run, how, first, last, self.log)))
+
+    def ilqr(self, first: int, last: int, task: int = declarations.ITERATE, **memory: float) -> tuple[Any, ...]:
+        for name, number in memory.items():
+            self.work.memory[name] = number
+        given = self.run._plan_arguments(task, NO_DESCENT, self.run.final, 0.0, first, last, self.log)
+        return replay(self.source, self.sizes, "ilqr", *with_rows(given))
+
+    def linearize(self) -> tuple[Any, ...]:
+        given = self.run._linearize_arguments(self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
+
+
+def steps_of(run: SolveRun, how: Descent, first: int, last: int, log: StructuredArray) -> tuple[Any, ...]:
+    """Arguments for steps from the plan."""
+    tolerance = run.final if how is NEWTON_STEPS else run.rough
+    return run._plan_arguments(declarations.DESCEND, how, tolerance, 0.0, first, last, log)
 
 
 def descended(
@@ -562,7 +573,7 @@ def descended(
     run = SolveRun(one, settings, resolve(None, one), begin, Budget(settings.max_iterations))
     run.smooth(1)
     work, log, outcome = run.work, np.zeros(count, LOG), declarations.RUNNING
-    work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
+    work.begin_descent(NEWTON_STEPS)
     for name, number in memory.items():
         work.memory[name] = number
     stage = work.model.stage
@@ -572,7 +583,7 @@ def descended(
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
-            arguments = run._plan_arguments(declarations.FINISH, done, done + 1, log)
+            arguments = steps_of(run, NEWTON_STEPS, done, done + 1, log)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     if not sizes["NOISY"]:
         found = run.result(run.ending)
@@ -669,53 +680,40 @@ class TestRareEnds:
         """A merit that no step can have; then with a weight, which grows, and falls again."""
         one = Begun(problem())
         one.run._loop(*one.run._arguments(0, 2, one.log))
-        cost = float(one.work.memory["plan_cost"])
-        assert one.damped(0, 3, merit=-1e9, reach=1.0, ilqr_next=2.0, plan_cost=cost)[1] == declarations.RUNNING
+        assert one.descend(DAMPED_STEPS, 0, 3, merit=-1e9)[1] == declarations.RUNNING
         assert one.log["method"][:3].tolist() == [declarations.REJECTED] * 3
         assert one.work.memory["reach"] == 0.0
         for weight in (1e-2, 1e-7):
-            one.damped(0, 1, merit=1e9, reach=0.0, weight=weight)
+            one.descend(DAMPED_STEPS, 0, 1, merit=1e9, reach=0.0, weight=weight)
             assert one.work.memory["weight"] == 0.1 * weight * (weight > 1e-6)
-        one.damped(0, 1, merit=1e9, reach=1.0, since_ilqr=float(declarations.PATIENCE))
+        one.descend(DAMPED_STEPS, 0, 1, merit=1e9, since_ilqr=float(descent.PATIENCE))
         assert one.work.memory["reach"] == 0.0
         # Only policy and value functions; of a plan that is no number there are none.
-        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (False, -1)
+        assert one.linearize()[2:] == (False, -1)
         one.work.arrays.best.states[2] = np.nan
-        assert one.damped(0, 0, declarations.LINEARIZE)[2:] == (True, 2)
+        assert one.linearize()[2:] == (True, 2)
 
     @pytest.mark.parametrize("noise", [False, *rarely(True)])
     def test_ends_of_ilqr(self, noise: bool) -> None:
         given = {"noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.05} if noise else {}
-        one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given)
-        source, sizes, log = compiled.with_form("dual"), sizes_of(one), np.zeros(5, LOG)
-        model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
-        work = IlqrArrays(
-            start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
-            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), best=Motion(states, controls),
-            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
-        )  # fmt: skip
-        options = IterationSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
-
-        def iterate(first: int, last: int, task: int = declarations.ITERATE) -> Any:
-            given = task, first, last, options, model, work, log
-            return replay(source, sizes, "ilqr", *with_rows(given))
-
-        assert iterate(0, 2) == (2, declarations.RUNNING, False, -1)
-        assert iterate(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
-        log["cost"][1] = -np.inf  # lower than any
-        assert iterate(2, 3)[1] == (declarations.RUNNING if noise else declarations.STALLED)
+        one = Begun(problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given), start=[0.2, 0.2], tolerance=1e-9)
+        assert one.ilqr(0, 2) == (2, declarations.RUNNING, False, -1)
+        assert one.ilqr(0, 0, declarations.LINEARIZE) == (0, declarations.RUNNING, False, -1)
+        # A cost that is lower than any.
+        assert one.ilqr(2, 3, plan_cost=-np.inf)[1] == (declarations.RUNNING if noise else declarations.STALLED)
         if noise:
             return
         # Without a minimum, changes of the controls get a weight.
-        model = model._replace(final=with_numbers(model.final, 0, 3, lambda weight: -2 * weight))
-        assert iterate(2, 3)[1] in (declarations.RUNNING, declarations.STALLED)
-        assert work.damping[0] > 0
-        plan = work.best.states.copy()
-        work.best.states[2] = np.nan
-        assert iterate(2, 3)[1:] == (declarations.NOT_FINITE, True, 2)
-        work.best.states[...] = plan
-        work.start[0] = np.nan
-        assert iterate(0, 1)[1] == declarations.NO_START
+        model = one.work.model
+        one.work.model = model._replace(final=with_numbers(model.final, 0, 3, lambda weight: -2 * weight))
+        assert one.ilqr(2, 3)[1] in (declarations.RUNNING, declarations.STALLED)
+        assert one.work.memory["weight"] > 0
+        plan = one.work.best.states.copy()
+        one.work.best.states[2] = np.nan
+        assert one.ilqr(2, 3)[1:] == (declarations.NOT_FINITE, True, 2)
+        one.work.best.states[...] = plan
+        one.work.start[0] = np.nan
+        assert one.ilqr(0, 1)[1] == declarations.NO_START
 
     def test_logs_that_cycle_or_do_not_fall(self) -> None:
         """Costs, and what is said of them."""

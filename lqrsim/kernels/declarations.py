@@ -26,21 +26,18 @@ LONGEST_CYCLE = 8
 # number is reached if the method converges on the paper's queries:
 # `python experiments/benchmark_reliability.py --sections overhead`.
 NO_FALL, SLOW_FALL = 12, 30
+# The ladder of regularisation begins with fractions of the convex models in a mixture with those of second order, tried in
+# turn until one has a minimum. Weights on changes of the controls follow.
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)
 ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
 # Indices of a constraint's numbers in its array, and of its first multiplier; see `augmented_lagrangian.py`.
 PENALTY, ROWS, FIRST, MARGIN, PRICE, MULTIPLIERS = 0, 1, 2, 3, 4, 5
 
 # Tasks of the entry points; see `entry_points.py`.
-ITERATE, DAMP, FINISH, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5, 6
+ITERATE, DESCEND, LINEARIZE, CERTIFY, EVALUATE, CURVE = 0, 1, 2, 3, 4, 5
 
 # Methods of an iteration; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
-
-# Number of damped iterations after which iLQR is tried.
-PATIENCE = 50
-# Relative improvements that may be rounding, and the number of iterations with only these after which damped ones
-# stall.
-ROUNDING, IDLE = 1e-11, 12
 
 
 # Words of the language; see `codegen/language.py`.

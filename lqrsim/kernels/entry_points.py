@@ -8,13 +8,11 @@ from math import inf
 
 from lqrsim.kernels.certificate import certify, reduced_curvature
 from lqrsim.kernels.control_limits import riccati_backward
-from lqrsim.kernels.damped_iterations import damped_iterations, relinearize
 from lqrsim.kernels.declarations import (
     CERTIFY,
     CURVE,
-    DAMP,
+    DESCEND,
     EVALUATE,
-    FINISH,
     LINEARIZE,
     RUNNING,
     M,
@@ -25,9 +23,9 @@ from lqrsim.kernels.declarations import (
     stack,
     zeros,
 )
-from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
+from lqrsim.kernels.descent import descend, judge
+from lqrsim.kernels.iterations import ilqr_iterations, relative_optimality, smoother_iterations
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
-from lqrsim.kernels.newton_iterations import newton_iterations
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import Limits, LinearStep, QuadraticStage
 from lqrsim.kernels.rollouts import ilqr_pass
@@ -35,10 +33,10 @@ from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
-    """Run undamped, damped or Newton iterations; or do something else with a plan.
+    """Run undamped iterations, or a descent; or do something else with a plan.
 
     Args:
-      task: one of ITERATE, DAMP, FINISH; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
+      task: one of ITERATE, DESCEND; LINEARIZE, to compute policy and value functions about the best plan; CERTIFY,
         to certify the last policy and rollout with the Hessians of the cost-to-go; or EVALUATE, the same with Hessians
         of the policy itself, which overwrite them; or CURVE, to measure the curvature of the cost about that rollout.
       first, last: iterations to run, `last` excluded. The rest are records.
@@ -53,24 +51,23 @@ def smoother(task, first, last, settings, model, work, memory, log):
         certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == LINEARIZE:
-        _, failed = relinearize(settings, False, 0.0, model, work, memory[0], log[0])
-        return 0, RUNNING, failed >= 0, failed
-    if task == DAMP:
-        return damped_iterations(first, last, settings, model, work, memory[0], log)
-    if task == FINISH:
-        return newton_iterations(first, last, settings, model, work, memory[0], log)
+        judge(settings, False, False, model, work, memory[0], log[0])
+        return 0, RUNNING, memory[0].failed >= 0, int(memory[0].failed)
+    if task == DESCEND:
+        return descend(first, last, settings, model, work, memory[0], log)
     return smoother_iterations(first, last, settings, model, work, memory[0], log)
 
 
-def ilqr(task, first, last, settings, model, work, log):
-    """Run iterations of iLQR; or linearise about the plan, or certify it, as `smoother` does."""
+def ilqr(task, first, last, settings, model, work, memory, log):
+    """Run iterations of iLQR; or linearise about the plan, or certify a plan, as `smoother` does."""
     if task >= CERTIFY:
-        certify(settings, task == EVALUATE, work.best, work.policy, work.to_go, model, work.certificate[0])
+        certify(settings, task == EVALUATE, work.last, work.last_policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == LINEARIZE:
-        failed, _, _ = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        failed, _, left = ilqr_pass(settings.steps, work.best, model, 0.0, work.policy, work.to_go)
+        log[0].optimality = relative_optimality(failed, left, memory[0].plan_cost, 0.0)
         return 0, RUNNING, failed >= 0, failed
-    return ilqr_iterations(first, last, settings, model, work, log)
+    return ilqr_iterations(first, last, settings, model, work, memory[0], log)
 
 
 def lq_passes(steps, dynamics, inverse, stages, constants, work):

@@ -89,7 +89,7 @@ EDGE = 0.05  # distance of the first controls from their limits, relative to the
 BARELY = 1e-3  # least first excess, relative to the least first slack
 WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor from the barrier's, that they may reach
 CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
-NEGLIGIBLE = 1e-10  # multiplier that counts as zero in the Hessians, relative to the cost
+NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
 
 # Tasks of `interior_point`: to choose slacks and multipliers at a plan; to take steps without a barrier from there; to
 # iterate; and to cross over, because no iteration follows.

@@ -1,9 +1,9 @@
 """Iterations of LQR smoothing and of iLQR, all in compiled code. Written in the kernels' subset.
 
-Each function runs the iterations `first` to `last` - 1, and can be called again to continue, because its state is in
-its arrays. The log gets a row per iteration. All functions return four values: the number of iterations so far, the
-outcome (a name in `declarations.py`), whether a failed pass was the backward one, and the step at which it failed, or
--1.
+Each function, as `descend` of `descent.py`, runs the iterations `first` to `last` - 1, and can be called again to
+continue, because its state is in its arrays. The log gets a row per iteration. All return four values: the number of
+iterations so far, the outcome (a name in `declarations.py`), whether a failed pass was the backward one, and
+the step at which it failed, or -1.
 """
 
 from math import inf, isnan, nan
@@ -222,7 +222,7 @@ def outcome_of(settled, settings, left, cost, full):
     return RUNNING
 
 
-def ilqr_iterations(first, last, settings, model, work, log):
+def ilqr_iterations(first, last, settings, model, work, memory, log):
     """Iterative LQR: a backward pass about a feasible trajectory and a line search in each iteration.
 
     Far outside an arena costs reach 1e20, and rounding makes the backward pass's matrices indefinite. Only then do
@@ -230,34 +230,34 @@ def ilqr_iterations(first, last, settings, model, work, log):
 
     Args:
       settings: IterationSettings. model: ProblemModel.
-      work: IlqrArrays. The policy makes the first trajectory. Afterwards the plan is the best trajectory, with the
+      work: SmootherArrays. The policy makes the first trajectory. Afterwards the plan is the best trajectory, with the
         policy relative to it and the cost-to-go about it.
-      log: rows of LOG; the last row has the cost that the first iteration improves on.
+      memory: row of MEMORY, with the plan's cost and the weight.
     """
-    steps, policy, plan, to_go, damping = settings.steps, work.policy, work.best, work.to_go, work.damping
+    steps, policy, plan, to_go = settings.steps, work.policy, work.best, work.to_go
     no_shift = zeros(N)
     if first == 0:
         cost = rollout(steps, work.start, policy, model, plan)
-        log[settings.max_iterations].cost = cost
+        memory.plan_cost = cost
         if not abs(cost) < inf:
             return 0, NO_START, False, -1
-    cost = log[first - 1 if first > 0 else settings.max_iterations].cost
+    cost, damping = memory.plan_cost, memory.weight
     for done in range(first, last):
-        damping[0] *= 0.1
-        failed, good, _ = ilqr_pass(steps, plan, model, damping[0], policy, to_go)
-        while failed >= 0 and good and damping[0] < 1e25:
-            damping[0] = max(10 * damping[0], 1.0)
-            failed, good, _ = ilqr_pass(steps, plan, model, damping[0], policy, to_go)
+        damping *= 0.1
+        failed, good, _ = ilqr_pass(steps, plan, model, damping, policy, to_go)
+        while failed >= 0 and good and damping < 1e25:
+            damping = max(10 * damping, 1.0)
+            failed, good, _ = ilqr_pass(steps, plan, model, damping, policy, to_go)
         if failed >= 0:
             return done, failure(good, model), True, failed
-        if not damping[0] > 1.0:
-            damping[0] = 0.0
+        if not damping > 1.0:
+            damping = 0.0
         if NOISY:  # with the new policy's cost-to-go
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
-        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.trial)
+        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.last)
         if fraction > 0:
-            copy_plan(steps, work.trial, plan)
+            copy_plan(steps, work.last, plan)
         improvement = relative_improvement(old, cost, 0.0)
         settled = abs(improvement) < settings.tolerance
         left = nan
@@ -266,6 +266,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
+        memory.plan_cost, memory.weight = cost, damping
         write_row(log[done], cost, improvement, 0.0, left, 0.0, ILQR)
         outcome = outcome_of(settled, settings, left, cost, done + 1 == settings.max_iterations)
         if outcome == RUNNING and fraction == 0:

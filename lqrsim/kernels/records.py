@@ -4,6 +4,7 @@ T is the number of steps. Kernels see an array as a pointer to blocks of constan
 table of addresses; see `codegen/language.py`. An address is a float64, which represents all integers up to 2^53.
 """
 
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -421,6 +422,39 @@ class EliminatedControl(NamedTuple):
     size: Arrays
 
 
+class Descent(NamedTuple):
+    """How steps from a plan are made, accepted and regularised; see `descent.py`.
+
+    Attributes:
+      method: DAMPED or NEWTON.
+      changes: number of small changes of cost in a row after which the plan is judged; 0 to judge each plan.
+      idle: number of steps in a row that improve by rounding which ends the descent.
+      share: fraction of second-order terms in the first models of a plan. reach: that of the first step.
+      smallest, armijo: the smallest fraction of a step that the line search tries, and the fraction of the predicted
+        decrease that a step must achieve; of models at reach 0 without second-order terms SHORTEST and 0, if `patient`.
+      lightest, factor: the first weight on changes of the controls, for Newton's method relative to the merit and for
+        damped steps to their curvature; and the factor to the next.
+      weights: number of weights that are tried where a pass fails. heaviest: largest weight that is tried where steps
+        are rejected.
+    """
+
+    method: int
+    changes: int
+    idle: float = inf
+    share: float = 0.0
+    reach: float = 0.0
+    smallest: float = 0.0
+    armijo: float = 0.0
+    lightest: float = 0.0
+    factor: float = 0.0
+    weights: int = 0
+    heaviest: float = 0.0
+    patient: bool = True
+
+
+NO_DESCENT = Descent(method=0, changes=0)
+
+
 class IterationSettings(NamedTuple):
     """Limits of a solve's iterations, and tolerances of convergence.
 
@@ -430,6 +464,7 @@ class IterationSettings(NamedTuple):
       guided: whether the first iteration linearises about the guess. prior_iterations: number of iterations with the
         prior.
       valley: the gap below which Newton's method takes over from smoothing; 0 for never.
+      descent: the steps of a descent.
     """
 
     steps: int
@@ -441,6 +476,7 @@ class IterationSettings(NamedTuple):
     guided: bool
     prior_iterations: int
     valley: float = 0.0
+    descent: Descent = NO_DESCENT
 
 
 class SmootherArrays(NamedTuple):
@@ -677,23 +713,6 @@ class RiccatiArrays(NamedTuple):
     x_hats: Arrays
 
 
-class IlqrArrays(NamedTuple):
-    """All arrays of iLQR.
-
-    Attributes:
-      best: the best trajectory so far. trial: that of a line search. damping: (1,) weight on changes of the controls.
-      certificate: (1,) row of `CERTIFICATE`.
-    """
-
-    start: Arrays
-    policy: Policy
-    to_go: CostToGo
-    best: Motion
-    trial: Motion
-    damping: Arrays
-    certificate: Arrays
-
-
 class Predictor(NamedTuple):
     """The model that predicts estimates over a control period; see `estimation.py`.
 
@@ -743,18 +762,18 @@ def _row(*names: str) -> np.dtype[np.void]:
 # The state of the iterations between calls.
 # plan_cost, merit: cost and merit of the plan; the merit includes the augmented Lagrangian. started: 1 once the start
 # was rolled out. watched: 1 if undamped iterations end without progress, because the safeguard can take over.
-# For the safeguard: reach of the next iteration; weight on changes of the controls; number of small changes in a row;
-# idle: number of iterations in a row that were rejected or improved by rounding; for iterations at reach 0, iLQR's, how
-# many remain, how many there will be the next time, and how many others there were since; final_gap: gap between
-# smoothed states and plan at the end.
-# For Newton's method: fraction of second-order terms in the next pass; the step at which the last pass failed; its
-# predicted slope of the merit (decrease), and its predicted decrease relative to the merit (promised); the negligible
-# cost, and the least cost to which that is relative; the damping without which the pass has no minimum; and 1 if short
-# steps are taken, too, because no other method follows (patient).
+# Of a descent: small_changes: number of small changes of cost in a row; idle: number of steps in a row that improved by
+# rounding. failed: the step at which the last pass failed, or -1. negligible: the negligible cost; least: the least
+# cost to which an optimality is relative. final_gap: gap between smoothed states and plan at the end.
+# Of damped steps: reach of the next; weight on changes of the controls, which iLQR has, too; for steps at reach 0,
+# iLQR's, how many remain, how many there will be the next time, and how many others there were since.
+# Of passes about the plan: known: 1 if the next step's was made; its fraction of second-order terms (share), weight on
+# changes of the controls (damping), predicted slope of the merit (decrease) and predicted decrease, relative to the
+# merit (promised). more: number of steps that followed an optimal plan.
 MEMORY = _row(
-    "plan_cost", "merit", "reach", "weight", "small_changes", "idle", "ilqr_left", "ilqr_next", "since_ilqr",
-    "final_gap", "started", "watched", "share", "failed", "decrease", "promised", "negligible", "least", "damping",
-    "patient",
+    "plan_cost", "merit", "started", "watched", "small_changes", "idle", "failed", "negligible", "least", "final_gap",
+    "reach", "weight", "ilqr_left", "ilqr_next", "since_ilqr", "known", "share", "damping", "decrease", "promised",
+    "more",
 )  # fmt: skip
 
 # The state of an interior point between calls. cost, stationarity, violation, gap, complementarity: the measures of the

@@ -9,7 +9,7 @@ from math import inf, sin, sqrt
 
 from lqrsim.kernels.certificate import reduce_stage
 from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
-from lqrsim.kernels.declarations import FIRST, ROWS, M, N, W, stack, zeros
+from lqrsim.kernels.declarations import FIRST, MIXES, ROWS, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
@@ -40,9 +40,8 @@ ASIDE = 1e-3  # distance from a plan at which slopes are looked at, too: at the 
 SMALLEST = 1e-3  # least motion of a state that is its typical size
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
-# The ladder of regularisation, tried in turn until the models have a minimum: fractions of the projected Hessian of the
-# cost; then that Hessian with weights on changes of the controls, relative to the cost.
-MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)
+# The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of the
+# projected Hessians gives the models a minimum.
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
 CONTROL, SIGN, SIDE = 0, 1, 2  # columns of `StageRows.limits`
@@ -53,7 +52,8 @@ def look(stages, plan, costates, least):
     """Write the models of all stages at a plan, and return its cost.
 
     Args:
-      stages: PlanStages. costates: (T+1, N). least: multipliers up to this count as zero in the Hessians.
+      stages: PlanStages. costates: (T+1, N).
+      least: multipliers up to this, times the sizes of their rows, count as zero in the Hessians.
     """
     constraint_slopes(stages, plan)
     stages.projected[0] = 0.0
@@ -150,7 +150,8 @@ def subtract_curvatures(x, u, t, stages, least, hessian):
         if not acts_at(k, t, stages.steps, constraints):
             continue
         for row in range(int(constraints.multipliers[k][ROWS])):
-            if abs(rows.force[rows.size * t + int(rows.first[k]) + row]) > least:
+            at = rows.size * t + int(rows.first[k]) + row
+            if abs(rows.force[at]) * rows.sizes[at] > least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
 

@@ -15,13 +15,16 @@ from lqrsim.codegen.compiled_module import Call, in_c_order
 from lqrsim.codegen.user_functions import interrupt_of, raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
+from lqrsim.kernels.descent import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
     MEMORY,
+    NO_DESCENT,
     CostModel,
     CostToCome,
     CostToGo,
+    Descent,
     IterationSettings,
     Motion,
     Policy,
@@ -260,38 +263,40 @@ class SolveRun:
     """Iterated LQR smoothing from one start, and its current state.
 
     Attributes:
-      initial_guess: the start. work: the memory. budget: the iterations and the time.
+      initial_guess: the start. work: the memory. budget: the iterations and the time. entry: the compiled function.
       ending: the state of smoothing; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method does the last iterations. final, rough: the tolerances of the answer, and of
         the smoothing before it; see `SmootherSettings`.
     """
 
     def __init__(
-        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
-    ) -> None:
-        self.problem, self.settings = problem, settings
+        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
+        entry: str = "smoother",
+    ) -> None:  # fmt: skip
+        self.problem, self.settings, self.entry = problem, settings, entry
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
         self.work = Workspace(problem, settings, initial_guess, start)
         self._begin(initial_guess, budget)
-        self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._rows))
+        self._loop = self.work.core.lay_out(entry, *self._arguments(0, 0, self._rows))
 
     @classmethod
     def lent(
-        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
-    ) -> "SolveRun":
+        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
+        entry: str = "smoother",
+    ) -> "SolveRun":  # fmt: skip
         """A run, if possible in memory that an earlier solve gave back, because allocating takes time.
 
         The run overwrites the result of the earlier solve, which must have been copied.
         """
-        core, steps = compiled.core(problem, settings.form), problem.steps
+        wanted = entry, compiled.core(problem, settings.form), problem.steps
         with _lending:
-            fitting = (one for one in reversed(_idle) if one.work.core is core and one.problem.steps == steps)
+            fitting = (one for one in reversed(_idle) if (one.entry, one.work.core, one.problem.steps) == wanted)
             run = next(fitting, None) if settings.first_pass == "forward" else None
             if run is not None:
                 _idle.remove(run)
         if run is None:
-            return cls(problem, settings, initial_guess, start, budget)
+            return cls(problem, settings, initial_guess, start, budget, entry)
         run.problem, run.settings = problem, settings
         run.work.begin(problem, settings, initial_guess, start)
         run._begin(initial_guess, budget)
@@ -412,9 +417,7 @@ class SolveRun:
         What it promises is relative to the cost, or to `least` if that is more. If no other method can follow, it is
         `patient`: it takes short steps, too.
         """
-        self.work.begin_newton(added, least)
-        self.work.memory["patient"] = float(patient)
-        ending = self._iterate(partial(self._plan_arguments, declarations.FINISH), self.work.best)
+        ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
         status = ending.status
         if ending.outcome == declarations.STALLED:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
@@ -453,12 +456,24 @@ class SolveRun:
         return self.damped_result(damped, status, detail)
 
     def damped(self, *, added: float = 0.0, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
-        """Damped iterations from the best plan so far; see `kernels/damped_iterations.py`.
+        """Damped iterations from the best plan so far; see `kernels/descent.py`.
 
         `added` is the constraints' share of its cost; the tolerances of cost and gap are at least `least`.
         """
-        self.work.begin_damped(added)
-        return self._iterate(partial(self._plan_arguments, declarations.DAMP, least=least), self.work.best)
+        return self.descend(DAMPED_STEPS, max(self.rough, least[0]), least[1], added=added)
+
+    def descend(
+        self, how: Descent, tolerance: float, gap_tolerance: float = 0.0, *, added: float = 0.0, least: float = 0.0
+    ) -> Ending:
+        """Steps from the best plan so far; `gap_tolerance` is the least, for the rest see `Workspace.begin_descent`."""
+        self.work.begin_descent(how, added, least)
+        arguments = partial(self._plan_arguments, declarations.DESCEND, how, tolerance, gap_tolerance)
+        return self._iterate(arguments, self.work.best)
+
+    def ilqr(self) -> Ending:
+        """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr"."""
+        arguments = partial(self._plan_arguments, declarations.ITERATE, NO_DESCENT, self.final, 0.0)
+        return self._iterate(arguments, self.work.best)
 
     def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
         """Run more iterations, in separate rows. A prior no longer acts."""
@@ -492,8 +507,8 @@ class SolveRun:
     def linearize_about_plan(self) -> float:
         """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
         rows = np.full(1, np.nan, LOG)
-        self.work.begin_damped()
-        self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, rows))
+        self.work.begin_descent(DAMPED_STEPS)
+        self._loop(*self._linearize_arguments(rows))
         return float(rows["optimality"][0])
 
     def fails_at(self, risk: float) -> int:
@@ -502,7 +517,7 @@ class SolveRun:
         Overwrites the arrays of the passes.
         """
         self.work.model.noise.risk[0] = risk
-        *_, failed = self._loop(*self._plan_arguments(declarations.LINEARIZE, 0, 0, np.full(1, np.nan, LOG)))
+        *_, failed = self._loop(*self._linearize_arguments(np.full(1, np.nan, LOG)))
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
@@ -626,7 +641,7 @@ class SolveRun:
         if term is None or not (term.active or self.problem.risk):
             return
         rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), no_value(plan.states)
-        task, first, last, options, _, *_ = self._plan_arguments(declarations.LINEARIZE, 0, 0, rows)
+        task, first, last, options, _, *_ = self._linearize_arguments(rows)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
             x_hats=arrays.x_hats.copy(), policy=Policy(*map(np.copy, arrays.policy)),
@@ -707,13 +722,18 @@ class SolveRun:
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, rows
 
     def _plan_arguments(
-        self, task: int, first: int, last: int, rows: StructuredArray, *, least: tuple[float, float] = (0.0, 0.0)
-    ) -> tuple[Any, ...]:
-        """Arguments for damped or Newton iterations from the plan, with at least these tolerances of cost and gap."""
-        work, tolerance = self.work, self.final if task == declarations.FINISH else self.rough
-        options = self._options(rows, max(tolerance, least[0]), least[1])
+        self, task: int, how: Descent, tolerance: float, gap_tolerance: float, first: int, last: int,
+        rows: StructuredArray,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """Arguments for steps from the plan, with this tolerance of the cost and at least that of the gap."""
+        work = self.work
+        options = self._options(rows, tolerance, gap_tolerance)._replace(descent=how)
         arrays = work.arrays._replace(prior=work.no_prior, last=work.trial)
         return task, first, last, options, work.model, arrays, work.memory_rows, rows
+
+    def _linearize_arguments(self, rows: StructuredArray) -> tuple[Any, ...]:
+        """Arguments for policy and value functions about the plan."""
+        return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.rough, 0.0, 0, 0, rows)
 
     def _check_arguments(
         self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
@@ -825,17 +845,17 @@ class Workspace:
         """With constraints the least cost is no measure, and a rollout of lower cost is no better plan."""
         self.memory["watched"], self.memory["plan_cost"] = 0.0, -np.inf
 
-    def begin_damped(self, added: float = 0.0) -> None:
-        """Begin damped iterations from the best plan; `added` is the constraints' share of its cost."""
-        memory = self.memory
-        memory["merit"] = memory["plan_cost"] + added
-        memory["reach"], memory["weight"], memory["small_changes"], memory["idle"] = 1.0, 0.0, 0.0, 0.0
-        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
+    def begin_descent(self, how: Descent, added: float = 0.0, least: float = 0.0) -> None:
+        """Begin steps from the best plan.
 
-    def begin_newton(self, added: float = 0.0, least: float = 0.0) -> None:
-        """The same for Newton's method, which begins with a pass about the plan; see `SolveRun.newton`."""
-        self.memory["merit"], self.memory["share"] = self.memory["plan_cost"] + added, -1.0
-        self.memory["least"] = least
+        `added` is the constraints' share of its cost. Its optimality is relative to the cost, or to `least` if that is
+        more.
+        """
+        memory = self.memory
+        memory["merit"], memory["least"] = memory["plan_cost"] + added, least
+        memory["reach"], memory["share"], memory["known"], memory["more"] = how.reach, how.share, 0.0, 0.0
+        memory["weight"], memory["small_changes"], memory["idle"] = 0.0, 0.0, 0.0
+        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""

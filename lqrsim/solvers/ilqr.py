@@ -1,22 +1,13 @@
 """Iterative LQR with line search: the paper's baseline for comparison."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import (
-    CERTIFICATE,
-    LOG,
-    CostToGo,
-    IlqrArrays,
-    IterationSettings,
-    Motion,
-    Policy,
-    StructuredArray,
-)
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
@@ -26,12 +17,18 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.budget import Budget, Callback
-from lqrsim.solvers.certify import certified
-from lqrsim.solvers.engine import RunResult, check_finite_at_start, iterate
-from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
+from lqrsim.solvers.engine import RunResult, SolveRun, check_finite_at_start
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
-from lqrsim.solvers.risk import named
-from lqrsim.solvers.settings import Settings, check_callback, check_problem, settings_from, warn_of_goal
+from lqrsim.solvers.risk import name_risk
+from lqrsim.solvers.settings import (
+    Settings,
+    SmootherSettings,
+    check_callback,
+    check_problem,
+    settings_from,
+    warn_of_goal,
+)
 
 TOLERANCE = 1e-4  # default tolerance
 
@@ -139,71 +136,38 @@ def _solve(
 ) -> Solution:
     """Solve; `attentive`: see `Budget`."""
     assert problem.start is not None
-    assert settings.tolerance is not None
-    initial_guess = resolve(settings.start, problem)
-    if initial_guess.prior is not None:  # a function may return one
-        raise InputError(_NO_PRIOR)
-    start, control = problem.start.copy(), initial_guess.offset[0].copy()
-    check_functions(problem, start, control)
-    n, steps, zeros = len(start), problem.steps, np.zeros
-    policy = Policy(initial_guess.gain.copy(), initial_guess.offset.copy())
-    plan = Motion(zeros((steps + 1, n)), zeros(initial_guess.offset.shape))
-    states, controls = plan
-    go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
-    work = IlqrArrays(
-        start=start, policy=policy, to_go=go, best=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
-        certificate=zeros(1, CERTIFICATE),
-    )  # fmt: skip
-    most = settings.max_iterations
-    rows = zeros(most + 1, LOG)
-    options = IterationSettings(
-        steps=steps, max_iterations=most, tolerance=settings.tolerance, gap_tolerance=0.0,
-        optimal=settings.stop == "optimal", fixed=True, guided=False, prior_iterations=0,
-    )  # fmt: skip
-    budget = Budget(most, callback=callback, attentive=attentive)
+    budget = Budget(settings.max_iterations, callback=callback, attentive=attentive)
     budget.stop.begin(settings.time_limit)
     with budget.stop.not_counting():
-        model = compiled.arguments(problem)
-        loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, rows)
+        guess = resolve(settings.start, problem)
+        if guess.prior is not None:  # a function may return one
+            raise InputError(_NO_PRIOR)
+        start, control = problem.start.copy(), guess.offset[0].copy()
+        check_functions(problem, start, control)
+        options = SmootherSettings(stop=settings.stop, tolerance=settings.tolerance, finish=None)
+        run = SolveRun.lent(problem, options, InitialGuess(guess.gain, guess.offset), start, budget, "ilqr")
+        run.work.fixed = True  # if by the initial cost alone
     with budget.stop.reporting("ilqr", attentive):
-        ending = iterate(
-            problem, lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, rows), rows,
-            first=0, last=most, budget=budget,
-        )  # fmt: skip
-    done = len(budget.log)
-    ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
-    whole = done > 0 and ending.failed < 0
+        ending = run.ilqr()
+    log, work = budget.log, run.work
+    costs = np.array([one.cost for one in log])
+    ending = check_finite_at_start(problem, ending, costs, start, control, refuse=attentive)
+    whole = len(log) > 0 and ending.failed < 0
     if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was made about the previous trajectory
-        if not done:
-            loop(declarations.ITERATE, 0, 0, options, model, work, rows)  # only the first rollout
-        *_, failed = loop(declarations.LINEARIZE, 0, 0, options, model, work, rows)
-        whole = failed < 0 and np.isfinite(states).all()
-    if not whole:  # without a pass about the trajectory the policy has no feedback
-        policy.gain[:] = 0
-    offset = compiled.law_about(states, controls, policy.gain)[1] if whole else controls.copy()
-    status, detail = ending.status, ending.detail(steps)
-
-    def check(task: int, to_go: CostToGo, out: StructuredArray) -> None:
-        checked = work._replace(policy=Policy(policy.gain, offset), to_go=to_go, certificate=out)
-        loop(task, 0, 0, options, model, checked, rows)
-
-    value = Quadratic(*go) if whole else None
-    certificate, wrong = certified(
-        problem, check, states, value, violation=0.0, claimed=budget.log[-1].cost if status.success else None,
-        tolerance=settings.tolerance if status is Status.CONVERGED else None,
-    )  # fmt: skip
-    if wrong:
-        status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
-    if status is Status.RISK_TOO_HIGH:
-
-        def fails(risk: float) -> int:
-            model.noise.risk[0] = risk
-            return loop(declarations.LINEARIZE, 0, 0, options, model, work, rows)[3]
-
-        detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)
+        if not log:
+            run.roll_out()
+        whole = bool(np.isfinite(run.linearize_about_plan()))
+    (states, controls), gain = work.best, work.arrays.policy.gain
+    # Without a pass about the trajectory the policy has no feedback.
+    law = compiled.law_about(states, controls, gain) if whole else (np.zeros_like(gain), controls)
     found = RunResult(
-        status=status, detail=detail, states=states, controls=controls, law=(policy.gain, offset),
-        cost=certificate.cost, violation=0.0, gap=0.0, values={"cost_to_go": value}, certificate=certificate,
+        status=ending.status, detail=ending.detail(problem.steps), states=states, controls=controls,
+        law=law, cost=work.cost, violation=0.0, gap=0.0,
+        values={"cost_to_go": Quadratic(*work.arrays.to_go)} if whole else {},
     )  # fmt: skip
-    solution = assemble(problem, found, budget.log, solver="ilqr", options=settings.options(initial_guess))
+    found = run.certified(found)
+    if found.status is Status.RISK_TOO_HIGH:
+        found = replace(found, detail=name_risk(run, found))
+    solution = assemble(problem, found, log, solver="ilqr", options=settings.options(guess))
+    run.give_back()
     return budget.stop.finish(solution)
