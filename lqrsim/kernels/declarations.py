@@ -26,8 +26,8 @@ LONGEST_CYCLE = 8
 # number is reached if the method converges on the paper's queries:
 # `python experiments/benchmark_reliability.py --sections overhead`.
 NO_FALL, SLOW_FALL = 12, 30
-# The ladder of regularisation begins with fractions of the convex models in a mixture with those of second order, tried in
-# turn until one has a minimum. Weights on changes of the controls follow.
+# The ladder of regularisation begins with fractions of the convex models in a mixture with those of second order, tried
+# in turn until one has a minimum. Weights on changes of the controls follow.
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)
 ROW = 16  # count of numbers per obstacle in `World.table`: kind, position (3), rotation (9, row by row), size (3)
 # Indices of a constraint's numbers in its array, and of its first multiplier; see `augmented_lagrangian.py`.

@@ -40,8 +40,8 @@ ASIDE = 1e-3  # distance from a plan at which slopes are looked at, too: at the 
 SMALLEST = 1e-3  # least motion of a state that is its typical size
 SLOWEST = 1e-6  # least effect of a control without limits, relative to the states' sizes
 
-# The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of the
-# projected Hessians gives the models a minimum.
+# The weights on changes of the controls, relative to the cost, that end the ladder of regularisation if no fraction of
+# the projected Hessians gives the models a minimum.
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
 CONTROL, SIGN, SIDE = 0, 1, 2  # columns of `StageRows.limits`
