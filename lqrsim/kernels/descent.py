@@ -183,11 +183,11 @@ def newton_step(settings, model, work, memory):
         if share <= memory.share:
             order = ModelOrder(damping, share, work.to_go)
             failed, good, left = pass_about_plan(settings, order, model, work, work.policy, second)
-            if failed < 0 and isnan(left):  # the start has no minimum
+            if failed < 0 and isnan(left) and not settings.fixed:  # the start has no minimum
                 failed = 0
             if failed < 0 or not good:
                 break
-    memory.failed, memory.share, memory.damping, memory.known = failed, share, damping, 1.0
+    memory.failed, memory.share, memory.damping, memory.known = failed, share, damping, 1.0 if failed < 0 else 0.0
     for t in range(settings.steps + 1):
         size = max(size, abs(second.constant[t]))
     memory.negligible, memory.decrease = 1e-26 * size, 2 * left
