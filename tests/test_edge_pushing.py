@@ -177,6 +177,7 @@ def test_the_effort_grows_with_the_number_of_operations() -> None:
     np.testing.assert_allclose(hessian, [[second, 0], [0, 0]], rtol=1e-11)
 
 
+@pytest.mark.long
 def test_of_an_aeroplane() -> None:
     """The largest formula of the experiments, by second differences with 60 digits, whose error is some 1e-25."""
     dynamics = airplane()

@@ -1207,8 +1207,7 @@ class TestPlanMethods:
         stages = Stages(problem(steps=3, constraints=kept, **changed))
         return stages, Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
 
-    @pytest.mark.parametrize("price", [np.inf, 20.0])
-    @pytest.mark.parametrize("informed", [False, True])
+    @pytest.mark.parametrize(("price", "informed"), [(np.inf, False), (20.0, True)])
     def test_interior_point(self, price: float, informed: bool) -> None:
         stages, plan = self.made(**({"initial": ls.FixedState([0.0, 0.0, 0.3])} if informed else {}))
         point = InteriorPoint(stages, plan, price=price)
