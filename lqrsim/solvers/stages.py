@@ -237,12 +237,6 @@ class Stages:
         self.about.state_size[...], self.about.control_size[...] = sizes.states, sizes.controls
         self._sizes[...] = sizes.rows
 
-    def spread(self, rows: Array) -> Array:
-        """Numbers of the live rows (K,) at their places in (T+1, R); others are zero."""
-        spread = np.zeros(self.live.shape)
-        spread[self.live] = rows
-        return spread
-
     def of_constraints(self, numbers: Sequence[Array]) -> Array:
         """Numbers of each constraint (T+1, rows) at their places in (T+1, R); zero for limits, or if none are given."""
         rows = np.zeros(self.live.shape)
