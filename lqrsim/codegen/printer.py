@@ -225,10 +225,10 @@ class _Body:
         self._loops: list[tuple[str, str]] = []
         self._left: set[str] = set()  # ends of loops that a break reaches
         self._own: set[str] = set()  # variables that may be or hold work arrays of this function
-        self._local = {one.arg for one in function.node.args.args}  # local names
-        for one in ast.walk(function.node):
-            if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store):
-                self._local.add(one.id)
+        self._constants: dict[str, Value] = {}  # arguments that keep their values
+        names = (one for one in ast.walk(function.node) if isinstance(one, ast.Name))
+        self._stored = {one.id for one in names if isinstance(one.ctx, ast.Store)}
+        self._local = self._stored | {one.arg for one in function.node.args.args}
         self._now = Block("body", [])  # the block that is printed
         self._blocks = [self._now]
         self._fast = "contract" if "exact" in function.decorators else FAST
@@ -249,7 +249,11 @@ class _Body:
             self._refuse(self.function.node, f"{len(self.types)} arguments", str(len(arguments.args)))
         names = (f"%a{i}" for i in itertools.count())
         for one, kind in zip(arguments.args, self.types, strict=True):
-            self._store(one.arg, _assemble(kind, names), one)
+            value = _assemble(kind, names)
+            if one.arg in self._stored:
+                self._store(one.arg, value, one)
+            else:
+                self._constants[one.arg] = value
         self._block(self.function.node.body)
         if not self._now.ended:
             if self.result is not None:
@@ -591,6 +595,8 @@ class _Body:
     def _expression_Name(self, node: ast.Name) -> Value:
         if node.id in self._names:
             return self._get(*self._names[node.id])
+        if node.id in self._constants:
+            return self._constants[node.id]
         found = self.scope.find(node.id)
         if node.id in self._local:
             self._refuse(node, f"the name {node.id}, which has no value yet", "a value assigned before")
@@ -604,6 +610,9 @@ class _Body:
         return _group([self._expression(one) for one in node.elts])
 
     def _expression_Attribute(self, node: ast.Attribute) -> Value:
+        part = self._part(node)
+        if part is not None:  # loaded without the rest of the record
+            return self._get(*part)
         value = self._expression(node.value)
         fields = value.type.fields if isinstance(value.type, Group | Struct) else ()
         if node.attr not in fields:
@@ -612,6 +621,18 @@ class _Body:
         if isinstance(value.type, Struct):
             return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
         return value.parts[place]
+
+    def _part(self, node: ast.expr) -> tuple[Type, Any] | None:
+        """The type and slots of a variable, or of a field of one that holds a record; None for anything else."""
+        if isinstance(node, ast.Name):
+            return self._names.get(node.id)
+        if not isinstance(node, ast.Attribute):
+            return None
+        match self._part(node.value):
+            case Group(members=members, fields=fields), slots if node.attr in fields:
+                place = fields.index(node.attr)
+                return members[place], slots[place]
+        return None
 
     def _expression_Subscript(self, node: ast.Subscript) -> Value:
         found = self._entry(self._expression(node.value), node)
