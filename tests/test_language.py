@@ -214,6 +214,43 @@ def f(policy, vectors, log, n):
     np.testing.assert_array_equal(found[2], np.asarray(wanted[2]))
 
 
+def test_compact_functions_take_records_by_address() -> None:
+    """Whether a record is what the caller was given, a part of it, newly made, renamed or replaced."""
+    text = """\
+from lqrsim.kernels.declarations import compact
+from lqrsim.kernels.records import Limits, Policy
+
+@compact
+def inner(limits, n):
+    low, high = limits
+    return limits.low[n] + high if limits.high > 1 else low[0] - n
+
+@compact
+def middle(policy, limits, on):
+    gain, other, total = policy.gain, limits, 0.0
+    for i in range(3):
+        part = gain if i > 0 else other
+        total = 10 * total + inner(part, i % 2)
+        total += inner(gain, 0) + inner(Limits(policy.offset, i), 1)
+    limits = Limits(other.low, gain.high + on)
+    return total + inner(limits, 1) - inner(other, 0) + policy[0].low[1]
+
+@compact
+def f(policy, limits, on):
+    renamed, n = policy, 2
+    renamed.gain.low[0] += n
+    swapped = Policy(limits, renamed.gain.low)
+    first = middle(renamed, limits, on) + middle(swapped, swapped.gain, not on)
+    policy = Policy(limits, policy.offset)
+    return first, middle(policy, renamed.gain, on), on, Limits(n, first).high
+"""
+    for on, high in ((True, 1.5), (False, 1)):
+        given = [Policy(Limits(np.arange(2.0), 2), np.array([3.0, 5.0])), Limits(np.array([7.0, 11.0]), high), on]
+        found, wanted = copy.deepcopy(given), copy.deepcopy(given)
+        assert run(text, "f", *found) == in_python(text)(*wanted)
+        np.testing.assert_array_equal(found[0].gain.low, wanted[0].gain.low)
+
+
 def test_helpers_are_compiled_for_what_they_are_called_with() -> None:
     text = """\
 def half(a):

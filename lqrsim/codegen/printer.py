@@ -1,7 +1,9 @@
 """Print kernels as LLVM IR; `language.py` defines their subset of Python.
 
 A function is printed once for each combination of argument types. Records and tuples are passed as their parts, so that
-LLVM sees numbers and addresses; variables are slots on the stack, which LLVM turns into registers.
+LLVM sees numbers and addresses; variables are slots on the stack, which LLVM turns into registers. Functions that are
+`compact` take records by address instead, with 8 bytes for each part: calls with hundreds of arguments take long to
+compile.
 """
 
 import ast
@@ -9,6 +11,7 @@ import itertools
 import math
 import operator
 import struct
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn, TypeGuard
@@ -65,6 +68,14 @@ class Value:
     name: str = ""
     parts: tuple["Value", ...] = ()
     constant: Constant | None = None
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a record is in memory, with 8 bytes for each of its parts: a pointer, or a slot that holds it."""
+
+    name: str
+    in_slot: bool = False
 
 
 @dataclass
@@ -137,7 +148,7 @@ class Program:
 
         A whole number that it returns becomes a float, such as the value of a formula that is 0: callers take a float.
         """
-        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(types))]
+        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(_passed(function, types))]
         kind, call, result = self._call_of(function, types)
         body = [f"  {call}", "  ret void"] if kind == "void" else [f"  %r = {call}", f"  ret {kind} %r"]
         if result is INT or result is BOOL:
@@ -154,15 +165,19 @@ class Program:
         returned = scalars(result) if result is not None else []
         if not {FLOAT, INT, BOOL}.issuperset(returned):
             raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
-        lines, parts = [], _parts_of(types)
-        for place, one in enumerate(parts):
-            loaded = "i64" if one is BOOL else llvm_type(one)
-            lines += [
-                f"  %p{place} = getelementptr inbounds i64, ptr %words, i64 {place}",
-                f"  %{'w' if one is BOOL else 'a'}{place} = load {loaded}, ptr %p{place}",
-            ]
-            if one is BOOL:
-                lines.append(f"  %a{place} = trunc i64 %w{place} to i1")
+        lines, place = [], 0
+        for i, one in enumerate(_passed(function, types)):
+            if isinstance(one, Group):
+                lines.append(f"  %a{i} = getelementptr inbounds i64, ptr %words, i64 {place}")
+            else:
+                loaded = "i64" if one is BOOL else llvm_type(one)
+                lines += [
+                    f"  %p{i} = getelementptr inbounds i64, ptr %words, i64 {place}",
+                    f"  %{'w' if one is BOOL else 'a'}{i} = load {loaded}, ptr %p{i}",
+                ]
+                if one is BOOL:
+                    lines.append(f"  %a{i} = trunc i64 %w{i} to i1")
+            place += len(scalars(one))
         lines.append(f"  {call}" if result is None else f"  %r = {call}")
         for i, one in enumerate(returned):
             part = "%r"
@@ -173,7 +188,7 @@ class Program:
                 lines.append(f"  %z{i} = zext i1 {part} to i64")
                 part = f"%z{i}"
             lines += [
-                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {len(parts) + i}",
+                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}",
                 f"  store {'i64' if one is BOOL else llvm_type(one)} {part}, ptr %q{i}",
             ]
         self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
@@ -183,7 +198,7 @@ class Program:
         """LLVM's type of a function's result, a call with the arguments %a0, %a1, ..., and the type of the result."""
         name, result = self.instance(function, types)
         kind = "void" if result is None else llvm_type(result)
-        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(types)))
+        given = ", ".join(f"{_passed_type(one)} %a{i}" for i, one in enumerate(_passed(function, types)))
         return kind, f"call {kind} {name}({given})", result
 
 
@@ -227,8 +242,8 @@ class _Body:
         self._own: set[str] = set()  # variables that may be or hold work arrays of this function
         self._constants: dict[str, Value] = {}  # arguments that keep their values
         names = (one for one in ast.walk(function.node) if isinstance(one, ast.Name))
-        self._stored = {one.id for one in names if isinstance(one.ctx, ast.Store)}
-        self._local = self._stored | {one.arg for one in function.node.args.args}
+        self._stores = Counter(one.id for one in names if isinstance(one.ctx, ast.Store))
+        self._local = {*self._stores, *(one.arg for one in function.node.args.args)}
         self._now = Block("body", [])  # the block that is printed
         self._blocks = [self._now]
         self._fast = "contract" if "exact" in function.decorators else FAST
@@ -249,11 +264,13 @@ class _Body:
             self._refuse(self.function.node, f"{len(self.types)} arguments", str(len(arguments.args)))
         names = (f"%a{i}" for i in itertools.count())
         for one, kind in zip(arguments.args, self.types, strict=True):
-            value = _assemble(kind, names)
-            if one.arg in self._stored:
-                self._store(one.arg, value, one)
+            record = (kind, Address(next(names))) if isinstance(kind, Group) and _by_address(self.function) else None
+            if one.arg in self._stores:
+                self._store(one.arg, self._get(*record) if record else _assemble(kind, names), one)
+            elif record:
+                self._names[one.arg] = record
             else:
-                self._constants[one.arg] = value
+                self._constants[one.arg] = _assemble(kind, names)
         self._block(self.function.node.body)
         if not self._now.ended:
             if self.result is not None:
@@ -264,7 +281,11 @@ class _Body:
 
     def text(self, name: str) -> str:
         """The IR."""
-        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(_parts_of(self.types)))
+        given = ", ".join(
+            # Records do not change: LLVM need not read their parts again.
+            f"ptr noalias readonly %a{i}" if isinstance(one, Group) else f"{llvm_type(one)} %a{i}"
+            for i, one in enumerate(_passed(self.function, self.types))
+        )
         kind = "void" if self.result is None else llvm_type(self.result)
         decorators = self.function.decorators
         known = {"inline": "#1", "outline": "#2", "compact": "#3"}
@@ -340,9 +361,22 @@ class _Body:
     def _get(self, kind: Type, slots: Any) -> Value:
         if isinstance(kind, Group):
             return Value(
-                kind, parts=tuple(self._get(member, slot) for member, slot in zip(kind.members, slots, strict=True))
+                kind, parts=tuple(self._get(*self._member_of(kind, slots, i)) for i in range(len(kind.members)))
             )
+        if isinstance(slots, Address):
+            slots = self._pointer_of(slots)
         return Value(kind, self._emit(f"load {llvm_type(kind)}, ptr {slots}"))
+
+    def _member_of(self, kind: Group, slots: Any, place: int) -> tuple[Type, Any]:
+        """The type and slots of a member of a record."""
+        if not isinstance(slots, Address):
+            return kind.members[place], slots[place]
+        offset = sum(len(scalars(member)) for member in kind.members[:place])
+        pointer = self._emit(f"getelementptr inbounds i64, ptr {self._pointer_of(slots)}, i64 {offset}")
+        return kind.members[place], Address(pointer)
+
+    def _pointer_of(self, address: Address) -> str:
+        return self._emit(f"load ptr, ptr {address.name}") if address.in_slot else address.name
 
     # Types.
 
@@ -403,11 +437,16 @@ class _Body:
         self._call(node.value)
 
     def _statement_Assign(self, node: ast.Assign) -> None:
-        value = self._expression(node.value)
-        if self._has_own(value, node.value):
-            self._own |= {one.id for target in node.targets for one in ast.walk(target) if isinstance(one, ast.Name)}
-        for target in node.targets:
-            self._assign(target, value)
+        targets, values = [node.targets], [node.value]
+        match node.targets, node.value:
+            case [ast.Tuple(elts=each)], ast.Tuple(elts=parts) if len(each) == len(parts):
+                targets, values = [[target] for target in each], parts
+        found = [self._reference(one) for one in values]  # all of them, before any name changes
+        for group, one, value in zip(targets, values, found, strict=True):
+            if self._has_own(value, one):
+                self._own |= {name.id for target in group for name in ast.walk(target) if isinstance(name, ast.Name)}
+            for target in group:
+                self._assign(target, value)
 
     def _has_own(self, value: Value, node: ast.expr) -> bool:
         """Whether a value may be or hold a work array of this function, which ends when the function returns."""
@@ -433,6 +472,12 @@ class _Body:
 
     def _assign(self, target: ast.expr, value: Value) -> None:
         match target:
+            case ast.Name(id=name) if _is_address(value) and self._stores[name] == 1:
+                slot = self._slot("ptr")
+                self._do(f"store ptr {value.name}, ptr {slot}")
+                self._names[name] = value.type, Address(slot, in_slot=True)
+            case _ if _is_address(value):
+                self._assign(target, self._get(value.type, Address(value.name)))
             case ast.Name(id=name):
                 self._store(name, value, target)
             case ast.Tuple(elts=parts):
@@ -622,6 +667,13 @@ class _Body:
             return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
         return value.parts[place]
 
+    def _reference(self, node: ast.expr) -> Value:
+        """The value of an expression; for a record that is in memory, its address."""
+        match self._part(node):
+            case Group() as kind, Address() as address:
+                return Value(kind, self._pointer_of(address))
+        return self._expression(node)
+
     def _part(self, node: ast.expr) -> tuple[Type, Any] | None:
         """The type and slots of a variable, or of a field of one that holds a record; None for anything else."""
         if isinstance(node, ast.Name):
@@ -629,9 +681,8 @@ class _Body:
         if not isinstance(node, ast.Attribute):
             return None
         match self._part(node.value):
-            case Group(members=members, fields=fields), slots if node.attr in fields:
-                place = fields.index(node.attr)
-                return members[place], slots[place]
+            case Group(fields=fields) as kind, slots if node.attr in fields:
+                return self._member_of(kind, slots, fields.index(node.attr))
         return None
 
     def _expression_Subscript(self, node: ast.Subscript) -> Value:
@@ -854,7 +905,8 @@ class _Body:
             self._refuse(node, f"`{ast.unparse(node)}`", "a call by a bare name, of positional arguments")
         name = node.func.id
         found = self.scope.find(name) if name not in self._local else None
-        given = [self._expression(one) for one in node.args]
+        by_address = isinstance(found, ScopedFunction) and _by_address(found)
+        given = [self._reference(one) if by_address else self._expression(one) for one in node.args]
         match found:
             case ScopedFunction():
                 return self._call_kernel(found, given, node)
@@ -871,7 +923,10 @@ class _Body:
         if len(given) != count:
             self._refuse(node, f"{len(given)} arguments for {function.node.name}", str(count))
         symbol, result = self.program.instance(function, tuple(one.type for one in given))
-        arguments = ", ".join(f"{llvm_type(part.type)} {part.name}" for one in given for part in _leaves(one))
+        if _by_address(function):
+            given = [self._in_memory(one) if isinstance(one.type, Group) else one for one in given]
+        parts = [part for one in given for part in ([one] if _is_address(one) else _leaves(one))]
+        arguments = ", ".join(f"{_passed_type(part.type)} {part.name}" for part in parts)
         if result is None:
             self._do(f"call void {symbol}({arguments})")
             return None
@@ -881,6 +936,17 @@ class _Body:
         kind = llvm_type(result)
         parts = [self._emit(f"extractvalue {kind} {returned}, {i}") for i in range(len(result.members))]
         return _assemble(result, iter(parts))
+
+    def _in_memory(self, value: Value) -> Value:
+        """The address of a record, which is written to memory if it is not there."""
+        if _is_address(value):
+            return value
+        parts = _leaves(value)
+        table = self._slot(f"[{len(parts)} x i64]", 8)
+        for i, part in enumerate(parts):
+            address = self._emit(f"getelementptr inbounds i64, ptr {table}, i64 {i}")
+            self._do(f"store {llvm_type(part.type)} {part.name}, ptr {address}")
+        return Value(value.type, table)
 
     def _call_word(self, name: str, given: list[Value], node: ast.Call) -> Value | None:
         method, count = getattr(self, f"_word_{name}", None), _COUNTS.get(name, 2 if name in BINARY else 1)
@@ -1050,8 +1116,24 @@ def _group(parts: list[Value]) -> Value:
     return Value(Group(tuple(part.type for part in parts)), parts=tuple(parts), constant=constant)
 
 
-def _parts_of(types: tuple[Type, ...]) -> list[Type]:
-    return [one for kind in types for one in scalars(kind)]
+def _by_address(function: ScopedFunction) -> bool:
+    """Whether a function takes records by address."""
+    return "compact" in function.decorators
+
+
+def _passed(function: ScopedFunction, types: tuple[Type, ...]) -> list[Type]:
+    """The types that a function takes in LLVM: records, if by address, and parts of records otherwise."""
+    return list(types) if _by_address(function) else [one for kind in types for one in scalars(kind)]
+
+
+def _passed_type(kind: Type) -> str:
+    """LLVM's name of the type of an argument."""
+    return "ptr" if isinstance(kind, Group) else llvm_type(kind)
+
+
+def _is_address(value: Value) -> bool:
+    """Whether a value is the address of a record."""
+    return isinstance(value.type, Group) and bool(value.name)
 
 
 def _leaves(value: Value) -> list[Value]:
