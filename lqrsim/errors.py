@@ -148,7 +148,9 @@ def check_number(
     """`value` as a finite float within the bounds. Raises InputError otherwise, including for text and bools."""
     number = float("nan")
     try:
-        if not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
+        if type(value) is float:  # the most frequent
+            number = value
+        elif not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
             number = float(value)  # pyright: ignore[reportArgumentType]
     except Exception:  # an object may raise anything in its conversion
         number = float("nan")

@@ -201,22 +201,28 @@ def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
 
 def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) -> None:
     """Raises InputError unless a shape fits these letters and the known sizes; new letters get sizes."""
-    wanted, before, alike = letters.split(), dict(sizes), True
-    if wanted[0] == "...":
+    wanted, before, alike = _lengths(letters), sizes.copy(), True
+    if wanted[0][0] == "...":
         leading = len(shape) - len(wanted) + 1
         # As many as the record's other arrays have; a single number may stand for all.
         alike = (letters == "..." and not shape) or leading == sizes.setdefault("...", leading)
-        wanted = [f"...{i}" for i in range(leading)] + wanted[1:]
+        wanted = (*((f"...{i}", 0) for i in range(leading)), *wanted[1:])
     fits = alike and len(wanted) == len(shape)
-    for letter, length in zip(wanted, shape, strict=False):
-        name, _, more = letter.partition("+")
-        size = length - int(more or 0)
-        expected = int(name) if name.isdecimal() else size if name == "_" else sizes.setdefault(name, size)
+    for (name, more), length in zip(wanted, shape, strict=False):
+        size = length - more
+        expected = name if isinstance(name, int) else size if name == "_" else sizes.setdefault(name, size)
         fits = fits and size == expected and size >= 0
     if not fits:
         known = [_length_of(letter, before) for letter in letters.split()]
         meaning = "" if known == letters.split() else f" = ({', '.join(known)})"
         raise InputError(f"{field}: got shape {shape}, want ({', '.join(letters.split())}){meaning}")
+
+
+@cache
+def _lengths(letters: str) -> tuple[tuple[str | int, int], ...]:
+    """The letter of each length, or the length itself, and what is added to it."""
+    parts = (letter.partition("+") for letter in letters.split())
+    return tuple((int(name) if name.isdecimal() else name, int(more or 0)) for name, _, more in parts)
 
 
 def _length_of(letter: str, sizes: Sizes) -> str:

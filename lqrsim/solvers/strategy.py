@@ -681,9 +681,10 @@ class Search:
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
+        if len(self._named) == 1:
+            return ()
         results = {id(run): found for run, found in self._finished}
-        found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
-        return (*found, *self._softer) if len(found) > 1 else ()
+        return (*(run.candidate(name, results.get(id(run))) for name, run in self._named), *self._softer)
 
     # Helper methods of the steps above.
 
@@ -751,8 +752,8 @@ class Search:
         """
         problem = self._problem
         space = problem.dynamics.state_coordinates
-        if pull(problem) == 0 or problem.goal is None:
-            return self._idle() or self.is_without_plan
+        if not self.is_guided or problem.goal is None:
+            return self.is_without_plan or self._idle()
         (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
             return run.budget.left > 0
@@ -794,7 +795,7 @@ class Attempt(NamedTuple):
 
 
 def _is_poor(search: Search) -> bool:
-    return search.is_poor and search.may_go_on and not search.tried
+    return not search.tried and search.may_go_on and search.is_poor
 
 
 # What a search among starts is, also of a problem that is a part of another attempt.
