@@ -18,7 +18,8 @@ lqrsim, no finish the first with finish=None and tolerance=1e-8: no Newton steps
                   1e-6 to spare, in place of the interior point.
 ilqr              ls.ilqr with tolerance=1e-8; it keeps no constraints but the limits of the controls.
 box-FDDP          Crocoddyl's, which keeps as much.
-FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
+FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8, in at most 3,000 iterations; FATROP with
+                  the default first barrier parameter, 0.1, and with that of its older versions, 100.
 
 The target is Altro.jl's published cost where a verified plan of the league costs no more, and otherwise 1.001 times the
 least cost of the verified plans of all that begin with the same, whether or not they are said to be optimal. It is
@@ -35,9 +36,10 @@ difference.
 Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
 1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of
 random problems iterations, times and costs are medians; an instance where something is never reached counts as
-infinitely long. Times are on one thread and without compiling: of lqrsim those of its iterations, of FATROP and IPOPT
-those of calls through CasADi, their functions compiled from C, which takes a while once. With --quick they are
-evaluated in CasADi. What is not installed is left out, and named.
+infinitely long. Times are processor times of whole calls, on one thread and without compiling, the least of up to five
+calls; FATROP and IPOPT are called through CasADi, their functions compiled from C, which takes a while once. With
+--quick they are evaluated in CasADi. "Beside FATROP" is the ratio of these times, FATROP's the better of its two
+settings, for the instances that both solve in the same optimum. What is not installed is left out, and named.
 """
 
 import os
@@ -49,7 +51,7 @@ if __name__ == "__main__":  # before NumPy looks: times are on one thread
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 import numpy as np
-from league.contestants import CONTESTANTS, SEARCH, Run, Solve
+from league.contestants import CONTESTANTS, FATROPS, SEARCH, Run, Solve
 from league.problems import FAMILIES, Instance, instances
 from league.verification import VIOLATION, Verified, verify
 from peers import Unavailable
@@ -231,6 +233,7 @@ def report(result: Result) -> str:
             *notes,
             *(f"{', '.join(names)}: {what}." for what, names in absent.items()),
             *_by_measure(result["problems"]),
+            *_beside_fatrop(result["problems"]),
         ]
     )
 
@@ -260,6 +263,45 @@ def _by_measure(problems: dict[str, Any]) -> list[str]:
             table(("problem", *solvers), [row(name, solvers, [what]) for name in problems]),
         ]
     return parts
+
+
+def _beside_fatrop(problems: dict[str, Any]) -> list[str]:
+    """Times of whole calls beside the better of FATROP's two settings, and the geometric mean of their ratios."""
+    rows, logs = [], []
+    for name, family in problems.items():
+        ours = family["solvers"].get("lqrsim")
+        theirs = [family["solvers"][one] for one in FATROPS if one in family["solvers"]]
+        if ours is None or not theirs:
+            continue
+        pairs = []
+        for i, cost in enumerate(ours["cost"]):
+            times = [
+                one["exact"]["milliseconds"][i]
+                for one in theirs
+                if one["solved"][i] and ours["solved"][i] and abs(one["cost"][i] / cost - 1) < SAME
+            ]
+            if times and ours["exact"]["milliseconds"][i] is not None:
+                pairs.append((ours["exact"]["milliseconds"][i], min(times)))
+        solved = [any(each) for each in zip(*(one["solved"] for one in theirs), strict=True)]
+        row = [name, family["instances"], sum(ours["solved"]), sum(solved), len(pairs)]
+        if pairs:
+            logs.append(np.mean([np.log(mine / other) for mine, other in pairs]))
+            row += [_median([pair[i] for pair in pairs], ".1f") for i in (0, 1)] + [f"{np.exp(logs[-1]):.2f}"]
+        rows.append([*row, *["-"] * (8 - len(row))])
+    if not rows:
+        return []
+    head = (
+        "problem",
+        "instances",
+        "lqrsim solves",
+        "FATROP solves",
+        "both, one optimum",
+        "lqrsim, ms",
+        "FATROP, ms",
+        "ratio",
+    )
+    mean = f"Geometric mean of the ratios: {np.exp(np.mean(logs)):.2f}, over {len(logs)} problems." if logs else ""
+    return ["Beside FATROP, whole calls:", table(head, rows), mean]
 
 
 MEASURES: dict[str, Callable[[Result], str]] = {

@@ -2,8 +2,9 @@
 
 Direct multiple shooting, as in `ipopt.py` and `fatrop.py`: the states and controls of all knots are variables, the
 steps and the given start are equality constraints, limits of controls and bounds of states are bounds of the variables.
-Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at their own tolerance of 1e-8 and are
-otherwise as they come, on one thread. A solver is made for one problem and serves all that differ in parameters only.
+Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at their own tolerance of 1e-8 or after 3,000
+iterations, IPOPT's default, and are otherwise as they come, on one thread. Times are processor times. A solver is made
+for one problem and serves all that differ in parameters only.
 """
 
 import signal
@@ -21,7 +22,7 @@ from lqrsim.process import SIGNALS
 from peers import formulas, ipopt
 from peers.common import Answer
 
-TOLERANCE, MAX_ITERATIONS = 1e-8, 500  # the latter as lqrsim has it
+TOLERANCE, MAX_ITERATIONS = 1e-8, 3000
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Moment:
     """How far a solver had come.
 
     Attributes:
-      iterations: how many it had made. seconds: since the solve began.
+      iterations: how many it had made. seconds: processor time since the call.
       cost, violation: of the plan at that time; the violation is the largest, that of the dynamics among them.
     """
 
@@ -46,15 +47,18 @@ class Shooting:
       problem: of the kind that is to be solved.
       plugin: "ipopt" or "fatrop".
       compile: to C and with g++, for speed.
+      **settings: options of IPOPT or FATROP.
 
     Raises:
       Unavailable: CasADi is not installed, or g++ where it is needed.
       NotImplementedError: something of the problem is no formula.
     """
 
-    def __init__(self, problem: ls.Problem, plugin: Literal["ipopt", "fatrop"], *, compile: bool) -> None:
+    def __init__(
+        self, problem: ls.Problem, plugin: Literal["ipopt", "fatrop"], *, compile: bool, **settings: Any
+    ) -> None:
         ca = ipopt.casadi()
-        self._plugin = plugin
+        self._plugin, self._own = plugin, settings
         told = formulas.formulas(problem)
         nlp, self._equal = _nlp(problem, told)
         self._nlp = nlp
@@ -99,7 +103,7 @@ class Shooting:
         shown: list[tuple[float, Array]] = []
         watch = _watch(self._nlp, shown)
         solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
-        begun = time.perf_counter()
+        begun = time.process_time()
         self._run(solver, problem, states, controls)
         # Counted back from the last: IPOPT shows its plan once more wherever it begins to restore feasibility.
         for count, (when, plan) in enumerate(shown, iterations + 1 - len(shown)):
@@ -109,9 +113,9 @@ class Shooting:
     def _stopped(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
         for count in range(1, iterations + 1):
             solver = self._made(count - 1)  # as Fatrop counts, in its last iteration it only looks at what it has
-            begun = time.perf_counter()
+            begun = time.process_time()
             plan = self._run(solver, problem, states, controls)["x"].full().ravel()
-            yield Moment(count, time.perf_counter() - begun, *self._worth(problem, plan))
+            yield Moment(count, time.process_time() - begun, *self._worth(problem, plan))
 
     def worth(self, problem: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
         """Cost and largest violation of a plan, the dynamics included, as the solver is told of them.
@@ -121,7 +125,7 @@ class Shooting:
         return self._worth(problem, _packed(_stated(problem, states), controls))
 
     def _settings(self, iterations: int) -> dict[str, Any]:
-        settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
+        settings = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE, **self._own}
         # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
         return settings | ({"sb": "yes", "honor_original_bounds": "yes"} if self._plugin == "ipopt" else {})
 
@@ -245,7 +249,7 @@ def _watch(nlp: dict[str, Any], shown: list[tuple[float, Array]]) -> Any:
             return ca.Sparsity.dense(sizes[name]) if (name := ca.nlpsol_out(i)) in sizes else ca.Sparsity(0, 0)
 
         def eval(self, arguments: Any) -> list[int]:
-            shown.append((time.perf_counter(), arguments[0].full().ravel()))
+            shown.append((time.process_time(), arguments[0].full().ravel()))
             return [0]
 
     return Watch()
