@@ -153,8 +153,9 @@ class World:
           seconds: the delay in seconds; negative for an earlier time.
         """
         seconds = check_number("seconds", seconds)
-        moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]
-        return World(moved) if self.moving else self
+        if not self.moving:
+            return self
+        return World([replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles])
 
     def seen_by(self, plane: str, offset: float | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
@@ -180,6 +181,15 @@ class World:
         offset = None if offset is None else check_number("offset", offset)
         if plane == SPACE:
             return self
+        if (plane, offset) not in self._seen:
+            self._seen[plane, offset] = self._seen_by(plane, offset)
+        return self._seen[plane, offset]
+
+    @cached_property
+    def _seen(self) -> "dict[tuple[str, float | None], World]":
+        return {}
+
+    def _seen_by(self, plane: str, offset: float | None) -> "World":
         if offset is None and plane not in ("xy", "yx"):
             raise InputError(
                 f"offset: got none for the plane {plane!r}, want its coordinate along the third axis, in metres"
