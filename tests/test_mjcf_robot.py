@@ -465,6 +465,40 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
         robot.problem(start, goal, weights={"N": 1.0})
 
 
+def test_a_free_body_does_not_tumble_on_its_way() -> None:
+    """Eight thrusters, which could turn it in any way while it flies; the attitude of what it handles costs nothing."""
+    places = [(x, y) for x in (-0.15, 0.15) for y in (-0.1, 0.1)]
+    sites = "".join(f'<site name="{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(places))
+    thrusters = "".join(
+        f'<motor site="{i}" gear="0.7 {0.7 if x * y > 0 else -0.7} 0 0 0 0" ctrlrange="-35 35"/>'
+        f'<motor site="{i}" gear="0 0 1 0 0 0" ctrlrange="-35 35"/>'
+        for i, (x, y) in enumerate(places)
+    )
+    robot = ls.MjcfRobot(
+        scene_from_xml(
+            f"""<mujoco><option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/><worldbody>
+            <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/><geom type="ellipsoid" mass="11.5"
+            size="0.25 0.18 0.13"/>{sites}</body><body name="crate" pos="0 3 1" gravcomp="1"><freejoint name="crate"/>
+            <geom size="0.1"/></body></worldbody><actuator>{thrusters}</actuator></mujoco>""",
+            "rov",
+        ),
+        body="rov",
+    )
+    goal = robot.at(rov_x=5.0, rov_y=0.3, rov_z=1.4, rov_rz=0.5)
+    problem = robot.problem(robot.at(), goal, steps=80, dt=0.1)
+    solution = ls.smooth(problem, max_iterations=40, starts=1, threads=1)
+    assert solution.status is ls.Status.CONVERGED
+    names = robot.dynamics.state_coordinates.names
+    first = names.index("rov_rx")
+    assert np.linalg.norm(solution.trajectory.states[:, first : first + 3], axis=1).max() < 1.0
+    (calm,) = (one for one in terms_of(problem.stage_cost) if isinstance(one, ls.QuadraticCost))
+    weights = dict(zip(names, np.diag(calm.weight), strict=True))
+    assert {name: weight for name, weight in weights.items() if weight} == {
+        "rov_rx": 0.1, "rov_ry": 0.1, "rov_rz": 0.1, "rov_wx": 0.05, "rov_wy": 0.05, "rov_wz": 0.05,
+    }  # fmt: skip
+    np.testing.assert_array_equal(calm.about, np.where(np.array(names) == "rov_rz", 0.5, 0.0))
+
+
 @settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS)
 def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:
