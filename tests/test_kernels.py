@@ -1051,13 +1051,13 @@ class TestParts:
         team[mjcf_dynamics.HELPERS] = 1
         self.steps(dynamics, x, u, 0.005 * drawn.substeps)
         numbers, sizes = dynamics.data, {"N": n, "M": m, "W": n + m}
-        size = 1 + n + m + 6 + n * (n + m)
+        size = 1 + (n + m) + n + 6 + n * (n + m)
         job = np.ctypeslib.as_array((ctypes.c_double * size).from_address(int(numbers[mjcf_dynamics.JOB])))
         plain = plain_functions(dynamics.step_source, sizes, ["help_out"])["help_out"]
         found = []
         for help_out in (plain, dynamics.compiled.help_out):
-            job[: 1 + n + m] = drawn.substeps, *x, *u
-            job[1 + n + m + 6 :] = np.nan
+            job[:] = np.nan
+            job[: 1 + n + m + n + 6] = 1.0, *x, *u, *np.zeros(n + 6)
             team[[mjcf_dynamics.DONE, mjcf_dynamics.STOP]] = 0
             team[mjcf_dynamics.TICKET] = (team[mjcf_dynamics.TICKET] // mjcf_dynamics.JOBS + 1) * mjcf_dynamics.JOBS
             helper = threading.Thread(target=help_out, args=(numbers,))
@@ -1066,9 +1066,9 @@ class TestParts:
                 time.sleep(0.001)
             team[mjcf_dynamics.STOP] = 1
             helper.join()
-            found.append(job[1 + n + m + 6 :].reshape(n, n + m).copy())
+            found.append(job[-n * (n + m) :].reshape(n, n + m).copy())
         same(found[1], found[0], 1.0, "help_out")
-        a, b, _ = dynamics.linearize(x, u, 0.005 * drawn.substeps)
+        a, b, _ = dynamics.linearize(x, u, 0.005)  # a physics step
         same(found[1], np.concatenate([a, b], axis=1), 1.0, "help_out")
         COMPARED["lqrsim.kernels.mjcf_dynamics.help_out"] += 1
 

@@ -3,8 +3,8 @@
 States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
 states. The rotation of a ball or free joint is three numbers, a rotation vector. `p` has the wrench on the body, then
 addresses and sizes, at the indices named below; `scenes/mjcf_physics.py` writes it. Several threads may run these
-functions at once. Each takes a slot, two `MjData` that it owns for as long as it needs them. If bodies carry loads, a
-slot also has its own model.
+functions at once. Each takes a slot, an `MjData` that it owns for as long as it needs it. If bodies carry loads, a slot
+also has its own model.
 
 A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and
 `exact`. Otherwise LLVM would reorder sums depending on where they are inlined, and bits would depend on the thread.
@@ -27,33 +27,40 @@ from lqrsim.kernels.declarations import (
     rows_at,
     stack,
     store,
+    zeros,
 )
+from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
 # The layout of p. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: flags of the slots
-# in use, address of their numbers, number of slots. MODEL: MuJoCo's model. STEP, FORWARD, INTEGRATE: the addresses of
-# mj_step, mj_forwardSkip and the integrator; the last is 0 if parts of a step cannot be called separately. TIMESTEP:
-# timestep of the physics, in s. NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of
-# joints; ACTUATORS: address of the list of actuators that the controls drive. TEAM, JOB: addresses at which helper
-# threads find their work, 0 without helpers; YIELD: the address of the function that yields to other threads;
-# KINEMATICS, RESET, COMPOS, JAC, DISTANCE: the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
-# mj_geomDistance; DISTANCE_MODEL: the model for distances. LOADED, LOADS: number of bodies that may carry a load, and
-# address of the loads, in kg; the numbers of these bodies and their own masses follow. CONSTANTS: the address of
-# mj_setConst. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
-WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
+# in use, address of their numbers, number of slots. MODEL: MuJoCo's model. STEP, STEP_SKIP: the addresses of mj_step
+# and mj_stepSkip. KEEPS: whether stages of a step can be kept for the next. TIMESTEP: timestep of the physics, in s.
+# NV, NA: numbers of degrees of freedom and of actuators' states. JOINTS: number of joints; ACTUATORS: address of the
+# list of actuators that the controls drive. TEAM, JOB: addresses at which helper threads find their work, 0 without
+# helpers; YIELD: the address of the function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE:
+# the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model for
+# distances. LOADED, LOADS: number of bodies that may carry a load, and address of the loads, in kg; the numbers of
+# these bodies and their own masses follow. CONSTANTS: the address of mj_setConst. TABLE: the joints' kind and places in
+# qpos and qvel, three numbers each.
+WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, STEP_SKIP, KEEPS = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
 RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29, 30
 
-# Addresses that a slot has for each of its two MjData.
-SLOT, SIZE = 28, 14
+# Addresses that a slot has for its MjData, and their number.
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
-OWN_MODEL, MASSES = 12, 13
+OWN_MODEL, MASSES, SLOT = 12, 13, 14
 
 # The words that a team shares: whether it is in use, the next column, combined with the number of the job, the number
 # of finished columns, whether to stop, the number of helpers, and whether a signal came, after which all steps are NaN.
 BUSY, TICKET, DONE, STOP, HELPERS, SIGNALLED = 0, 1, 2, 3, 4, 5
 JOBS = 65536  # the ticket is JOBS * job + column
 PATIENT = 2000  # number of looks at the ticket before a helper lets other threads run
+
+# The width of differences, relative to a number or to 1. Rounding errors, some 1e-15 of a physics step, are then 1e-9
+# of a derivative; at a jump, as where a body just touches, narrower differences would be steeper. Differences to one
+# side suffice while their error, relative to the largest entry, is below CURVED: it is 1e-7 to 1e-6 in free motion of
+# arms, less after the errors of neighbouring steps have cancelled, and 1e-5 to 1e-2 with contacts.
+WIDTH, CURVED = 1e-6, 1e-5
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
 LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are no valid state
@@ -64,62 +71,129 @@ def advance(x, u, p, h, out):
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
     if substeps < 1:
-        for i in range(N):
-            out[i] = nan
+        fill(out, N, nan)
         return
     slot = take_slot(p)
-    run(z, p, p, substeps, at(p[SLOTS] + 8 * SLOT * slot + 8 * SIZE), out)
+    run(z, p, substeps, at(p[SLOTS] + 8 * SLOT * slot), out)
     store(p[FLAGS], slot, 0)
 
 
 def step_jacobian(x, u, p, h, out, jacobian):
-    """Write the same step and its Jacobian `[A B]` (N, W), by central differences over the whole step.
+    """Write the same step and its Jacobian `[A B]` (N, W): the product of those of the physics steps.
 
+    The Jacobian of a physics step is of one-sided differences; and of both sides, where the step is too curved.
     Free helpers also compute columns. The bits do not depend on which thread computed a column.
     """
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
     if substeps < 1:
+        fill(out, N, nan)
         for i in range(N):
-            out[i] = nan
-            for j in range(W):
-                jacobian[i, j] = nan
+            fill(jacobian[i], W, nan)
         return
     team, slot = p[TEAM], take_slot(p)
     together = team != 0 and load(team, HELPERS) > 0 and claim(team, BUSY) == 1
+    one, before, accelerations, arrived = at(p[SLOTS] + 8 * SLOT * slot), zeros(N), zeros(N), stack(N)
+    columns, other_side = stack(N, W), stack(N, W)
+    run(z, p, substeps, one, out)
+    for k in range(substeps):
+        # Errors of one-sided differences change their sign with the side: those of neighbouring steps nearly cancel.
+        side = 1.0 if k % 2 == 0 else -1.0
+        difference(z, p, side, together, one, before, accelerations, arrived, columns)
+        if curved(z, p, side, one, accelerations, arrived, columns):
+            difference(z, p, -side, together, one, before, accelerations, arrived, other_side)
+            for i in range(N):
+                for j in range(W):
+                    columns[i, j] = 0.5 * (columns[i, j] + other_side[i, j])
+        if k == 0:
+            copy_matrix(columns, N, W, jacobian)
+        else:
+            follow(columns, jacobian)
+        copy(arrived, N, z)
+        copy(accelerations, N, before)
     if together:
-        job = at(p[JOB])
-        job[0] = substeps
-        for i in range(W):
-            job[1 + i] = z[i]
-        for i in range(6):
-            job[1 + W + i] = p[WRENCH + i]
-        store(team, DONE, 0)
-        store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
-    address, warm = p[SLOTS] + 8 * SLOT * slot, stack(N)
-    run(z, p, p, substeps, at(address + 8 * SIZE), out)
-    linearize_here(z, p, p, address, warm)
-    if not together:
+        store(team, BUSY, 0)
+    store(p[FLAGS], slot, 0)
+
+
+def difference(z, p, side, together, one, before, accelerations, arrived, columns):
+    """Write the Jacobian of a physics step by differences to one side, with the helpers if there is a team.
+
+    Args:
+      side: 1 or -1. one: a slot. before: (N,) accelerations of the step before, at which MuJoCo's solver begins.
+      accelerations, arrived: (N,) those of this step and the state after it, written.
+    """
+    if together:
+        publish(z, p, side, before)
+    linearize_here(z, p, p, one, before, accelerations, arrived)
+    if together:
+        share_columns(z, p, side, one, accelerations, arrived, columns)
+    else:
         for k in range(W):
-            column(k, z, p, p, substeps, address, warm, jacobian)
-        store(p[FLAGS], slot, 0)
-        return
-    columns = job_columns(p)
+            column(k, z, p, side, one, accelerations, arrived, columns)
+
+
+@outline
+@exact
+def curved(z, p, side, one, accelerations, arrived, columns):
+    """Whether one-sided differences of a physics step are too inexact.
+
+    A change of everything at once, to the other side, then leads elsewhere than the columns say.
+    """
+    moved, reached, off, largest = stack(W), stack(N), 0.0, 0.0
+    for j in range(W):
+        moved[j] = z[j] - side * WIDTH * max(1.0, abs(z[j]))
+    step_from(moved, z, p, one, accelerations, 0, reached)
+    for i in range(N):
+        expected = arrived[i]
+        for j in range(W):
+            expected += columns[i, j] * (moved[j] - z[j])
+            largest = max(largest, abs(columns[i, j]))
+        off = max(off, abs(reached[i] - expected))
+    return off > 2 * CURVED * WIDTH * largest  # twice, as the errors of both sides add up
+
+
+@outline
+@exact
+def follow(columns, jacobian):
+    """Let a step with these columns, [A B], follow the steps of a Jacobian: A times it, plus B in the controls."""
+    before = stack(N, W)
+    copy_matrix(jacobian, N, W, before)
+    for i in range(N):
+        for j in range(W):
+            jacobian[i, j] = columns[i, j] if j >= N else 0.0
+        for k in range(N):
+            for j in range(W):
+                jacobian[i, j] += columns[i, k] * before[k, j]
+
+
+def publish(z, p, side, before):
+    """Hand a job to the helpers: the side, the state and the control, the accelerations before, and the wrench."""
+    team, job = p[TEAM], at(p[JOB])
+    job[0] = side
+    for i in range(W):
+        job[1 + i] = z[i]
+    for i in range(N):
+        job[1 + W + i] = before[i]
+    for i in range(6):
+        job[1 + W + N + i] = p[WRENCH + i]
+    store(team, DONE, 0)
+    store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
+
+
+def share_columns(z, p, side, one, accelerations, arrived, columns):
+    """Compute columns of the job that helpers also have, and write all."""
+    team, shared, patience = p[TEAM], job_columns(p), 0
     k = fetch_add(team, TICKET, 1) % JOBS
     while k < W:
-        column(k, z, p, p, substeps, address, warm, columns)
+        column(k, z, p, side, one, accelerations, arrived, shared)
         fetch_add(team, DONE, 1)
         k = fetch_add(team, TICKET, 1) % JOBS
-    patience = 0
     while load(team, DONE) < W:  # a helper still has work to do, once it gets to run
         patience += 1
         if patience > PATIENT and p[YIELD] != 0:
             call(p[YIELD])
-    for i in range(N):
-        for j in range(W):
-            jacobian[i, j] = columns[i, j]
-    store(team, BUSY, 0)
-    store(p[FLAGS], slot, 0)
+    copy_matrix(shared, N, W, columns)
 
 
 def help_out(p):
@@ -128,8 +202,8 @@ def help_out(p):
     A thread takes a column first, and reads its job afterwards. Until the column is done, no other job is written.
     """
     team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
-    address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)
-    z, wrench = stack(W), stack(6)
+    one, job, columns = at(p[SLOTS] + 8 * SLOT * slot), at(p[JOB]), job_columns(p)
+    z, wrench, before, accelerations, arrived = stack(W), stack(6), stack(N), zeros(N), stack(N)
     while load(team, STOP) == 0:
         if load(team, TICKET) % JOBS >= W:
             patience += 1
@@ -143,70 +217,60 @@ def help_out(p):
             known = ticket // JOBS
             for i in range(W):
                 z[i] = job[1 + i]
+            for i in range(N):
+                before[i] = job[1 + W + i]
             for i in range(6):
-                wrench[i] = job[1 + W + i]
-            linearize_here(z, p, wrench, address, warm)
-        column(ticket % JOBS, z, p, wrench, int(job[0]), address, warm, columns)
+                wrench[i] = job[1 + W + N + i]
+            linearize_here(z, p, wrench, one, before, accelerations, arrived)
+        column(ticket % JOBS, z, p, job[0], one, accelerations, arrived, columns)
         fetch_add(team, DONE, 1)
     store(p[FLAGS], slot, 0)
 
 
 def job_columns(p):
     """Destination of a job's columns: rows of W numbers."""
-    return rows_at(p[JOB] + 8 * (1 + W + 6), W)
+    return rows_at(p[JOB] + 8 * (1 + W + N + 6), W)
 
 
-def run(z, p, wrench, substeps, two, out):
+def run(z, p, substeps, one, out):
     """Write the state after this number of physics steps."""
-    write_loads(p, two)
-    write_to(z, p, two)
-    begin(p, wrench, two)
-    for _ in range(substeps):
-        call(p[STEP], at(two[OWN_MODEL]), at(two[DATA]))
-    read_from(z, p, two, out)
-
-
-def linearize_here(z, p, wrench, address, warm):
-    """Set the first MjData of a slot to the state that columns differ from, and write MuJoCo's accelerations there."""
-    one = at(address)
+    none = zeros(N)
     write_loads(p, one)
     write_to(z, p, one)
-    begin(p, wrench, one)
-    call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(0), int32(1))
-    accelerations = at(one[QACC])
+    push(p, one)
+    start_from(p, one, none)  # so that it is independent of earlier steps
+    for _ in range(substeps):
+        call(p[STEP], at(one[OWN_MODEL]), at(one[DATA]))
+    read_from(z, p, one, out)
+
+
+def linearize_here(z, p, wrench, one, before, accelerations, arrived):
+    """Bring the MjData of a slot to the stages of a physics step, from which columns keep what does not change."""
+    write_loads(p, one)
+    push(wrench, one)
+    step_from(z, z, p, one, before, 0, arrived)
+    found = at(one[QACC])
     for i in range(int(p[NV])):
-        warm[i] = accelerations[i]
+        accelerations[i] = found[i]
+    step_from(z, z, p, one, accelerations, 2, arrived)
 
 
 @outline
 @exact
-def column(k, z, p, wrench, substeps, address, warm, jacobian):
-    """Write the k-th column of the Jacobian. Controls come first: they do not change the stage of velocities.
+def column(k, z, p, side, one, accelerations, arrived, jacobian):
+    """Write the k-th column of a physics step's Jacobian, after `linearize_here`.
 
-    A perturbed velocity or control does not change the position stage of the first physics step, so that stage is
-    reused. MuJoCo's solver starts at the solution of the unperturbed step. Both sides then end equally near to their
-    solutions, so that the solver's tolerance is not divided by the difference.
+    Controls come first, then actuators' states, velocities and positions, each of which changes an earlier stage of a
+    step: what comes before that stage is kept. MuJoCo's solver starts at the solution of the unperturbed step. Both
+    steps then end equally near to their solutions, so that the solver's tolerance is not divided by the difference.
     """
-    one, two, nv = at(address), at(address + 8 * SIZE), int(p[NV])
-    moved, ahead, behind = stack(W), stack(N), stack(N)
-    for i in range(W):
-        moved[i] = z[i]
-    j = k + N if k < M else k - M
-    difference = 1e-6 * max(1.0, abs(z[j]))
-    kept = 0 if j < nv or p[INTEGRATE] == 0 else 1 if j < N else 2
-    for side in range(2):
-        moved[j] = z[j] + difference if side == 0 else z[j] - difference
-        begin(p, wrench, two)
-        if kept > 0:
-            step_from(moved, p, one, two, warm, kept)
-        else:
-            write_to(moved, p, two)
-            start_from(p, two, warm)
-        for _ in range(substeps - 1 if kept > 0 else substeps):
-            call(p[STEP], at(two[OWN_MODEL]), at(two[DATA]))
-        read_from(z, p, two, ahead if side == 0 else behind)
+    moved, reached, nv = stack(W), stack(N), int(p[NV])
+    copy(z, W, moved)
+    j = k + N if k < M else W - 1 - k
+    moved[j] += side * WIDTH * max(1.0, abs(z[j]))
+    step_from(moved, z, p, one, accelerations, 2 if j >= 2 * nv else 1 if j >= nv else 0, reached)
     for i in range(N):
-        jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
+        jacobian[i, j] = (reached[i] - arrived[i]) / (moved[j] - z[j])
 
 
 def steps_in(x, u, p, h, z):
@@ -259,13 +323,11 @@ def write_positions(x, p, qpos):
             qpos[q] = x[d]
 
 
-def begin(p, wrench, one):
-    """Make the next step of an MjData independent of earlier steps, and apply the wrench to the body."""
-    warm, push = at(one[WARM]), at(one[PUSH])
-    for i in range(int(p[NV])):
-        warm[i] = 0.0
+def push(wrench, one):
+    """Apply the wrench to the body."""
+    applied = at(one[PUSH])
     for i in range(6):
-        push[i] = wrench[WRENCH + i]
+        applied[i] = wrench[WRENCH + i]
 
 
 def write_loads(p, one):
@@ -291,27 +353,12 @@ def start_from(p, one, guess):
         warm[i] = guess[i]
 
 
-def step_from(z, p, one, two, guess, kept):
-    """Write a physics step to `two`, reusing the stages of `one` that do not change."""
+def step_from(z, near, p, one, guess, kept, out):
+    """Write the state after a physics step, which keeps that number of stages of the MjData if it can."""
     write_to(z, p, one)
     start_from(p, one, guess)
-    call(p[FORWARD], at(one[OWN_MODEL]), at(one[DATA]), int32(kept), int32(1))
-    call(p[INTEGRATE], at(one[OWN_MODEL]), at(one[DATA]))
-    nv = int(p[NV])
-    write_to(z, p, two)
-    for k in range(int(p[JOINTS])):
-        kind, q = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1])
-        copy_between(one[QPOS], two[QPOS], q, 7 if kind == FREE else 4 if kind == BALL else 1)
-    copy_between(one[QVEL], two[QVEL], 0, nv)
-    copy_between(one[WARM], two[WARM], 0, nv)
-    copy_between(one[ACT], two[ACT], 0, int(p[NA]))
-
-
-def copy_between(source, target, first, count):
-    """Copy numbers from one address to another."""
-    there, here = at(source), at(target)
-    for i in range(first, first + count):
-        here[i] = there[i]
+    call(p[STEP_SKIP], at(one[OWN_MODEL]), at(one[DATA]), int32(kept if p[KEEPS] != 0 else 0), int32(1))
+    read_from(near, p, one, out)
 
 
 def read_from(near, p, one, out):

@@ -334,6 +334,7 @@ class MjcfRobot(Robot):
         weights: PerEntry = 100.0,
         effort: PerEntry | None = None,
         damping: float = 1e-3,
+        attitude: float = 0.1,
         limits: float = 100.0,
         clearance: float | None = None,
     ) -> Problem:
@@ -356,6 +357,8 @@ class MjcfRobot(Robot):
             so that a deviation of that size costs 1/2. The largest value comes from the control limits, else from the
             force limits, else it is 1.
           damping: weight of the velocities of hinges, slides and ball joints at each step.
+          attitude: if the robot's body moves on a free joint, the weight of its attitude, about the goal's, at each
+            step; half of it is that of its angular velocity. With 0, nothing keeps a plan from tumbling on its way.
           limits: weight of joint limits at each step. The cost of a limit begins at the least of these distances from
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
           clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
@@ -376,11 +379,17 @@ class MjcfRobot(Robot):
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
         spent = efforts(model) ** -2.0 if effort is None else effort
         cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
-        damping, moves = check_number("damping", damping, at_least=0.0), np.zeros(n)
+        damping, attitude = (check_number(*one, at_least=0.0) for one in (("damping", damping), ("attitude", attitude)))
+        calm, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
         for one in self._joints:
-            moves[model.nv : 2 * model.nv][one.dofs] = damping if one.kind != "free" else 0.0
-        if moves.any():
-            cost = cost + QuadraticCost(moves, about=np.zeros(n))
+            if one.kind != "free":
+                calm[model.nv : 2 * model.nv][one.dofs] = damping
+            elif model.dof_bodyid[one.dof] == root:  # not of something that the robot handles
+                turned = slice(one.dof + 3, one.dof + 6)
+                calm[turned], about_state[turned] = attitude, goal[turned]
+                calm[model.nv : 2 * model.nv][turned] = 0.5 * attitude
+        if calm.any():
+            cost = cost + QuadraticCost(calm, about=about_state)
         bounds = self._bounds(start, goal)
         if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)

@@ -39,8 +39,9 @@ class MjcfDynamics(Dynamics):
 
     The state is the position of each joint, in MuJoCo's order of degrees of freedom and with rotations of ball and free
     joints as rotation vectors; then the velocities; then the states of actuators that have states. The control is
-    MuJoCo's `ctrl`. Derivatives are central differences over the control period. There is no rate: solvers in
-    continuous time, and solvers that need an inverse, do not accept these dynamics.
+    MuJoCo's `ctrl`. Derivatives are products of those of the physics steps, differences that are each good to 1e-5 of
+    the largest entry; those of an arm's period are good to some 1e-7. There is no rate: solvers in continuous time, and
+    solvers that need an inverse, do not accept these dynamics.
 
     Attributes:
       xml: the MJCF. physics: MuJoCo's model, and memory for each thread.

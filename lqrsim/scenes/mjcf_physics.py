@@ -17,11 +17,6 @@ from lqrsim.scenes.scene import model_from_xml, unlogged
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
-_PARTS = {
-    mujoco.mjtIntegrator.mjINT_EULER: "mj_Euler",
-    mujoco.mjtIntegrator.mjINT_IMPLICIT: "mj_implicit",
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "mj_implicit",
-}
 
 
 class MjcfPhysics:
@@ -72,7 +67,7 @@ class MjcfPhysics:
         # With loads, each slot has its own model, which may be large; filters need one slot.
         slots = 2 if loaded else 2 * processors()
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
-        self._data = [mujoco.MjData(self.model) for _ in range(2 * slots)]
+        self._data = [mujoco.MjData(self.model) for _ in range(slots)]
         for data in self._data:
             # MuJoCo reports the first warning of each kind to a file and the console; here no warning counts as the
             # first.
@@ -82,14 +77,13 @@ class MjcfPhysics:
         self.team = np.zeros(8, dtype=np.int64)
         n, m = 2 * self.model.nv + self.model.na, len(actuators)
         self.team[kernel.TICKET] = n + m  # a job without columns left
-        self._job = np.zeros(1 + n + m + 6 + n * (n + m))
-        own = [model for model in self._models for _ in range(2)]
-        addresses = [self._addresses(data, model, body) for data, model in zip(self._data, own, strict=True)]
+        self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
+        addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
         self._table = np.array(addresses, dtype=np.float64)
         self.numbers = self._numbers(actuators, self.carriers if loaded else ())
 
     def _addresses(self, data: mujoco.MjData, model: mujoco.MjModel, body: int) -> list[float]:
-        row = np.zeros(kernel.SIZE)
+        row = np.zeros(kernel.SLOT)
         fields = {
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
             kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
@@ -104,12 +98,12 @@ class MjcfPhysics:
     def _numbers(self, actuators: tuple[int, ...], carriers: tuple[int, ...]) -> Array:
         model, functions = self.model, _functions()
         joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
-        part = _PARTS.get(mujoco.mjtIntegrator(model.opt.integrator))
         numbers = np.zeros(kernel.TABLE)
         numbers[kernel.FLAGS], numbers[kernel.SLOTS] = self._flags.ctypes.data, self._table.ctypes.data
         numbers[kernel.COUNT], numbers[kernel.MODEL] = len(self._flags), model._address
-        numbers[kernel.STEP], numbers[kernel.FORWARD] = functions["mj_step"], functions["mj_forwardSkip"]
-        numbers[kernel.INTEGRATE] = functions[part] if part else 0
+        numbers[kernel.STEP], numbers[kernel.STEP_SKIP] = functions["mj_step"], functions["mj_stepSkip"]
+        # RK4 ends with the stages of its last evaluation.
+        numbers[kernel.KEEPS] = model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
         numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
@@ -224,7 +218,7 @@ def _functions() -> dict[str, int]:
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
     names = (
-        "mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac",
-        "mj_geomDistance", "mj_setConst",
+        "mj_step", "mj_stepSkip", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac", "mj_geomDistance",
+        "mj_setConst",
     )  # fmt: skip
     return {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value or 0 for name in names}

@@ -58,7 +58,47 @@ def wheel(rng: Generator) -> str:
         gainprm="1" ctrlrange="-2 2"/></actuator>"""
 
 
-KINDS = {"cart": cart, "arm": arm, "box": box, "wheel": wheel}
+def rig(rng: Generator) -> str:
+    """Two levers and a towed body with any of what ties them: equalities, a mocap body, tendons, springs, friction.
+
+    The actuators are two of many kinds, with and without states, on joints, on tendons, or with gains that depend on
+    the velocity.
+    """
+    levers = "".join(
+        f"""<body name="{name}" pos="{x} 0 0"><joint name="{name}" type="{rng.choice(["hinge", "slide"])}" axis="0 1 0"
+          damping="{rng.uniform(0.1, 1):.4f}" stiffness="{rng.choice([0, 2])}" frictionloss="{rng.choice([0, 0, 0.1])}"
+          armature="0.05"/><geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
+          <site name="{name}" pos="0.3 0 0"/></body>"""
+        for name, x in (("left", 0.0), ("right", 0.5))
+    )
+    ties = {
+        "joint": '<joint joint1="right" joint2="left" polycoef="0 0.5 0.1 0 0"/>',
+        "connect": '<connect body1="towed" body2="hand" anchor="0.1 0 0"/>',
+        "tendon": '<tendon tendon1="belt" polycoef="0.1 0 0 0 0"/>',
+    }
+    chosen = [tie for tie in ties.values() if rng.random() < 0.4]
+    drives = (
+        '<motor name="{}" joint="left" gear="3"/>',
+        '<position name="{}" joint="right" kp="20" kv="1" timeconst="0.05"/>',
+        '<intvelocity name="{}" joint="left" kp="10" actrange="-1 1"/>',
+        '<damper name="{}" joint="right" kv="2" ctrlrange="0 1"/>',
+        '<velocity name="{}" tendon="belt" kv="2"/>',
+        '<general name="{}" tendon="rope" dyntype="filterexact" dynprm="0.03" gainprm="2"/>',
+        '<muscle name="{}" tendon="rope" ctrlrange="0 1" lengthrange="0.1 1.5" force="5"/>',
+    )
+    driven = "".join(drives[i].format(f"drive{k}") for k, i in enumerate(rng.choice(len(drives), 2, replace=False)))
+    return f"""
+      <worldbody><body name="hand" mocap="true" pos="0 0.3 0"/>{levers}
+        <body name="towed" pos="0 0.3 0"><joint name="towed" type="free" damping="0.1"/><geom type="box"
+          size="0.1 0.05 0.03" mass="{rng.uniform(0.5, 2):.4f}" contype="0" conaffinity="0"/></body></worldbody>
+      <tendon><fixed name="belt" stiffness="{rng.choice([0, 3])}" damping="0.1"><joint joint="left" coef="0.7"/>
+          <joint joint="right" coef="-0.4"/></fixed>
+        <spatial name="rope" stiffness="{rng.choice([0, 5])}"><site site="left"/><site site="right"/></spatial></tendon>
+      <equality>{"".join(chosen)}</equality>
+      <actuator>{driven}</actuator>"""
+
+
+KINDS = {"cart": cart, "arm": arm, "box": box, "wheel": wheel, "rig": rig}
 
 
 def draw(kind: str, seed: int, integrator: str | None = None) -> Drawn:
