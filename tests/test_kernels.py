@@ -61,6 +61,7 @@ from lqrsim.kernels import (
     restoration,
     rollouts,
     rotation_ratios,
+    secants,
     signed_distance,
     sphere_centers,
 )
@@ -1207,9 +1208,11 @@ class TestPlanMethods:
         stages = Stages(problem(steps=3, constraints=kept, **changed))
         return stages, Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
 
-    @pytest.mark.parametrize(("price", "informed"), [(np.inf, False), (20.0, True)])
-    def test_interior_point(self, price: float, informed: bool) -> None:
+    @pytest.mark.parametrize(("price", "informed", "learns"), [(np.inf, False, 1), (20.0, True, 0)])
+    def test_interior_point(self, price: float, informed: bool, learns: int) -> None:
+        """With multipliers that are known and without; with the curvature of the dynamics and with secants."""
         stages, plan = self.made(**({"initial": ls.FixedState([0.0, 0.0, 0.3])} if informed else {}))
+        stages.about = stages.about._replace(learns=learns)
         point = InteriorPoint(stages, plan, price=price)
         stages.state(margin=1e-9)
         known = np.abs(stages.numbers.ravel()) if informed else np.zeros(stages.live.size)
@@ -1241,8 +1244,38 @@ class TestPlanMethods:
         replay(kernel, SIZES, "asked", *state[:2])
         run(interior_point.SETTLE, 0, 0)
         memory["solved"] = 1.0
+        run(interior_point.ITERATE, 2, 2)
         replay(kernel, SIZES, "cross", 1e6, 1e6, *state)
         assert np.isfinite(point.measures).all()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_secants_learn_a_quadratic_function(self, seed: int) -> None:
+        """After n + m steps, SR1 has its Hessian exactly (Nocedal and Wright, Theorem 6.1), up to rounding."""
+        stages, plan = self.made()
+        about = stages.about._replace(learns=1)
+        rng, source, models = np.random.default_rng(seed), source_of(secants), stages.models
+        hessian = rng.normal(size=(4, 5, 5))
+        hessian += hessian.transpose(0, 2, 1)
+        hessian[3, 3:], hessian[3, :, 3:] = 0.0, 0.0  # the last stage has no control
+        models.hessian[...] = 0.3 * hessian
+        models.jacobian[...], stages.force[...] = 0.0, 0.0
+        costates, moves, turns = np.zeros((4, 3)), np.zeros((4, 5)), np.zeros((4, 5))
+
+        def joined() -> Array:
+            return np.hstack([plan.states, np.vstack([plan.controls, np.zeros((1, 2))])])
+
+        replay(source, SIZES, "forget", about)
+        for step in range(5):
+            models.gradient[...] = np.einsum("tij,tj->ti", hessian, joined())
+            before = Motion(*map(np.copy, plan))
+            for part in plan:
+                part += rng.normal(size=part.shape)
+            replay(source, SIZES, "remember", about, before, plan, costates, moves, turns)
+            models.gradient[...] = np.einsum("tij,tj->ti", hessian, joined())
+            replay(source, SIZES, "learn", about, costates, moves, turns, step == 2)
+        assert stages.about.slow[0] == 1.0
+        np.testing.assert_allclose(models.hessian, hessian, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(models.learned, 0.7 * hessian, rtol=0, atol=1e-7)
 
     def test_active_set(self) -> None:
         """With rows of all kinds held, and prices."""

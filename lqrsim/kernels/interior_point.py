@@ -31,6 +31,7 @@ from lqrsim.kernels.active_set import (
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, compact
 from lqrsim.kernels.linear_algebra import copy
 from lqrsim.kernels.rollouts import copy_plan, larger
+from lqrsim.kernels.secants import forget, learn, remember
 from lqrsim.kernels.stages import (
     EQUALITY,
     LIMIT,
@@ -77,6 +78,7 @@ CROSSINGS = 8  # largest number of final steps without a barrier
 SETTLED = 1e-3  # fraction of the tolerances at which these end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
 CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
+CRAWL = 0.5  # factor by which stationarity falls too little, so that the Hessians need what is learned of them
 SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
 ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
@@ -153,6 +155,7 @@ def begin(begun, stages, work, mem):
     adjoint(stages, work.costates, work.other.changes.controls)
     take_measures(stages, work, mem)
     violated = off(now, stages)
+    forget(stages)
     mem.before = mem.cost
     mem.farthest_gap = FARTHEST * max(PER_ROW * steps, violated)
     mem.farthest = FARTHEST * max(PER_ROW * max(float(steps), mem.pairs), violated)
@@ -226,8 +229,13 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
     while True:
         if within(tolerance, violation, mem):
             mem.solved = 1.0
+        if stages.learns == 1:
+            if mem.solved != 0 and (ended or central(tolerance, mem)):
+                return done, CONVERGED
+            if ended:
+                return done, STALLED
         close = max(mem.complementarity, mem.stationarity) < mem.target
-        if mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
+        if stages.learns == 0 and mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
             if not within(tolerance, violation, mem):
                 go_back(stages, work, mem)
                 return done, STALLED
@@ -240,7 +248,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
             return done, STALLED
         if done >= last:
             return done, RUNNING
-        if not isfinite(mem.cost) or not iterate(done, stages, work, mem):
+        if not isfinite(mem.cost) or not iterate(done, tolerance, stages, work, mem):
             ended = True
             continue
         row = log[done]
@@ -267,10 +275,17 @@ def within(tolerance, violation, mem):
     return mem.stationarity < tolerance and mem.gap < tolerance and mem.complementarity < tolerance and missed
 
 
+def central(tolerance, mem):
+    """Whether the barrier costs no more than the tolerance: where there is no crossover, the plan ends inside."""
+    return mem.pairs * mem.parameter <= tolerance * mem.scale and mem.pairs * mem.complementarity <= 10 * tolerance
+
+
 @compact
-def iterate(done, stages, work, mem):
+def iterate(done, tolerance, stages, work, mem):
     """Do one iteration; return whether a step was found."""
     least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
+    if stages.learns == 1:
+        least = 0.5 * tolerance * mem.scale / max(mem.pairs, 1.0)
     lower_barrier(done, least, free, stages, work, mem)
     part = -1.0
     while True:
@@ -677,7 +692,12 @@ def take(part, stages, work, mem):
     for t in range(stages.steps + 1):
         for i in range(N):
             work.costates[t, i] += part * (step.costates[t, i] - work.costates[t, i])
+    before, new = mem.stationarity, work.tried.plan
+    if stages.learns == 1:
+        remember(stages, work.now.plan, new, work.costates, work.moves, work.turns)
     go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
+    if stages.learns == 1:
+        learn(stages, work.costates, work.moves, work.turns, part >= LONG and mem.stationarity > CRAWL * before)
 
 
 @compact

@@ -213,6 +213,7 @@ class StageModels(NamedTuple):
       hessian: (T+1, W, W) of the Lagrangian. convex: (T+1, W, W) of the cost alone, projected.
       gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps. arrived: (T, N) next states.
       slopes: ((T+1) size, W) gradients of the constraints' rows.
+      learned: (T+1, W, W) what secants say that the Hessians lack; see `secants.py`.
     """
 
     hessian: Arrays
@@ -221,6 +222,7 @@ class StageModels(NamedTuple):
     jacobian: Arrays
     arrived: Arrays
     slopes: Arrays
+    learned: Arrays
 
 
 class StageRows(NamedTuple):
@@ -259,6 +261,7 @@ class PlanStages(NamedTuple):
       steps: T. soft: 1 if there is an initial cost. free: (N,) 0 for the states that the start fixes, else 1.
       reach: (N,) distances from the start to the goal. state_size, control_size: (N,) and (M,) typical sizes.
       projected: (1,) 1 if the projected Hessians are those of the last plan.
+      learns: 1 if the dynamics have no second derivatives. slow: (1,) 1 if the Hessians have what is learned of them.
       values: a vector for each constraint.
       policy, to_go, changes: see `direction` of `stages.py`.
     """
@@ -270,6 +273,8 @@ class PlanStages(NamedTuple):
     state_size: Arrays
     control_size: Arrays
     projected: Arrays
+    learns: int
+    slow: Arrays
     model: ProblemModel
     values: Any
     rows: StageRows
@@ -356,6 +361,7 @@ class InteriorArrays(NamedTuple):
       curves, forces: (K,) see `direction` of `stages.py`.
       corrections, others: corrections of the products of slacks and multipliers.
       beyond: (K,) further residuals of the rows. wider: (T, N) further gaps.
+      moves, turns: (T+1, W) the last step, and the change of the Lagrangian's gradients by it.
       active: the arrays of the crossover to an active set. active_memory: (1,) row of `ACTIVE_SET`.
       filter: (any, 2) violations and merits that a trial must not both exceed. errors: (LATELY,) the last errors.
     """
@@ -376,6 +382,8 @@ class InteriorArrays(NamedTuple):
     others: Slacks
     beyond: Arrays
     wider: Arrays
+    moves: Arrays
+    turns: Arrays
     active: ActiveSetArrays
     active_memory: Arrays
     filter: Arrays

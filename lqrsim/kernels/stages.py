@@ -44,7 +44,7 @@ SLOWEST = 1e-6  # least effect of a control without limits, relative to the stat
 # the projected Hessians gives the models a minimum.
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
-CONTROL, SIGN, SIDE = 0, 1, 2  # columns of `StageRows.limits`
+CONTROL, SIGN, SIDE, RANGE = 0, 1, 2, 3  # columns of `StageRows.limits`
 INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
@@ -90,7 +90,16 @@ def stage_models(t, stages, plan, costates, least):
     else:
         total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
     subtract_curvatures(x, u, t, stages, least, out.hessian[t])
+    if stages.slow[0] != 0:
+        add_matrix(out.learned[t], W, out.hessian[t])
     return total
+
+
+def add_matrix(matrix, size, out):
+    """Add a square matrix."""
+    for i in range(size):
+        for j in range(size):
+            out[i, j] += matrix[i, j]
 
 
 def project(stages, plan):
@@ -274,6 +283,7 @@ def typical_sizes(stages, plan, hessian):
                 far = models.slopes[at, i] * size_of(i, stages)
                 total += far * far
         size = sqrt(total / max(count, 1.0)) if total > 0 else 1.0
+        size = min(size, rows.limits[row, RANGE])
         for t in range(steps + 1):
             rows.sizes[rows.size * t + row] = size
     cost = 0.0

@@ -52,6 +52,8 @@ class ConstraintTerm(Term):
         is not 0, the source must define `places` and `places_jacobian`, as in `SphereCenters`. Then `value` and `slope`
         get these values (shared,) and their derivatives (shared, n) in place of x and u.
       convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
+      ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others; it is the most
+        that counts as a typical change of the value.
     """
 
     rows: int
@@ -61,6 +63,7 @@ class ConstraintTerm(Term):
     final_only: bool = False
     shared: int = 0
     convex: bool = False
+    ranges: Array | None = None
 
     @property
     def _defines(self) -> Mapping[str, int]:

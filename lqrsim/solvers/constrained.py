@@ -14,12 +14,18 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
-from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, damped_from_rollout, meet_constraints
+from lqrsim.solvers.augmented_lagrangian import (
+    AugmentedLagrangian,
+    by_multipliers,
+    damped_from_rollout,
+    meet_constraints,
+)
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, alike, evidence
 from lqrsim.solvers.interior_run import LITTLE, MUCH, OPENING, Barrier, InteriorRun, copied
 from lqrsim.solvers.restoration import Restored, restore
+from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Sizes
 
 FAR = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
@@ -53,7 +59,8 @@ class Ladder:
     Attributes:
       guess, start: the start, and the rollout of its policy. stay: whether only plans from that rollout are tried.
       given: whether the start is to be kept to. guided: whether there is an ObstacleCost, with which smoothing chooses
-        the side on which obstacles are passed. elastic: whether violations have a price.
+        the side on which obstacles are passed. elastic: whether violations have a price. curved: whether the dynamics
+        have second derivatives.
       smoothed: the plan of smoothing without the constraints, once it is known.
       untried: whether the interior point has not yet begun from the start itself.
       converged: whether an attempt has.
@@ -66,6 +73,7 @@ class Ladder:
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self.smoothed: Motion | None = None
+        self.curved = has_curvature(run.problem)
         self.guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
         self.elastic = run.settings.elastic is not None
         self.given = self.guess.trajectory is not None or bool(self.guess.gain.any()) or stay
@@ -136,6 +144,8 @@ class Ladder:
         self.smoothed = copied(plan)
         if self._budget.stop.due:
             return None
+        if ending.success and not self._budget.log[-1].violation:
+            return self._remember(run.result(ending))
         if ending.outcome != declarations.IN_VALLEY or (not self.guided and self._budget.log[-1].violation):
             return self._interior(self.smoothed, MUCH)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
@@ -182,6 +192,12 @@ class Ladder:
         with self._budget.limited(AUGMENTED):
             found = meet_constraints(run, run.result(run.ending), stale=STALE)
         return self._after_multipliers(found, most=self.start.cost)
+
+    def by_multipliers(self) -> RunResult | None:
+        """By the augmented Lagrangian alone, from the plan of smoothing."""
+        self._point.without_multipliers()
+        found = by_multipliers(self._run)
+        return self._remember(found if found.success else None)
 
     def from_smoothed_at_a_price(self) -> RunResult | None:
         """From the plan of smoothing, after a descent at a price."""
@@ -290,7 +306,7 @@ class Ladder:
                 best = replace(best, against=same[0].beside(detail))
                 detail += f"; against it stand {', '.join(best.against)}" if best.against else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
-        return run.certified(best)
+        return best if best.certificate is not None else run.certified(best)
 
 
 class Attempt(NamedTuple):
@@ -342,6 +358,11 @@ ATTEMPTS = (
         "the start, after such a descent",
         lambda tried: tried.may_start and not tried.elastic,
         Ladder.from_start_at_a_price,
+    ),
+    Attempt(
+        "the plan of smoothing, by the augmented Lagrangian alone",
+        lambda tried: not (tried.converged or tried.curved or tried.elastic),
+        Ladder.by_multipliers,
     ),
     Attempt(
         "the best plan so far, by Newton's method without the constraints",

@@ -43,7 +43,7 @@ from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import certified, no_value
 from lqrsim.solvers.curvature import FLAT, Bend, curvature_at
 from lqrsim.solvers.initial_guess import InitialGuess
-from lqrsim.solvers.settings import INSIDE, SmootherSettings
+from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import LARGEST_KEPT, MOST_KEPT, Stages
 
 _METHODS = {
@@ -319,7 +319,7 @@ class SolveRun:
         settings, problem = self.settings, self.problem
         self.second_order = settings.second_order(problem)
         self.final, self.rough = settings.final(problem), settings.rough(problem)
-        self._valley = VALLEY if self.second_order else 0.0
+        self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._shares = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
 
@@ -511,6 +511,10 @@ class SolveRun:
         self._loop(*self._linearize_arguments(rows))
         return float(rows["optimality"][0])
 
+    def about_best(self, status: Status) -> RunResult:
+        """The best plan, with policy and value functions about it."""
+        return self._about_plan(self.linearize_about_plan(), status, "")
+
     def fails_at(self, risk: float) -> int:
         """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
 
@@ -605,7 +609,8 @@ class SolveRun:
     def bend(self, found: RunResult) -> Bend:
         """The curvature at a result, by exact second derivatives; with a direction along which a saddle bends down."""
         problem = self.problem
-        if not (found.status is Status.CONVERGED and self.second_order) or problem.noise_term is not None:
+        exact = self.second_order and has_curvature(problem) and problem.noise_term is None
+        if not (found.status is Status.CONVERGED and exact):
             return Bend(Curvature.NOT_CHECKED)
         if not problem.constraints:
             out = np.zeros(1, CERTIFICATE)

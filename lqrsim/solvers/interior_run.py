@@ -18,10 +18,12 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan
+FAINT = 1e-9  # factor by which penalties are smaller where a plan ends inside: its certificate is that of multipliers
 UPDATES = 5  # largest number of updates of the multipliers, if Newton's last steps violate constraints
 
 
@@ -124,10 +126,19 @@ class InteriorRun:
         states, controls = work.roll_out(*law, found.plan.states[0])
         if not np.isfinite(states).all():
             return None
-        self._take_multipliers(found, work.constraint_values(states, controls))
+        self._take_multipliers(found, work.constraint_values(states, controls), FIRMNESS)
         work.take(states, controls, self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
+        if not has_curvature(self._problem):
+            result = self._run.about_best(Status.CONVERGED)
+            self._take_multipliers(found, work.constraint_values(states, controls), FIRMNESS * FAINT)
+            lagrangian.evaluate(*work.best)
+            result = replace(result, multipliers=self._pressing(lagrangian, found, result))
+            if lagrangian.kept:
+                return result
+            self.without_multipliers()
+            return replace(result, status=Status.MAX_ITERATIONS)
         with self._budget.joined_with_last(NAME):
             result = self._newton(lagrangian, found.scale)
             for _ in range(UPDATES):
@@ -155,12 +166,12 @@ class InteriorRun:
             gain[there] = 0.0
         return controls, gain
 
-    def _take_multipliers(self, found: Found, values: list[Array]) -> None:
+    def _take_multipliers(self, found: Found, values: list[Array], firmness: float) -> None:
         """Choose multipliers so that the forces of the augmented Lagrangian at these values are those found."""
         each = zip(self._run.work.multipliers, found.multipliers, values, strict=True)
         for k, (own, known, numbers) in enumerate(each):
             size = found.sizes.rows[self._run.stages.owners == k]
-            own.penalty = FIRMNESS * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            own.penalty = firmness * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = known + own.penalty * np.where(np.isfinite(numbers), numbers - own.margin, 0.0)
             presses = known > own.penalty * (numbers - own.margin)  # other forces are remnants of the barrier
             acts = np.isfinite(numbers) & (own.term.equality | presses)

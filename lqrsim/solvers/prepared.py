@@ -27,7 +27,7 @@ from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
 from lqrsim.solvers.restoration import restore
-from lqrsim.solvers.settings import SmootherSettings, check_problem
+from lqrsim.solvers.settings import FINE, SmootherSettings, check_problem
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
 # Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be
@@ -63,7 +63,7 @@ def prepare(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    if tolerance is None and getattr(problem, "constraints", ()) and settings.second_order(problem):
+    if tolerance is None and getattr(problem, "constraints", ()) and settings.final(problem) == FINE:
         settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings)
 

@@ -26,6 +26,7 @@ from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
 MOST_STARTS = 10_000
 _log = logging.getLogger("lqrsim")
 ROUGH, FINE = 1e-4, 1e-8  # default tolerances of smoothing and of Newton's method
+LEARNED = 1e-5  # the same of the interior point with MuJoCo's steps: their derivatives are right to some 1e-6
 INSIDE = 1e-3  # margin of active constraints for rounding, as a fraction of the tolerance
 MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
 
@@ -88,7 +89,7 @@ class SmootherSettings(Settings):
         keep(self, safeguard=check_flag("safeguard", self.safeguard))
 
     def second_order(self, problem: Problem) -> bool:
-        """Whether Newton's method has the last iterations; with stop="cost" the paper's method has them."""
+        """Whether Newton's method or the interior point has the last iterations; with stop="cost" the paper's method."""
         return self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
 
     @property
@@ -102,7 +103,8 @@ class SmootherSettings(Settings):
 
     def final(self, problem: Problem) -> float:
         """Tolerance of the optimality."""
-        return self.tolerance or (FINE if self.second_order(problem) else ROUGH)
+        own = ROUGH if not self.second_order(problem) else FINE if has_curvature(problem) else LEARNED
+        return self.tolerance or own
 
     def rough(self, problem: Problem) -> float:
         """Tolerance at which smoothing ends, coarser if Newton's method follows."""
@@ -111,12 +113,18 @@ class SmootherSettings(Settings):
 
 
 def can_be_exact(problem: Problem) -> bool:
-    """Whether Newton's method and the interior point, with their second derivatives, can solve a problem.
+    """Whether Newton's method, or with constraints the interior point, can solve a problem.
 
-    The steps of an MJCF have none, and without these an iteration of smoothing is worth several of Newton's; see
-    `experiments/convergence.py`. Nor has the expected cost of noise, with which constraints are left to smoothing.
+    The expected cost of noise has no second derivatives: with it, constraints are left to smoothing. Nor have the steps
+    of an MJCF. Without constraints, an iteration of smoothing is then worth several of Newton's; see
+    `experiments/convergence.py`. With constraints, the interior point learns from secants what is missing.
     """
-    return not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
+    return problem.noise_term is None if problem.constraints else has_curvature(problem)
+
+
+def has_curvature(problem: Problem) -> bool:
+    """Whether the dynamics have second derivatives; the steps of an MJCF have none."""
+    return not problem.dynamics.discrete
 
 
 S = TypeVar("S", bound=Settings)

@@ -163,7 +163,7 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
         if problem.constraints:
             why = 'None without finish="newton" and stop="optimal"'
             if settings.finish and settings.stop == "optimal":
-                why = "None with noise or the dynamics of an MJCF"
+                why = "None with noise"
             raise InputError(f"elastic: got {settings.elastic:g}, want {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     if problem.duration is not None and not settings.second_order(problem):

@@ -40,7 +40,7 @@ from lqrsim.kernels.records import (
     StageRows,
     StructuredArray,
 )
-from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, SIDE, SIGN
+from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, RANGE, SIDE, SIGN
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
@@ -82,12 +82,13 @@ class Stages:
         self.models = StageModels(
             zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m, n + m)), zeros((steps + 1, n + m)),
             zeros((steps, n, n + m)), zeros((steps, n)), self.slopes.reshape(-1, n + m),
+            zeros((steps + 1, n + m, n + m)),
         )  # fmt: skip
         self.about = PlanStages(
-            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), unread,
+            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), 0, zeros(1), unread,
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
-                rows, zeros((rows, 3)), np.cumsum([0, *counts])[:-1].astype(np.float64),
+                rows, np.full((rows, 4), np.inf), np.cumsum([0, *counts])[:-1].astype(np.float64),
                 zeros((rows, n + m)),
                 *(one.reshape(-1) for one in (*of_rows[:-1], self.numbers, self.force)),
             ),
@@ -119,13 +120,18 @@ class Stages:
             self.live[steps, self.owners == k] &= not one.term.uses_control
         self.live[steps, self.owners == -1] = False
         self._acts[...] = self._live[...] = self.live
-        self.about = self.about._replace(steps=steps, soft=0 if fixed else 1, model=model)
+        self.about = self.about._replace(
+            steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.discrete), model=model
+        )
+        self.about.slow[...] = 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         if problem.goal is not None and problem.start is not None:
             self.about.reach[...] = np.abs(np.nan_to_num(problem.goal - problem.start))
         limit = self.owners == -1
         self._kinds[...] = np.where(self.equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
         self._sizes[...], self._prices[...] = 1.0, np.inf
+        for k, term in enumerate(terms):
+            self.about.rows.limits[self.owners == k, RANGE] = np.inf if term.ranges is None else term.ranges
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
             self.about.rows.limits[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
@@ -293,6 +299,7 @@ class Stages:
             now=point(), costates=costates, gaps=gaps, tried=point(), closer=point(), kept=point(),
             kept_force=kept_force, kept_costates=kept_costates, step=step(), other=step(), curves=curves, forces=forces,
             corrections=Slacks(*self._rows(2)), others=Slacks(*self._rows(2)), beyond=beyond, wider=wider,
+            moves=np.zeros_like(self.models.gradient), turns=np.zeros_like(self.models.gradient),
             active=active, active_memory=active_memory, filter=np.zeros((0, 2)), errors=np.zeros(LATELY),
         )  # fmt: skip
         return arrays, np.zeros(1, INTERIOR)
