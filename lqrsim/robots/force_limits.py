@@ -100,16 +100,16 @@ def limited_forces(
         linear &= np.abs(forces(z) - slopes[0] - z @ slopes[1:]) <= _LINEAR * np.maximum(size, 1e-12)
     found, rest = list[ForceLimit](), list[str]()
     elements = [
-        (f"the force of {model.actuator(i).name}", "N", model.actuator_forcelimited, model.actuator_forcerange, i, i)
+        (f"the force of {model.actuator(i).name}", "N", model.actuator_forcerange, i, i)
         for i in np.flatnonzero(model.actuator_forcelimited).tolist()
     ] + [
         (
             f"the force on {model.joint(i).name}", "N m" if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE else "N",
-            model.jnt_actfrclimited, model.jnt_actfrcrange, i, len(data.actuator_force) + int(model.jnt_dofadr[i]),
+            model.jnt_actfrcrange, i, len(data.actuator_force) + int(model.jnt_dofadr[i]),
         )
         for i in np.flatnonzero(model.jnt_actfrclimited).tolist()
     ]  # fmt: skip
-    for name, unit, flags, limits, i, place in elements:
+    for name, unit, limits, i, place in elements:
         if linear[place]:
             found.append(ForceLimit(name, unit, *limits[i].tolist(), slopes[:, place].copy()))
         else:

@@ -5,8 +5,8 @@ where the violation has not halved. Both steps are repeated. With an update afte
 along an obstacle would oscillate, since the model leaves out the curvature of obstacles. If undamped iterations do not
 settle, the damped ones of the safeguard minimise each augmented Lagrangian.
 
-The method serves problems that the interior point does not take: noise with constraints, the dynamics of an MJCF, and
-`finish=None`. Among obstacles it is also one of the attempts in `strategy.py`. The compiled part is in
+The method serves problems that the interior point does not take: noise with constraints, and `finish=None`. It is also
+one of the attempts of `constrained.py`, among obstacles and with the dynamics of an MJCF. The compiled part is in
 `kernels/augmented_lagrangian.py`.
 """
 

@@ -18,8 +18,8 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.interior_point import NAME, Found, InteriorPoint, Measures
+from lqrsim.solvers.settings import has_curvature
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan
@@ -130,22 +130,16 @@ class InteriorRun:
         work.take(states, controls, self._run.stages.trial(Motion(states, controls))[0])
         lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.best)
-        if not has_curvature(self._problem):
-            result = self._run.about_best(Status.CONVERGED)
-            self._take_multipliers(found, work.constraint_values(states, controls), FIRMNESS * FAINT)
-            lagrangian.evaluate(*work.best)
-            result = replace(result, multipliers=self._pressing(lagrangian, found, result))
-            if lagrangian.kept:
-                return result
-            self.without_multipliers()
-            return replace(result, status=Status.MAX_ITERATIONS)
         with self._budget.joined_with_last(NAME):
-            result = self._newton(lagrangian, found.scale)
-            for _ in range(UPDATES):
-                if lagrangian.kept or not result.success:
-                    break
-                lagrangian.update(growth=1.0)
+            if has_curvature(self._problem):
                 result = self._newton(lagrangian, found.scale)
+                for _ in range(UPDATES):
+                    if lagrangian.kept or not result.success:
+                        break
+                    lagrangian.update(growth=1.0)
+                    result = self._newton(lagrangian, found.scale)
+            else:
+                result = self._ended_inside(lagrangian, found)
         detail = ""
         if self._run.settings.elastic is not None and result.violation > self.allowed:
             detail = f"elastic: {lagrangian.worst()}"
@@ -154,6 +148,18 @@ class InteriorRun:
             return result
         self.without_multipliers()
         return replace(result, status=Status.MAX_ITERATIONS)
+
+    def _ended_inside(self, lagrangian: AugmentedLagrangian, found: Found) -> RunResult:
+        """The plan in memory as it is: without second derivatives, the interior point ends inside the constraints.
+
+        Penalties give the policy its gains across rows that press. The certificate is that of the multipliers alone.
+        """
+        work, laps = self._run.work, Laps(self._budget)
+        result = self._run.about_best(Status.CONVERGED)
+        self._take_multipliers(found, work.constraint_values(*work.best), FAINT * FIRMNESS)
+        lagrangian.evaluate(*work.best)
+        found.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
+        return result
 
     def _at_limits(self, found: Found) -> tuple[Array, Array]:
         """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""

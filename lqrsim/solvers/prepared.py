@@ -51,8 +51,8 @@ def prepare(
       tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, multiplied by the
         control's range and relative to the cost; by default 1e-6.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise, or
-        the dynamics of an MJCF, the margin of inequalities, by default 1e-3.
+      constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise,
+        the margin of inequalities, by default 1e-3.
       max_iterations: as in `smooth`.
       finish: as in `smooth`; with None, the augmented Lagrangian method keeps the constraints.
 

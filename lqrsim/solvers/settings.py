@@ -89,7 +89,7 @@ class SmootherSettings(Settings):
         keep(self, safeguard=check_flag("safeguard", self.safeguard))
 
     def second_order(self, problem: Problem) -> bool:
-        """Whether Newton's method or the interior point has the last iterations; with stop="cost" the paper's method."""
+        """Whether Newton's method or the interior point ends a solve; with stop="cost" the paper's method does."""
         return self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
 
     @property

@@ -69,8 +69,8 @@ def smooth(
         are bit-identical with and without the safeguard.
       stop: "optimal" (gap and first-order optimality within tolerance; for smoothing, also the change of cost) or
         "cost", the paper's test, which considers the change of cost alone and can pass early.
-      tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and
-        1e-4 without Newton's method.
+      tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8;
+        1e-4 without Newton's method, and 1e-5 with constraints and the dynamics of an MJCF.
       gap_tolerance: tolerance of the gap (see `Iteration`).
       max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
         may use that many, including the further starts that are tried while no plan satisfies the constraints.
@@ -93,7 +93,7 @@ def smooth(
         they then act from the first iteration. It needs a start.
       finish: "newton" leaves the last iterations to Newton's method, or with constraints to the interior point; see
         `solvers/strategy.py`. None uses the paper's method to the end, with an augmented Lagrangian for constraints. So
-        do `stop="cost"`, noise with constraints and the steps of an MJCF.
+        do `stop="cost"`, noise with constraints and, without constraints, the steps of an MJCF.
       elastic: the price of violating a constraint, in cost per unit, summed over rows and steps. Constraints whose
         multipliers would exceed the price are violated, and the detail says by how much. None: they must hold.
       noise: replaces the problem's own noise; see `Noise`. The cost is then an expectation, in the log, line searches

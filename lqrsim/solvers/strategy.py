@@ -7,8 +7,8 @@ these attempts (`free_duration.py`).
   without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
      (`SolveRun.solve`). If controls have limits: the interior point if controls stay at them, or all else fails.
   with constraints: the interior point from one plan after another (`ATTEMPTS` of `constrained.py`).
-  without Newton's method, that is with `finish=None`, `stop="cost"`, noise and constraints, or the dynamics of an MJCF:
-     smoothing, and the augmented Lagrangian for constraints (`augmented_lagrangian.py`).
+  with `finish=None`, `stop="cost"` or noise and constraints: smoothing, and the augmented Lagrangian for constraints
+     (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too.
 
 The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified
 (`certify.py`).
