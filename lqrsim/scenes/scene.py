@@ -399,6 +399,8 @@ def _flatten(path: Path) -> str:
     MuJoCo can also write a model as text, but with six digits, which gives another model.
     """
     seen: set[Path] = set()
+    folder = path.parent
+    beside = dict[ElementTree.Element, Path]()  # elements of included files -> the folder of their file
 
     def read(file: Path) -> ElementTree.Element:
         seen.add(file.resolve())
@@ -408,22 +410,23 @@ def _flatten(path: Path) -> str:
             raise InputError(f"scene: got {file.name}, which is not XML ({error}), want an MJCF file") from None
         except OSError as error:
             raise InputError(f"scene: got {file.name}, which cannot be read ({error.strerror}), want a file") from None
-        expand(root)
+        expand(root, file.parent)
         return root
 
-    def expand(element: ElementTree.Element) -> None:
+    def expand(element: ElementTree.Element, own: Path) -> None:
         children = list(element)
         element[:] = []
         for child in children:
             if child.tag == "include":
-                element.extend(read(find(child.get("file", ""))))
+                element.extend(read(find(child.get("file", ""), own)))
             else:
-                expand(child)
+                expand(child, own)
                 element.append(child)
+                beside.setdefault(child, own)
 
-    def find(name: str) -> Path:
-        # MuJoCo's rule, relative to the main file, and then the packaged models.
-        file = next((file for file in (path.parent / name, MODELS / name) if os.path.isfile(file)), None)
+    def find(name: str, own: Path) -> Path:
+        # MuJoCo's rule, relative to the main file, then to the file that includes; and then the packaged models.
+        file = next((file for file in (folder / name, own / name, MODELS / name) if os.path.isfile(file)), None)
         if file is None:
             packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
             raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")
@@ -434,17 +437,18 @@ def _flatten(path: Path) -> str:
     root = read(path)
     if root.tag != "mujoco":
         raise InputError(f"scene: got {path.name} with <{root.tag}> at its root, want <mujoco>")
-    folder = path.parent.resolve()
-    for model in root.iterfind("asset/model[@file]"):  # for <attach>; MuJoCo has no setting for their folder
-        model.set("file", str(folder / model.attrib["file"]))
+    settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
+    common, main = settings.get("assetdir", ""), folder.resolve()
+    folders = {kind: str(main / settings.get(kind, common)) for kind in ("meshdir", "texturedir")}
+    for element, own in beside.items():  # other files: the same rule, but from the folder of their kind
+        start = Path(folders["texturedir" if element.tag == "texture" else "meshdir"])
+        start = main if element.tag == "model" else start  # for <attach>; MuJoCo has no setting for their folder
+        for key in [key for key in element.attrib if key.startswith("file")]:
+            first, second = start / element.attrib[key], own.resolve() / element.attrib[key]
+            nested = not os.path.isfile(first) and os.path.isfile(second)
+            if nested or element.tag == "model":
+                element.set(key, str(second if nested else first))
     if any(key.startswith("file") for element in root.iter() for key in element.attrib):
-        settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
-        common = settings.get("assetdir", "")
-        root.append(
-            ElementTree.Element(
-                "compiler",
-                {kind: str(folder / settings.get(kind, common)) for kind in ("meshdir", "texturedir")},
-            )
-        )
+        root.append(ElementTree.Element("compiler", folders))
     text = ElementTree.tostring(root, encoding="unicode")
     return re.sub(r"\n\s*\n+", "\n", text) + "\n"
