@@ -9,7 +9,8 @@ import pytest
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
-from lqrsim.scenes.scene import MODELS, load_scene, names, scene_from_xml
+from lqrsim.scenes.mjcf_text import MODELS, names
+from lqrsim.scenes.scene import load_scene, scene_from_xml
 
 # method.md, section 4, in metres
 PILLARS = [
@@ -239,7 +240,7 @@ def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monk
 
 
 @pytest.mark.parametrize("unnamed", ["body", "joint", "geom", "position"])
-def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
+def test_an_attached_model_without_names_gets_some(unnamed, tmp_path):
     """A state or control without a name of its own could not be told from another."""
     hand = HAND.format(asset="", geom='<body name="tip"><geom name="nail" size=".1"/></body>', size=0.1)
     name = {"body": ' name="tip"', "joint": ' name="grip"', "geom": ' name="nail"', "position": ' name="grip"'}[unnamed]
@@ -249,9 +250,16 @@ def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
     path.write_text("""<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody><body name="arm">
       <joint name="turn"/><geom size=".1"/><attach model="hand" body="hand" prefix="left_"/>
     </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
-    kind = "actuator" if unnamed == "position" else unnamed
-    with pytest.raises(InputError, match=f"attached model whose {kind} .* has no name"):
-        MjcfRobot(path)
+    model, kind = MjcfRobot(path).scene.model, "actuator" if unnamed == "position" else unnamed
+    for one, count in (
+        ("body", model.nbody),
+        ("joint", model.njnt),
+        ("geom", model.ngeom),
+        ("actuator", model.nactuator),
+    ):
+        found = [getattr(model, one)(number).name for number in range(count)]
+        assert len({*found}) == len(found)
+        assert any(name.startswith(f"unnamed_{kind}_") for name in found) or one != kind
 
 
 @pytest.mark.parametrize(
