@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -155,7 +156,10 @@ class MjcfRobot(Robot):
         found = outline_of(model)
         many = not place and len(found.radii) > 0 if outline is None else check_flag(f"{who}: outline", outline)
         self.balls = MjcfBalls(found, mjcf) if many else None
-        self.geoms: MjcfGeoms = MjcfGeoms(self.scene)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @cached_property
+    def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return MjcfGeoms(self.scene)
 
     def among(self, world: World) -> ShapeInWorld:
         """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them.

@@ -30,15 +30,16 @@ def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floor
     Args:
       body: the robot's first that moves. floors: whether there may be ground for standing on.
     """
-    data, pairs, base = placed(model), touching_pairs(model, candidates), _base(model)
-    ground = set[int]()
+    data, pairs = placed(model), touching_pairs(model, candidates)
+    pairs = pairs[~np.isin(model.geom_bodyid[pairs[:, 1]], [*_base(model)])]
     if floors:
         level = _ground(model, data)
         near = pairs[np.isin(pairs[:, 1], [*level])]
         touched = set(near[_touch(model, data, near), 1].tolist())
-        ground = _supports(model, pairs) | (level if _sinks(model, data, body) else touched)
-    avoidable = set(pairs[~_always_touch(model, pairs), 1].tolist()) - ground
-    return [geom for geom in candidates if geom in avoidable and int(model.geom_bodyid[geom]) not in base]
+        ground = (level if _sinks(model, data, body) else touched) | _supports(model, pairs)
+        pairs = pairs[~np.isin(pairs[:, 1], [*ground])]
+    avoidable = set(pairs[~_always_touch(model, pairs), 1].tolist())
+    return [geom for geom in candidates if geom in avoidable]
 
 
 def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
@@ -186,6 +187,8 @@ def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
 
 def _always_touch(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom."""
+    if not len(pairs):
+        return np.zeros(0, dtype=bool)
     data = placed(model)
     always = _touch(model, data, pairs)
     always &= ~_moved_by(model, pairs, _FREE)
@@ -226,8 +229,10 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
 
     It stands there at rest; with a free joint, in a keyframe also counts.
     """
-    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
     floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
+    if not moving.any():
+        return set()
+    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
     for qpos, own in ((model.qpos0, pairs[moving]), *((one, pairs[floating]) for one in model.key_qpos)):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)

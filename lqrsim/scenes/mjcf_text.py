@@ -101,15 +101,16 @@ def _flatten(path: Path) -> str:
     settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
     common, main = settings.get("assetdir", ""), folder.resolve()
     folders = {kind: str(main / settings.get(kind, common)) for kind in ("meshdir", "texturedir")}
-    for element, own in beside.items():  # other files: the same rule, but from the folder of their kind
-        # MuJoCo has no setting of a folder for the models of <attach>.
-        kind = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir")
-        for key in [key for key in element.attrib if key.startswith("file")]:
-            first, second = main / folders.get(kind, "") / element.attrib[key], Path.cwd() / own / element.attrib[key]
-            nested = own != folder and not os.path.isfile(first) and os.path.isfile(second)
-            if nested or element.tag == "model":
-                element.set(key, str(second if nested else first))
-    if any(key.startswith("file") for element in root.iter() for key in element.attrib):
+    files = [(element, key) for element in root.iter() for key in element.attrib if key.startswith("file")]
+    for element, key in files:  # the same rule, but from the folder of their kind, of which an <attach> has none
+        kind, own = {"texture": "texturedir", "model": ""}.get(element.tag, "meshdir"), beside[element]
+        if kind and own == folder:
+            continue
+        first, second = (start / element.attrib[key] for start in (main / folders.get(kind, ""), own.resolve()))
+        nested = not os.path.isfile(first) and os.path.isfile(second)
+        if nested or not kind:
+            element.set(key, str(second if nested else first))
+    if files:
         root.append(ElementTree.Element("compiler", folders))
     text = ElementTree.tostring(root, encoding="unicode")
     return re.sub(r"\n\s*\n+", "\n", text) + "\n"
