@@ -14,7 +14,8 @@ from actuated import Rest, draw
 
 import lqrsim as ls
 from lqrsim.errors import InputError
-from lqrsim.scenes.scene import scene_from_xml, unlogged
+from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.scene import scene_from_xml
 
 STAYS = 1e-4  # rad or m within which a held robot stays for 2 s
 MORE = 1.02  # ratio of the norms of what two searches leave, of which the larger is no least

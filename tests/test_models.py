@@ -9,7 +9,8 @@ from lqrsim import robots
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes.scene import load_scene, names
+from lqrsim.scenes.mjcf_text import names
+from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.plant_check import check_plant
 

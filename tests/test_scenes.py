@@ -9,7 +9,8 @@ import pytest
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
-from lqrsim.scenes.scene import MODELS, load_scene, names, scene_from_xml
+from lqrsim.scenes.mjcf_text import MODELS, names
+from lqrsim.scenes.scene import load_scene, scene_from_xml
 
 # method.md, section 4, in metres
 PILLARS = [
@@ -165,6 +166,50 @@ def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tm
     assert mujoco.MjModel.from_xml_string(scene.xml).body("quadrotor").mass[0] == 0.5
 
 
+LOOK = '<mujoco><default><geom rgba="{0} 0 0 1"/></default></mujoco>'
+ARM = """<mujoco>{0}<asset>{1}</asset><worldbody><body name="arm"><joint name="turn"/>
+  <geom type="{2}"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("here", [("look.xml", "parts/look.xml"), ("parts/look.xml",)], ids=["main first", "nested"])
+def test_includes_are_found_where_mujoco_finds_them(here, tmp_path):
+    """MuJoCo looks beside the main file, and then beside the file that includes."""
+    (tmp_path / "parts" / "more").mkdir(parents=True)
+    for number, name in enumerate(here, 1):
+        (tmp_path / name).write_text(LOOK.format(number / 4))
+    arm = ARM.format('<include file="look.xml"/><include file="more/empty.xml"/>', "", 'sphere" size=".1')
+    (tmp_path / "parts" / "arm.xml").write_text(arm)
+    (tmp_path / "parts" / "more" / "empty.xml").write_text('<mujoco><include file="deep.xml"/></mujoco>')
+    (tmp_path / "parts" / "more" / "deep.xml").write_text('<mujoco><option timestep="0.007"/></mujoco>')
+    path = tmp_path / "scene.xml"
+    path.write_text('<mujoco><include file="parts/arm.xml"/><actuator><motor joint="turn"/></actuator></mujoco>')
+    model, wanted = MjcfRobot(path).scene.model, mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_array_equal(model.geom_rgba, wanted.geom_rgba)
+    assert wanted.geom_rgba[0, 0] == 0.25
+    assert model.opt.timestep == wanted.opt.timestep == 0.007
+
+
+@pytest.mark.parametrize("folder", ["", "meshes"])
+@pytest.mark.parametrize("both", [False, True], ids=["beside the included", "both"])
+def test_meshes_and_models_of_an_included_file_are_found_where_mujoco_finds_them(folder, both, tmp_path):
+    parts, meshes = tmp_path / "parts", tmp_path / folder
+    parts.mkdir()
+    meshes.mkdir(exist_ok=True)
+    (parts / "claw.obj").write_text(TETRA.format(0.1))
+    (parts / "hand.xml").write_text(HAND.format(asset="", geom="", size=0.1))
+    if both:
+        (meshes / "claw.obj").write_text(TETRA.format(0.3))
+    compiler = f'<compiler meshdir="{folder}"/>' if folder else ""
+    assets = '<mesh name="claw" file="claw.obj"/><model name="hand" file="hand.xml"/>'
+    arm = ARM.format(compiler, assets, 'mesh" mesh="claw')
+    (parts / "arm.xml").write_text(arm.replace("</body>", '<attach model="hand" body="hand" prefix="left_"/></body>'))
+    path = tmp_path / "scene.xml"
+    path.write_text('<mujoco><include file="parts/arm.xml"/><actuator><motor joint="turn"/></actuator></mujoco>')
+    model, wanted = load_scene(path).model, mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_array_equal(model.mesh_vert, wanted.mesh_vert)
+    np.testing.assert_array_equal(model.geom_size, wanted.geom_size)
+
+
 HAND = """<mujoco model="hand">{asset}<worldbody><body name="hand" pos=".5 0 0">
   <joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
 </body></worldbody><actuator><position name="grip" joint="grip" kp="3"/></actuator></mujoco>"""
@@ -195,7 +240,7 @@ def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monk
 
 
 @pytest.mark.parametrize("unnamed", ["body", "joint", "geom", "position"])
-def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
+def test_an_attached_model_without_names_gets_some(unnamed, tmp_path):
     """A state or control without a name of its own could not be told from another."""
     hand = HAND.format(asset="", geom='<body name="tip"><geom name="nail" size=".1"/></body>', size=0.1)
     name = {"body": ' name="tip"', "joint": ' name="grip"', "geom": ' name="nail"', "position": ' name="grip"'}[unnamed]
@@ -205,9 +250,16 @@ def test_an_attached_model_without_names_is_refused_by_kind(unnamed, tmp_path):
     path.write_text("""<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody><body name="arm">
       <joint name="turn"/><geom size=".1"/><attach model="hand" body="hand" prefix="left_"/>
     </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
-    kind = "actuator" if unnamed == "position" else unnamed
-    with pytest.raises(InputError, match=f"attached model whose {kind} .* has no name"):
-        MjcfRobot(path)
+    model, kind = MjcfRobot(path).scene.model, "actuator" if unnamed == "position" else unnamed
+    for one, count in (
+        ("body", model.nbody),
+        ("joint", model.njnt),
+        ("geom", model.ngeom),
+        ("actuator", model.nactuator),
+    ):
+        found = [getattr(model, one)(number).name for number in range(count)]
+        assert len({*found}) == len(found)
+        assert any(name.startswith(f"unnamed_{kind}_") for name in found) or one != kind
 
 
 @pytest.mark.parametrize(

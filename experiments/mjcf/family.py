@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.scenes.scene import read_mjcf, scene_from_xml
+from lqrsim.scenes.mjcf_text import read_mjcf
+from lqrsim.scenes.scene import scene_from_xml
 
 ARMS, HANDS = "models/assets/robots/", "models/assets/grippers/"
 LEGS, ENVS = "robot_model/", "envs/"

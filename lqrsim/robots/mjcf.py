@@ -1,14 +1,14 @@
 """A robot from any MJCF: its dynamics are MuJoCo's own steps, and nothing is derived by hand."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import rotations
 from lqrsim.errors import (
     Array,
     InputError,
@@ -34,11 +34,11 @@ from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
-from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
-from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, with_obstacles
-from lqrsim.scenes.mjcf_outline import outline_of
-from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
+from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
+from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
+from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
+from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, World
 
 _AXES = "xyz"
@@ -97,13 +97,13 @@ class MjcfRobot(Robot):
         MJCF has them. In a plan they do not move.
 
     Attributes:
-      scene: the scene that the robot moves in.
+      mjcf: its MJCF, with joints and actuators. scene: the scene that the robot moves in.
       dynamics: MuJoCo's steps.
       geoms: its colliding geoms. balls: an outline of it, or None.
 
     Raises:
-      InputError: no such file, body or state; nothing moves, or has an actuator; an attached model has elements without
-        a name; or the MJCF has what states do not describe: deformable parts, delays, plugins with states.
+      InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
+        describe: deformable parts, delays, plugins with states.
     """
 
     def __init__(
@@ -118,53 +118,48 @@ class MjcfRobot(Robot):
         obstacles: Choice = True,
         mocap: str | None = None,
     ) -> None:
-        self.name, xml = (file.name, file.xml) if isinstance(file, Scene) else read_mjcf(file)
-        xml, who = mjcf_joints.named(xml), f"MjcfRobot {self.name}"
-        model = checked_model(xml, self.name)
-        if mocap is not None:
-            xml = mjcf_joints.with_mocap(xml, model, mocap, who)
-            model = checked_model(xml, self.name)
-        seen = mjcf_joints.lit(xml, model)
-        if seen != xml:
-            xml, model = seen, checked_model(seen, self.name)
-        mjcf_joints.check_attached(xml, model, who)
-        number = mjcf_joints.body_of(model, body, who)
+        given = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
+        self.name, who = given.name, f"MjcfRobot {given.name}"
+        mjcf = given.complete() if mocap is None else given.complete().with_mocap(mocap, who)
+        model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         default = in_the_way(model, candidates, number, floors=check_flag(f"{who}: floors", floors))
         geoms = chosen_geoms(model, obstacles, default, who)
-        self.scene = scene_of(xml, self.name, model, geoms, (*KINDS, *OTHER_KINDS))
+        self.scene, self.mjcf = scene_of(mjcf, geoms, (*KINDS, *OTHER_KINDS)), mjcf
         self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
-        self._joints, inputs = mjcf_joints.joints_of(model), mjcf_joints.controls_of(model)
         self.body = model.body(number).name
-        self.joints = tuple(one.name for one in self._joints)
-        self.actuators = tuple(model.actuator(number).name for number in range(model.nactuator))
-        self.activations = int(model.na)
-        names, units = zip(*self._states(), strict=True)
+        self.joints = tuple(one.name for one in mjcf.joints)
+        self.actuators = tuple(one.name for one in mjcf.actuators)
+        self.activations = len(mjcf.activations)
+        names, units = zip(*mjcf.states, strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
-        self._axes = mjcf_joints.position_of(model, number)
+        self._axes = position_of(mjcf, number)
         place, plane = self._position(position, names, who)
         states = Coordinates(
             names=names, units=units, position=place, plane=plane,
-            rotation_vectors=tuple(one.dof + turned[one.kind] for one in self._joints if one.kind in turned),
-            angles=tuple(one.dof for one in self._joints if one.kind == "hinge" and one.limits is None),
+            rotation_vectors=tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned),
+            angles=tuple(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
-            xml, who, model=model, body=number, obstacles=tuple(geoms), states=states,
+            mjcf, who, body=number, obstacles=tuple(geoms), states=states, actuators=tuple(range(model.nu)),
             controls=Coordinates(
-                names=tuple(one.name for one in inputs) or ("none",), units=tuple(one.unit for one in inputs) or ("",),
-                low=tuple(one.low for one in inputs), high=tuple(one.high for one in inputs),
+                names=tuple(one.name for one in mjcf.controls) or ("none",),
+                units=tuple(one.unit for one in mjcf.controls) or ("",),
+                low=tuple(one.low for one in mjcf.controls), high=tuple(one.high for one in mjcf.controls),
             ),
-            actuators=tuple(range(model.nu)),
         )  # fmt: skip
-        reach = mjcf_joints.reach_of(model, number) if radius is None else radius
+        reach = reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
         found = outline_of(model)
         many = not place and len(found.radii) > 0 if outline is None else check_flag(f"{who}: outline", outline)
-        self.balls = MjcfBalls(found, self._balls_at) if many else None
-        self.geoms: MjcfGeoms = MjcfGeoms(self.scene)  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.balls = MjcfBalls(found, mjcf) if many else None
+
+    @cached_property
+    def geoms(self) -> MjcfGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return MjcfGeoms(self.scene)
 
     def among(self, world: World) -> ShapeInWorld:
         """The geoms among other obstacles than those of the scene, in a copy of the MJCF that has them.
@@ -177,29 +172,13 @@ class MjcfRobot(Robot):
         """
         if not len(check_kind("world", world, World, "a World, such as scene.world")):
             return shape_in(self.dynamics, world, geoms=self.geoms)
-        copy = Scene(self.name, with_obstacles(self.scene.xml, world), self.scene.model, World(), ())
+        copy = Scene(self.mjcf.with_obstacles(world), World(), ())
         stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
         other = MjcfRobot(copy, **stated)
         # Their places in the compiled model, which differ in the last bits.
         each = zip(other.scene.world.obstacles, world.obstacles, strict=True)
         there = World([replace(own, velocity=one.velocity) for own, one in each])
         return shape_in(other.dynamics, there, geoms=other.geoms)
-
-    def _states(self) -> Iterator[tuple[str, str]]:
-        """Names and units: positions, velocities, states of actuators."""
-        turned = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
-        moved = [(axis, "m") for axis in _AXES], [(f"v{axis}", "m/s") for axis in _AXES]
-        loose = [one for one in self._joints if one.kind == "free" and one.name.startswith(mjcf_joints.UNNAMED)]
-        for side in (0, 1):
-            for one in self._joints:
-                own = "" if [one] == loose else one.name
-                if one.kind in ("free", "ball"):
-                    entries = [*(moved[side] if one.kind == "free" else []), *turned[side]]
-                    yield from ((f"{own}_{name}" if own else name, unit) for name, unit in entries)
-                else:
-                    unit = "m" if one.kind == "slide" else "rad"
-                    yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
-        yield from ((name, "") for name in mjcf_joints.activations_of(self.scene.model))
 
     def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
         """The states that are the position, and its plane."""
@@ -230,12 +209,6 @@ class MjcfRobot(Robot):
             for dof, (axis, away) in self._axes.shifted.items()
         ]
 
-    def _balls_at(self, state: Array) -> Array:
-        """Centres of the balls, (K, 3), by MuJoCo's bindings."""
-        assert isinstance(self.balls, MjcfBalls)
-        outline = self.balls.outline
-        return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)
-
     @property
     def dynamics(self) -> MjcfDynamics:
         return self._dynamics
@@ -255,8 +228,7 @@ class MjcfRobot(Robot):
           InputError: as `dynamics.with_parameters` does.
         """
         changed = self.dynamics.with_parameters(**values)
-        model = checked_model(changed.xml, self.name)
-        scene = scene_of(changed.xml, self.name, model, self.scene.geoms, (*KINDS, *OTHER_KINDS))
+        scene = scene_of(changed.mjcf, self.scene.geoms, (*KINDS, *OTHER_KINDS))
         return MjcfRobot(scene, **self._stated)
 
     def hold(self, state: npt.ArrayLike) -> Array:
@@ -377,11 +349,11 @@ class MjcfRobot(Robot):
         self._check_limits(start, goal)
         first, last = self._held(start), self._held(goal)
         about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
-        spent = efforts(model) ** -2.0 if effort is None else effort
+        spent = efforts(self.mjcf) ** -2.0 if effort is None else effort
         cost: Cost = ControlCost(_weights("effort", spent, len(controls)), about=about)
         damping, attitude = (check_number(*one, at_least=0.0) for one in (("damping", damping), ("attitude", attitude)))
         calm, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
-        for one in self._joints:
+        for one in self.mjcf.joints:
             if one.kind != "free":
                 calm[model.nv : 2 * model.nv][one.dofs] = damping
             elif model.dof_bodyid[one.dof] == root:  # not of something that the robot handles
@@ -412,12 +384,12 @@ class MjcfRobot(Robot):
         Limits are springs, and an MJCF may itself be past them at rest or in a keyframe.
         """
         model = self.scene.model
-        for one in self._joints:
+        for one in self.mjcf.joints:
             if one.limits is None:
                 continue
             stated = [model.qpos0[one.qpos.start], *model.key_qpos[:, one.qpos.start]]
             if not np.isclose(start[one.dof], stated, rtol=0, atol=1e-9).any() and (
-                said := one.past_limits(start[one.dof], mjcf_joints.FAR_PAST)
+                said := one.past_limits(start[one.dof], FAR_PAST)
             ):
                 raise InputError(f"start: {said}")
             if goal[one.dof] != start[one.dof] and (said := one.past_limits(goal[one.dof], _PAST)):
@@ -426,7 +398,7 @@ class MjcfRobot(Robot):
     def _bounds(self, start: Array, goal: Array) -> tuple[dict[str, float], dict[str, float]]:
         """Least and largest positions of joints, by name: at some distance from their limits, if both states are."""
         names, low, high = self.dynamics.state_coordinates.names, {}, {}
-        for one in self._joints:
+        for one in self.mjcf.joints:
             if one.limits is not None:
                 least, most = one.limits
                 room, ends = min(_ROOM[0], _ROOM[1] * (most - least)), (start[one.dof], goal[one.dof])
@@ -481,12 +453,10 @@ class MjcfRobot(Robot):
         model, rest, names = self.dynamics.physics.model, self.at(), self.dynamics.state_coordinates.names
         past = [
             f"{names[one.dof]} {rest[one.dof]:.4g} (want {one.limits[0]:.4g} to {one.limits[1]:.4g})"
-            for one in self._joints
+            for one in self.mjcf.joints
             if one.limits is not None and not one.limits[0] <= rest[one.dof] <= one.limits[1]
         ]
-        touching = [
-            f"{first} and {second}" for first, second in mjcf_joints.contacts_of(model, self.configuration(rest)[0])
-        ]
+        touching = [f"{first} and {second}" for first, second in contacts_of(model, self.configuration(rest)[0])]
         return {"past their limits": past, "touching": touching}
 
     @property
@@ -497,7 +467,7 @@ class MjcfRobot(Robot):
           InputError: no joint has limits.
         """
         names = self.dynamics.state_coordinates.names
-        return StateBounds({names[one.dof]: one.limits for one in self._joints if one.limits is not None})
+        return StateBounds({names[one.dof]: one.limits for one in self.mjcf.joints if one.limits is not None})
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
@@ -523,7 +493,7 @@ class MjcfRobot(Robot):
         if keyframe is None:
             qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), None
         else:
-            qpos, qvel, act = mjcf_joints.keyframe(model, self.scene.xml, keyframe, who)
+            qpos, qvel, act = self.mjcf.keyframe(keyframe, who)
         state[: 2 * model.nv] = self.state(qpos, qvel)[: 2 * model.nv]
         state[2 * model.nv :] = 0.0 if act is None else act
         names = self.dynamics.state_coordinates.names
@@ -544,11 +514,11 @@ class MjcfRobot(Robot):
         """
         model, names = self.scene.model, self.dynamics.state_coordinates.names
         fixed = np.zeros(model.nv, dtype=bool)
-        for one in self._joints:
+        for one in self.mjcf.joints:
             fixed[one.dofs] = not set(names[one.dofs]).isdisjoint(named)
-        equalities, aim = mjcf_joints.Equalities(model), self.configuration(state)[0]
+        equalities, aim = Equalities(model), self.configuration(state)[0]
         # Followers follow; what they follow moves only if one of them is named.
-        tries = (equalities.met(qpos, aim, one) for one in (fixed | mjcf_joints.leaders_of(model), fixed))
+        tries = (equalities.met(qpos, aim, one) for one in (fixed | leaders_of(model), fixed))
         place = next((place for place in tries if place is not None), None)
         if place is None:
             told = ", ".join(f"{names[dof]} {state[dof]:g}" for dof in np.flatnonzero(fixed)) or "none of them named"
@@ -576,7 +546,7 @@ class MjcfRobot(Robot):
         states = vectors_of("states", states, len(self.dynamics.state_coordinates))
         if not model.eq_active0.any():
             return states
-        equalities, found = mjcf_joints.Equalities(model), states.copy()
+        equalities, found = Equalities(model), states.copy()
         for state in found.reshape(-1, states.shape[-1]):
             closed = equalities.closed(*self.configuration(state))
             if closed is None:
@@ -589,15 +559,7 @@ class MjcfRobot(Robot):
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         model = self.scene.model
         qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
-        parts = []
-        for one in self._joints:
-            own = qpos[..., one.qpos]
-            if one.kind in ("free", "ball"):
-                parts += [own[..., :3]] if one.kind == "free" else []
-                parts.append(rotations.rotation_vector(own[..., -4:]))
-            else:
-                parts.append(own)
-        state = np.concatenate([*parts, qvel], axis=-1)
+        state = np.concatenate([self.mjcf.positions_of(qpos), qvel], axis=-1)
         if near is None:
             return state
         near = vectors_of("near", near, len(self.dynamics.state_coordinates))
@@ -606,17 +568,8 @@ class MjcfRobot(Robot):
         return whole[..., : 2 * model.nv]
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        model = self.scene.model
-        state = vectors_of("state", state, len(self.dynamics.state_coordinates))
-        parts = []
-        for one in self._joints:
-            own = state[..., one.dofs]
-            if one.kind in ("free", "ball"):
-                parts += [own[..., :3]] if one.kind == "free" else []
-                parts.append(rotations.quaternion(own[..., -3:]))
-            else:
-                parts.append(own)
-        return np.concatenate(parts, axis=-1), state[..., model.nv : 2 * model.nv].copy()
+        state, nv = vectors_of("state", state, len(self.dynamics.state_coordinates)), self.mjcf.model.nv
+        return self.mjcf.qpos_of(state[..., :nv]), state[..., nv : 2 * nv].copy()
 
 
 def _weights(field: str, given: PerEntry, size: int) -> PerEntry:

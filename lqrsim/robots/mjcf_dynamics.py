@@ -21,10 +21,8 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
-from lqrsim.scenes.mjcf_joints import FAR_PAST, joints_of
-from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
-from lqrsim.scenes.mjcf_physics import MjcfPhysics, touches, untouched_body
-from lqrsim.scenes.scene import unlogged
+from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel, unlogged
+from lqrsim.scenes.mjcf_physics import MjcfPhysics, carriers_of, check_planned, touches, untouched_body
 
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
@@ -32,6 +30,7 @@ WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz
 SOFTER = 0.1, 0.03, 0.01, 0.003  # m or rad, softness of contacts and limits in successive solves
 
 _forming = threading.Lock()  # held while a team of threads is formed
+_making = threading.Lock()  # held while MuJoCo's memory is made, which one thread does for all
 
 
 class MjcfDynamics(Dynamics):
@@ -44,13 +43,13 @@ class MjcfDynamics(Dynamics):
     solvers that need an inverse, do not accept these dynamics.
 
     Attributes:
-      xml: the MJCF. physics: MuJoCo's model, and memory for each thread.
+      mjcf: the MJCF.
     """
 
     discrete: ClassVar[bool] = True
 
     def __init__(
-        self, xml: str, name: str, *, model: Any = None, body: int, obstacles: tuple[int, ...], states: Coordinates,
+        self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
         controls: Coordinates, actuators: tuple[int, ...],
     ) -> None:  # fmt: skip
         self._name = name
@@ -58,24 +57,33 @@ class MjcfDynamics(Dynamics):
         self.functions, self.level = (), "compiled"
         self.parameters: dict[str, float] = {}
         self.state_coordinates, self.control_coordinates = states, controls
-        self._set_mjcf(xml, model)
+        self._set_mjcf(mjcf)
 
-    def _set_mjcf(self, xml: str, model: Any = None) -> None:
-        self.xml, self.fixed = xml, sha256(xml, repr(self._stated))
-        self.physics = MjcfPhysics(xml, self._name, model=model, loaded=bool(self.parameters), **self._stated)
-        loads = [f"{self.physics.model.body(number).name}_load" for number in self.physics.carriers]
+    def _set_mjcf(self, mjcf: MjcfModel) -> None:
+        self.mjcf, self.fixed, self._physics = mjcf, sha256(mjcf.xml, repr(self._stated)), None
+        check_planned(mjcf.model, self._name, self._stated["obstacles"])
+        loads = [f"{mjcf.model.body(number).name}_load" for number in carriers_of(mjcf.model)]
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
+
+    @property
+    def physics(self) -> MjcfPhysics:
+        """MuJoCo's model, and memory for each thread, which are made when they are first asked for."""
+        with _making:
+            if self._physics is None:
+                loaded = bool(self.parameters)
+                self._physics = MjcfPhysics(self.mjcf.model, loaded=loaded, **self._stated)
+            return self._physics
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes without MuJoCo's memory, which another process allocates anew."""
-        return {name: value for name, value in vars(self).items() if name not in ("physics", "disturbed", "compiled")}
+        return {name: value for name, value in vars(self).items() if name not in ("_physics", "disturbed", "compiled")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._set_mjcf(self.xml)
+        self._set_mjcf(self.mjcf)
 
     def __copy__(self) -> "MjcfDynamics":
-        """A copy that shares MuJoCo's memory."""
+        """A copy that shares MuJoCo's memory, if there is any yet."""
         other = object.__new__(type(self))
         vars(other).update({name: value for name, value in vars(self).items() if name != "disturbed"})
         return other
@@ -98,7 +106,7 @@ class MjcfDynamics(Dynamics):
             return self
         other = copy.copy(self)
         other.parameters = dict(self.disturbances)
-        other._set_mjcf(self.xml, self.physics.model)  # with its own models, which carry the loads
+        other._set_mjcf(self.mjcf)  # with its own models, which carry the loads
         return other
 
     @property
@@ -122,7 +130,9 @@ class MjcfDynamics(Dynamics):
         `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, the largest number if there
         are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
-        return {name: one.value for name, one in numbers_of(self.xml, self.physics.model).items()}
+        passed = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
+        found = self.mjcf.numbers.items()
+        return {name: one.value for name, one in found if one.what != "friction" or one.part not in passed}
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
@@ -142,7 +152,7 @@ class MjcfDynamics(Dynamics):
         other.parameters = self.parameters | pushed
         stated = {name: value for name, value in values.items() if name not in pushed}
         if stated:
-            other._set_mjcf(with_numbers(self.xml, self.physics.model, stated, self.name))
+            other._set_mjcf(self.mjcf.with_numbers(stated, self.name))
         return other
 
     @cached_property
@@ -157,7 +167,7 @@ class MjcfDynamics(Dynamics):
         return untouched_body(self.physics.model, states, state)
 
     def _cause_of_failure(self, state: Array) -> str | None:
-        found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in joints_of(self.physics.model))
+        found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in self.mjcf.joints)
         return next((said for said in found if said), None)
 
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
@@ -166,7 +176,7 @@ class MjcfDynamics(Dynamics):
         for softness in SOFTER:
             other = copy.copy(self)
             other._stated = self._stated | {"softness": softness}
-            other._set_mjcf(self.xml, self.physics.model)
+            other._set_mjcf(self.mjcf)
             yield f"{softness:g}", other
 
     def contact_modes(self, dt: float) -> ContactModes | None:
@@ -257,7 +267,7 @@ class MjcfMemory(UserFunction):
             function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
             offset=1, values=1, with_control=False, is_memory=True,
         )  # fmt: skip
-        memory.held.append((dynamics.physics, dynamics.physics.numbers.ctypes.data))
+        memory.held.append((dynamics.physics, dynamics.physics.address()))
         vars(memory).update(identity=dynamics.fixed, of_what=dynamics)
         return memory
 

@@ -1,6 +1,6 @@
 """What of a robot from an MJCF collides: its geoms, with MuJoCo's own distances, or balls along them."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,9 @@ from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
 from lqrsim.scenes import mjcf_obstacles
-from lqrsim.scenes.mjcf_outline import Outline
+from lqrsim.scenes.mjcf_kinematics import places_on
+from lqrsim.scenes.mjcf_model import MjcfModel
+from lqrsim.scenes.mjcf_obstacles import Outline
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import Obstacle, World
 
@@ -144,7 +146,7 @@ class MjcfGeoms(CollisionGeoms):
         rows = np.asarray(place[self._number], dtype=np.int64)
         chosen = np.flatnonzero(rows >= 0)
         data = self._data(chosen, rows[chosen], len(numbers), _FAR)
-        return chosen, np.concatenate([[float(dynamics.physics.numbers.ctypes.data)], data])
+        return chosen, np.concatenate([[float(dynamics.physics.address())], data])
 
     def _module(self, dynamics: MjcfDynamics) -> Any:
         n = len(dynamics.state_coordinates)
@@ -155,12 +157,12 @@ class MjcfBalls(CollisionSpheres):
     """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
 
     Args:
-      outline: bodies, positions on them, and radii. place: the centres (K, 3) at a state (n,), in plain Python.
+      outline: bodies, positions on them, and radii. mjcf: the MJCF.
     """
 
-    def __init__(self, outline: Outline, place: Callable[[Array], Array]) -> None:
-        self.outline, self.place, self.level = outline, place, "compiled"
-        self.function, self.jacobian, self.depends_on = place, None, None
+    def __init__(self, outline: Outline, mjcf: MjcfModel) -> None:
+        self.outline, self.level = outline, "compiled"
+        self.function, self.jacobian, self.depends_on = partial(_centres, mjcf, outline), None, None
         self._set_balls(outline.radii, outline.names, outline.sites)
 
     @property
@@ -175,6 +177,11 @@ class MjcfBalls(CollisionSpheres):
         data = np.concatenate([[len(self)], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         source = source_of(differences, BALLS=len(self), AXES=positions).filled(places=source_of(mjcf_places))
         return SphereCenters(source, data, positions, functions=(memory,))
+
+
+def _centres(mjcf: MjcfModel, outline: Outline, state: Array) -> Array:
+    """Centres of balls, (K, 3), at a state (n,), by MuJoCo's bindings."""
+    return places_on(mjcf.model, mjcf.qpos_of(state[: mjcf.model.nv]), outline.bodies, outline.offsets)
 
 
 def _same(one: Obstacle, other: Obstacle | None) -> bool:

@@ -32,7 +32,7 @@ from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics, MjcfMemory
-from lqrsim.scenes.mjcf_joints import axes_of, site_frame
+from lqrsim.scenes.mjcf_kinematics import axes_of, site_frame
 
 _AXES = "xyz"
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_joints import Equalities, control_ranges, input_names, ranges
-from lqrsim.scenes.scene import unlogged
+from lqrsim.scenes.mjcf_kinematics import Equalities
+from lqrsim.scenes.mjcf_model import MjcfModel, control_ranges, input_names, ranges, unlogged
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
 _STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients
@@ -510,23 +510,16 @@ def _carried(model: mujoco.MjModel, qpos: Array, driven: npt.NDArray[np.bool_]) 
     return kept, moves.T
 
 
-@unlogged()
-def efforts(model: mujoco.MjModel) -> Array:
+def efforts(mjcf: MjcfModel) -> Array:
     """The largest size of each control, (nu,): from its own limits, else from its force's; 1 without limits."""
-    found = np.ones(model.nu)
-    for k, number in enumerate(_owners(model.nu, model.actuator_ctrladr, model.actuator_ctrlnum)):
-        gain = abs(float(model.actuator_gainprm[number, 0]))
-        gear = abs(float(model.actuator_gear[model.actuator_outadr[number], 0]))
-        joint = int(model.actuator_trnid[number, 0])
-        of_joint = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT and model.jnt_actfrclimited[joint]
-        servo = model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE  # its control is no force
-        if model.actuator_ctrllimited[k]:
-            largest = float(np.abs(model.actuator_ctrlrange[k]).max())
-        elif model.actuator_forcelimited[number] and gain and not servo:
-            largest = float(np.abs(model.actuator_forcerange[number]).max()) / gain
-        elif of_joint and gain and gear and not servo:
-            largest = float(np.abs(model.jnt_actfrcrange[joint]).max()) / (gain * gear)
-        else:
-            continue
-        found[k] = largest if largest > 0 else 1.0
+    joints, found = {one.name: one for one in mjcf.joints}, np.ones(len(mjcf.controls))
+    for one in mjcf.actuators:
+        sides = []
+        if one.gain is not None and one.gain[0] and not any(one.bias or ()):  # else its control is no force
+            sides.append(np.abs(one.forces) / abs(one.gain[0]))
+            if one.joint is not None and one.gear:
+                sides.append(np.abs(joints[one.joint].forces) / abs(one.gain[0] * one.gear))
+        for k in range(one.controls.start, one.controls.stop):
+            own = np.abs([mjcf.controls[k].low, mjcf.controls[k].high])
+            found[k] = next((size for side in (own, *sides) if 0 < (size := float(side.max())) < np.inf), 1.0)
     return found

@@ -1,70 +1,45 @@
 """The obstacles of a robot that consists of all moving bodies of an MJCF, and its geoms that can touch them."""
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError
-from lqrsim.scenes.mjcf_joints import placed
-from lqrsim.scenes.world import KINDS, World
+from lqrsim.capsules import Capsule
+from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_kinematics import placed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's geom
 
-_LONG = 1e3  # m, half length of a geom that stands for an infinite one
 _NEAR = 1e-3  # m; a geom nearer to another touches it
 _LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
 _LOWERED, _CARRIES = 1e-3, 0.7  # m; a geom carries another if lowering it by this widens the gap by this share or more
+TOLERANCE = 0.25  # largest part of a capsule outside its balls, relative to its radius
 _POSITIONS = 64  # random positions of joints in which a geom must touch what carries it
-
-
-def with_obstacles(xml: str, world: World) -> str:
-    """The MJCF with these obstacles as further geoms, fixed to the world, which nothing touches.
-
-    Raises:
-      InputError: an obstacle is of a kind of which MuJoCo needs more than its size, or has the name of a geom.
-    """
-    root = ElementTree.fromstring(xml)
-    taken = {one.get("name") for one in root.iter("geom")}
-    section = ElementTree.SubElement(root, "worldbody")
-    for one in world.obstacles:
-        if one.kind not in KINDS:
-            raise InputError(f"moving: got {one.name}, a {one.kind}, want one of: {', '.join(KINDS)}")
-        if one.name in taken:
-            raise InputError(f"moving: got {one.name}, which is a geom of the robot's MJCF, want another name")
-        turn = np.zeros(4)
-        mujoco.mju_mat2Quat(turn, one.rotation.ravel())
-        size = np.minimum([0.0, 0.0, 1.0] if one.kind == "plane" else one.size, _LONG)
-        numbers = {"size": size, "pos": one.position, "quat": turn}
-        texts = {key: " ".join(repr(number) for number in values.tolist()) for key, values in numbers.items()}
-        own = {"name": one.name, "type": one.kind, "contype": "0", "conaffinity": "0"}
-        ElementTree.SubElement(section, "geom", own | texts)
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
     """The candidates (ids of geoms fixed to the world) that are obstacles to the robot.
 
-    They are those of `touchable`, except its own base, and a floor that it touches at rest.
+    They are those of `touchable`, except its own base, and a floor that anything touches at rest.
 
     Args:
       body: the robot's first that moves. floors: whether there may be ground for standing on.
     """
-    data, base, bodies, pairs = placed(model), _base(model), model.geom_bodyid.tolist(), touching_pairs
-    level, stood_on = set[int](), set[int]()
+    data, pairs = placed(model), touching_pairs(model, candidates)
+    pairs = pairs[~np.isin(model.geom_bodyid[pairs[:, 1]], [*_base(model)])]
     if floors:
-        level, stood_on = _ground(model, data), _supports(model, pairs(model, candidates))
-    return [
-        geom
-        for geom in touchable(model, candidates, body, floors=floors)
-        if bodies[geom] not in base
-        and geom not in stood_on
-        and not (geom in level and _touch(model, data, pairs(model, [geom])).any())
-    ]
+        level = _ground(model, data)
+        near = pairs[np.isin(pairs[:, 1], [*level])]
+        touched = set(near[_touch(model, data, near), 1].tolist())
+        ground = (level if _sinks(model, data, body) else touched) | _supports(model, pairs)
+        pairs = pairs[~np.isin(pairs[:, 1], [*ground])]
+    avoidable = set(pairs[~_always_touch(model, pairs), 1].tolist())
+    return [geom for geom in candidates if geom in avoidable]
 
 
 def touchable(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
@@ -202,23 +177,29 @@ def _touch(model: mujoco.MjModel, data: mujoco.MjData, pairs: Pairs) -> npt.NDAr
     found, sizes = np.zeros(len(pairs), dtype=bool), model.geom_rbound[pairs]
     apart = np.linalg.norm(data.geom_xpos[pairs[:, 0]] - data.geom_xpos[pairs[:, 1]], axis=1) - sizes.sum(axis=1)
     for k in np.flatnonzero((apart < _NEAR) | (sizes == 0).any(axis=1)):  # planes have no size
-        found[k] = mujoco.mj_geomDistance(model, data, *pairs[k].tolist(), 2 * _NEAR, None) < _NEAR
+        found[k] = _close(model, data, pairs[k])
     return found
+
+
+def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
+    return mujoco.mj_geomDistance(model, data, *pair.tolist(), 2 * _NEAR, None) < _NEAR
 
 
 def _always_touch(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom."""
+    if not len(pairs):
+        return np.zeros(0, dtype=bool)
     data = placed(model)
     always = _touch(model, data, pairs)
     always &= ~_moved_by(model, pairs, _FREE)
-    rng, kept = np.random.default_rng(0), np.flatnonzero(always)
-    for _ in range(_POSITIONS):
+    kept = np.flatnonzero(always)
+    for qpos in _random_positions(model) if len(kept) else ():
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        always[kept] = [_close(model, data, pair) for pair in pairs[kept]]
+        kept = kept[always[kept]]
         if not len(kept):
             break
-        data.qpos[:] = _random_position(model, rng)
-        mujoco.mj_kinematics(model, data)
-        always[kept] = _touch(model, data, pairs[kept])
-        kept = kept[always[kept]]
     return always
 
 
@@ -229,19 +210,18 @@ def _moved_by(model: mujoco.MjModel, pairs: Pairs, *kinds: int) -> npt.NDArray[n
     return np.array([moved[body] for body in bodies], dtype=bool)
 
 
-def _random_position(model: mujoco.MjModel, rng: np.random.Generator) -> Array:
-    """Random positions (nq,) of all joints; slides without a range move up to 1 m."""
-    qpos = model.qpos0.copy()
-    for joint, kind in enumerate(model.jnt_type):
-        first = int(model.jnt_qposadr[joint])
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
-            turn = rng.standard_normal(4)
-            qpos[first : first + 4] = turn / np.linalg.norm(turn)
-        elif kind != _FREE:
-            span = 1.0 if kind == mujoco.mjtJoint.mjJNT_SLIDE else np.pi
-            low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-span, span)
-            qpos[first] = rng.uniform(low, high)
-    return qpos
+def _random_positions(model: mujoco.MjModel) -> Array:
+    """Random positions (_POSITIONS, nq) of all joints but free ones; slides without a range move up to 1 m."""
+    rng, positions = np.random.default_rng(0), np.tile(model.qpos0, (_POSITIONS, 1))
+    slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+    single = slides | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    span = np.where(slides, 1.0, np.pi)
+    low, high = np.where(model.jnt_limited, model.jnt_range.T, [-span, span])[:, single]
+    positions[:, model.jnt_qposadr[single]] = rng.uniform(low, high, (_POSITIONS, len(low)))
+    for first in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]:
+        turns = rng.standard_normal((_POSITIONS, 4))
+        positions[:, first : first + 4] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    return positions
 
 
 def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
@@ -249,8 +229,10 @@ def _supports(model: mujoco.MjModel, pairs: Pairs) -> set[int]:
 
     It stands there at rest; with a free joint, in a keyframe also counts.
     """
-    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
     floating, moving = _moved_by(model, pairs, _FREE), _moved_by(model, pairs, _FREE, _SLIDE)
+    if not moving.any():
+        return set()
+    data, found, far = mujoco.MjData(model), set[int](), _NEAR + 2 * _LOWERED
     for qpos, own in ((model.qpos0, pairs[moving]), *((one, pairs[floating]) for one in model.key_qpos)):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
@@ -275,3 +257,48 @@ def _sinks(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
     """Whether a body can sink: it, or a body that carries it, has a free joint or a slide that is not level."""
     upward = np.abs(data.xaxis[:, 2]) > 1e-9
     return any(kind == _FREE or (kind == _SLIDE and upward[joint]) for kind, joint in _joints(model, body))
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """B balls.
+
+    Attributes:
+      bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) positions in the axes of these bodies,
+        in metres. radii: (B,) in metres. names: names of the balls. sites: names of the geoms in whose centre they are;
+        None for other balls. missed: largest part of a capsule outside its balls, in metres.
+    """
+
+    bodies: Array
+    offsets: Array
+    radii: Array
+    names: tuple[str, ...]
+    sites: tuple[str | None, ...]
+    missed: float
+
+
+def outline_of(model: mujoco.MjModel) -> Outline:
+    """Spheres as balls, capsules as chains of balls, other geoms as a ball about their centre that contains them.
+
+    Geoms that are only drawn count if nothing collides. The last ball is in the centre of a geom.
+    """
+    rows, names, sites, missed = list[tuple[int, Array, float]](), list[str](), list[str | None](), 0.0
+    for geom in solid_geoms(model).tolist():
+        body, middle, name = int(model.geom_bodyid[geom]), model.geom_pos[geom], model.geom(geom).name
+        radius, places = float(model.geom_rbound[geom]), [middle]
+        if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+            radius, half = (float(number) for number in model.geom_size[geom, :2])
+            capsule = Capsule(2 * half, radius, TOLERANCE * radius)
+            missed = max(missed, capsule.missed)
+            axis = np.zeros(3)
+            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), model.geom_quat[geom])
+            chain = np.array(capsule.between(tuple(middle - axis), tuple(middle + axis)))
+            places = [*(one for one in chain if np.linalg.norm(one - middle) > 1e-9), middle]
+        for number, place in enumerate(places, start=1 - len(places)):
+            rows.append((body, np.asarray(place, dtype=np.float64), radius))
+            names.append(f"{name} ({-number} before)" if number else name)
+            sites.append(None if number else name)
+    return Outline(
+        bodies=np.array([body for body, _, _ in rows]), offsets=np.array([place for _, place, _ in rows]),
+        radii=np.array([radius for _, _, radius in rows]), names=tuple(names), sites=tuple(sites), missed=missed,
+    )  # fmt: skip

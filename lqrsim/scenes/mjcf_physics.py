@@ -4,7 +4,7 @@ import copy
 import ctypes
 import platform
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import mujoco
@@ -13,7 +13,7 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.scenes.scene import model_from_xml, unlogged
+from lqrsim.scenes.mjcf_model import unlogged
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
 _CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
@@ -30,7 +30,7 @@ class MjcfPhysics:
     - an unstable simulation is not reset.
 
     Args:
-      xml: the MJCF as text. name: name of the MJCF in messages. body: id of the body that is pushed.
+      model: the MJCF's model, which passes `check_planned`. body: id of the body that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
@@ -39,31 +39,23 @@ class MjcfPhysics:
     Attributes:
       model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
         threads share. carriers: ids of the bodies that can carry a load: bodies that move and have mass.
-
-    Raises:
-      InputError: joints and actuators do not describe the whole state.
     """
 
     def __init__(
         self,
-        xml: str,
-        name: str,
+        model: mujoco.MjModel,
         *,
-        model: mujoco.MjModel | None = None,
         body: int,
         actuators: tuple[int, ...],
         obstacles: tuple[int, ...],
         loaded: bool = False,
         softness: float = 0.0,
     ) -> None:
-        self.model = model_from_xml(xml, name) if model is None else copy.copy(model)
-        _check(self.model, name)
+        self.model = copy.copy(model)
         _prepare(self.model, obstacles)
         if softness > 0:
             _soften(self.model, softness)
-        self._exact = _for_distances(self.model)
-        heavy = (self.model.body_treeid >= 0) & (self.model.body_mass > 0)
-        self.carriers = tuple(np.flatnonzero(heavy).tolist())
+        self.carriers = carriers_of(model)
         # With loads, each slot has its own model, which may be large; filters need one slot.
         slots = 2 if loaded else 2 * processors()
         self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
@@ -81,6 +73,27 @@ class MjcfPhysics:
         addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
         self._table = np.array(addresses, dtype=np.float64)
         self.numbers = self._numbers(actuators, self.carriers if loaded else ())
+
+    def address(self) -> int:
+        """The address of the numbers, for kernels of places and distances.
+
+        The model for distances, which is as large as all meshes and textures, is not made before.
+        """
+        self.numbers[kernel.DISTANCE_MODEL] = self._for_distances._address
+        return self.numbers.ctypes.data
+
+    @cached_property
+    def _for_distances(self) -> mujoco.MjModel:
+        """The model with more exact distances, whose directions are gradients.
+
+        With MuJoCo's own tolerance of 1e-6 m, the direction between two geoms that nearly touch can be a few degrees
+        off.
+        """
+        exact = copy.copy(self.model)
+        exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _CLOSE, max(_LOOKS, exact.opt.ccd_iterations)
+        # The other algorithm is wrong at a distance.
+        exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+        return exact
 
     def _addresses(self, data: mujoco.MjData, model: mujoco.MjModel, body: int) -> list[float]:
         row = np.zeros(kernel.SLOT)
@@ -110,15 +123,19 @@ class MjcfPhysics:
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
         numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
         numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
-        numbers[kernel.DISTANCE_MODEL], numbers[kernel.LOADED] = self._exact._address, len(carriers)
-        numbers[kernel.LOADS] = kernel.TABLE + joints.size + len(actuators)
+        numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size + len(actuators)
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
         numbers[kernel.CONSTANTS] = functions["mj_setConst"]
         return np.concatenate([numbers, joints.ravel(), actuators, *loads])
 
 
-def _check(model: mujoco.MjModel, name: str) -> None:
-    """Raises InputError if there is no actuator, or for features that have their own states."""
+def carriers_of(model: mujoco.MjModel) -> tuple[int, ...]:
+    """Ids of the bodies that can carry a load: bodies that move and have mass."""
+    return tuple(np.flatnonzero((model.body_treeid >= 0) & (model.body_mass > 0)).tolist())
+
+
+def check_planned(model: mujoco.MjModel, name: str, obstacles: tuple[int, ...]) -> None:
+    """Raises InputError if there is no actuator, an obstacle is in a <pair>, or something has states of its own."""
     refused = {
         "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
         "deformable parts": (model.nflex > 0, "got some", "rigid bodies"),
@@ -128,14 +145,13 @@ def _check(model: mujoco.MjModel, name: str) -> None:
     for what, (found, got, wanted) in refused.items():
         if found:
             raise InputError(f"{name}: {what}: {got}, want {wanted}")
+    for geom in np.intersect1d(obstacles, [model.pair_geom1, model.pair_geom2])[:1]:
+        who = model.geom(int(geom)).name
+        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
 
 
 def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
-    listed = list(obstacles)
-    model.geom_contype[listed] = model.geom_conaffinity[listed] = 0
-    for geom in np.intersect1d(listed, [model.pair_geom1, model.pair_geom2])[:1]:
-        who = model.geom(int(geom)).name
-        raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
+    model.geom_contype[list(obstacles)] = model.geom_conaffinity[list(obstacles)] = 0
     option, flags = model.opt, mujoco.mjtDisableBit
     option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -189,17 +205,6 @@ def _placed(model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:
         with unlogged():
             mujoco.mj_fwdPosition(model, data)
         yield data
-
-
-def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with more exact distances, whose directions are gradients.
-
-    With MuJoCo's own tolerance of 1e-6 m, the direction between two geoms that nearly touch can be a few degrees off.
-    """
-    exact = copy.copy(model)
-    exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _CLOSE, max(_LOOKS, exact.opt.ccd_iterations)
-    exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the other algorithm is wrong at a distance
-    return exact
 
 
 @cache

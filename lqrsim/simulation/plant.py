@@ -5,7 +5,7 @@ With a `Simulator`, the simulator moves the robot. The MuJoCo model then provide
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -18,9 +18,10 @@ from lqrsim.errors import Array, InputError, check_kind, check_number, check_tex
 from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import mjcf_joints
+from lqrsim.scenes import mjcf_kinematics
+from lqrsim.scenes.mjcf_model import compiled, unlogged
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
-from lqrsim.scenes.scene import Scene, compiled, free_name, obstacle_geoms, unlogged
+from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation
 from lqrsim.simulation.simulator import Simulator
@@ -262,7 +263,7 @@ class Plant:
         if balls is None:
             if dynamics.state_coordinates.position:
                 return None
-            number, place, radius = mjcf_joints.farthest_out(self.model, self.body)
+            number, place, radius = mjcf_kinematics.farthest_out(self.model, self.body)
             places = np.full((*driven.shape[:2], 1, 3), np.nan)
             places[known] = self._places_on(number, place, driven[known])
             planned, anchor = self._places_on(number, place, planned), np.array([[number, *place]])
@@ -298,38 +299,24 @@ class Plant:
           displaced: (K, obstacles, 3), in metres along the world's axes.
         """
         geoms = self.obstacle_geoms
-        simulations.expand("geom_pos")[:, geoms] += mjcf_joints.in_axes_of_bodies(self.model, geoms, displaced)
+        simulations.expand("geom_pos")[:, geoms] += mjcf_kinematics.in_axes_of_bodies(self.model, geoms, displaced)
 
     def _scenery(self) -> list[tuple[int, str]]:
         """The ids and names of the scene's obstacles."""
         return list(zip(self.scene.geoms, self.scene.world.names, strict=True))
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
-        try:
-            spec = mujoco.MjSpec.from_string(self.scene.xml)
-            # The sensors need names; geoms without one get the obstacle's. Ids exist only after compiling.
-            again = compiled(spec)
-        except (ValueError, mujoco.FatalError) as error:
-            raise InputError(f"scene {self.scene.name}: xml: got an MJCF that MuJoCo refuses: {error}") from None
-        had, has = self.scene.model, again
-        if (had.ngeom, had.nbody, had.nq, had.nv, had.nactuator) != (
-            has.ngeom,
-            has.nbody,
-            has.nq,
-            has.nv,
-            has.nactuator,
-        ):
-            raise InputError(f"scene {self.scene.name}: got a model that differs from its xml, want one of load_scene")
+        spec = self.scene.mjcf.spec()
         if self._step is not None:
             spec.option.timestep = self._step
-        geoms = {geom.id: geom for geom in spec.geoms}
+        geoms = list(spec.geoms)
         for geom, name in self._scenery():
-            geoms[geom].name = name
+            geoms[geom].name = name  # sensors need names
         _separate(spec, geoms, self._apart, self.scene.model)
         taken = {sensor.name for sensor in spec.sensors}
         for name in self.obstacles:
             if not contacts:
-                geom = next(geom for geom in spec.geoms if geom.name == name)
+                geom = next(geom for geom in geoms if geom.name == name)
                 geom.contype = geom.conaffinity = 0
                 continue
             sensor = free_name(f"contact with {name}", taken)
@@ -370,7 +357,7 @@ def extent(plant: Plant) -> float:
     collides[model.pair_geom1], collides[model.pair_geom2] = True, True
     reach = 0.0
     for geom in np.flatnonzero(collides).tolist():
-        path = mjcf_joints.path_to(model, geom, plant.body)
+        path = mjcf_kinematics.path_to(model, geom, plant.body)
         if path is None:
             continue
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
@@ -405,7 +392,7 @@ def _left_out(robot: Robot, scene: Scene, body: int) -> Pairs:
     return touching_pairs(scene.model, touchable(scene.model, left, body, floors=True))
 
 
-def _separate(spec: mujoco.MjSpec, geoms: Mapping[int, mujoco.MjsGeom], apart: Pairs, model: mujoco.MjModel) -> None:
+def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs, model: mujoco.MjModel) -> None:
     """Let no contact arise between the geoms of these pairs, by bits of their own for the fixed ones.
 
     Args:

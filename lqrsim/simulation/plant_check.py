@@ -14,7 +14,8 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.robots.base import Robot
-from lqrsim.scenes.scene import Scene, unlogged
+from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.scene import Scene
 from lqrsim.simulation.mujoco_physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator, states_of

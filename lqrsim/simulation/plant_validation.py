@@ -10,7 +10,6 @@ from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
 from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import mjcf_joints
 from lqrsim.scenes.scene import Scene
 from lqrsim.scenes.world import PLANES, SPACE
 
@@ -117,7 +116,7 @@ def _check_limits(plant: "Plant") -> None:
     if beyond.any():
         row, k = (int(place) for place in np.argwhere(beyond)[0])
         given = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
-        name = mjcf_joints.controls_of(model)[plant.ctrl[k]].name
+        name = plant.scene.mjcf.controls[plant.ctrl[k]].name
         raise InputError(
             f"robot {robot.name}: control_limits: got controls ({given}), for which actuation() commands"
             f" {asked[row, k]:g} of actuator {name!r}, want its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"

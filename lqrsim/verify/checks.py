@@ -18,7 +18,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenes.mjcf_joints import posed
+from lqrsim.scenes.mjcf_kinematics import posed
 from lqrsim.verify.verdict import Criterion, Positions, Verification, compare, positions_at
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera, measuring

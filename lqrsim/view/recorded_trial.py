@@ -5,8 +5,8 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.results.rollout import BallRecord, Rollout
-from lqrsim.scenes.mjcf_joints import in_axes_of_bodies
-from lqrsim.scenes.scene import model_from_xml
+from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
+from lqrsim.scenes.mjcf_model import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker

@@ -25,7 +25,8 @@ from lqrsim.results.coordinates import Coordinates, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status, Trajectory
-from lqrsim.scenes.scene import compiled, free_name
+from lqrsim.scenes.mjcf_model import compiled
+from lqrsim.scenes.scene import free_name
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
@@ -80,7 +81,7 @@ class MovableGoal:
 
 def model_with_goal(plant: Plant, goal: MovableGoal) -> tuple[mujoco.MjModel, str]:
     """The plant's model with a body for the goal, which a mouse can drag and nothing collides with; and its name."""
-    spec = mujoco.MjSpec.from_string(plant.scene.xml)
+    spec = plant.scene.mjcf.spec()
     space, radius = plant.robot.dynamics.state_coordinates, GOAL_SIZE * plant.robot.radius
     name = free_name("goal", [body.name for body in spec.bodies])
     body = spec.worldbody.add_body(name=name, mocap=True, pos=space.in_world(goal.place))

@@ -19,7 +19,7 @@ from mujoco import batch
 from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown, possible_unknowns
 from lqrsim.errors import Array, InputError, check_name, check_number, check_text, keep
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.scenes.mjcf_joints import placed
+from lqrsim.scenes.mjcf_kinematics import placed
 from lqrsim.simulation.disturbances.actuation import check_gains
 from lqrsim.simulation.disturbances.base import (
     Disturbance,

@@ -1,0 +1,214 @@
+"""Places of bodies of an MJCF, how joints move them, and positions of joints at which kinematic loops close."""
+
+import copy
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_model import MjcfModel, unlogged
+
+_MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
+_TYPED = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
+_RANK = 1e-9  # relative size of singular values that count as zero
+_STRIDE = 0.05  # m or rad, of joints that others follow
+
+
+def placed(model: mujoco.MjModel, qpos: Array | None = None) -> mujoco.MjData:
+    """MuJoCo's data with the places of all bodies at positions (nq,), by default at rest."""
+    return next(posed(model, [model.qpos0 if qpos is None else qpos]))
+
+
+def posed(model: mujoco.MjModel, positions: Iterable[Array]) -> Iterator[mujoco.MjData]:
+    """MuJoCo's data with the places of all bodies at each of these positions (nq,): one object, which changes."""
+    data = mujoco.MjData(model)
+    for qpos in positions:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        yield data
+
+
+@unlogged()
+def contacts_of(model: mujoco.MjModel, qpos: Array) -> list[tuple[str, str]]:
+    """The names of the bodies that touch, each pair once."""
+    data = placed(model, qpos)
+    mujoco.mj_collision(model, data)
+    bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
+    return [
+        (model.body(first).name, model.body(second).name)
+        for first, second in dict.fromkeys(map(tuple, bodies.tolist()))
+    ]
+
+
+def leaders_of(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
+    """Which degrees of freedom (nv,) are those of joints that others follow by an equality, and that follow none."""
+    joints = np.flatnonzero(model.eq_active0 & (model.eq_type == mujoco.mjtEq.mjEQ_JOINT.value))
+    leads, follows = np.zeros(model.nv, dtype=bool), np.zeros(model.nv, dtype=bool)
+    follows[model.jnt_dofadr[model.eq_obj1id[joints]]] = True
+    others = model.eq_obj2id[joints]
+    leads[model.jnt_dofadr[others[others >= 0]]] = True
+    return leads & ~follows
+
+
+class Equalities:
+    """All active equality constraints of a model, at given positions.
+
+    Args:
+      model: with at least one.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = copy.copy(model)
+        self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        self._data = mujoco.MjData(self.model)
+
+    @unlogged()
+    def at(self, qpos: Array) -> tuple[Array, Array]:
+        """How far they are off at positions (nq,), (k,) in m or rad, and the derivatives by the velocities, (k, nv)."""
+        data = self._data
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        return data.efc_pos[rows].copy(), data.efc_J.reshape(-1, self.model.nv)[rows].copy()
+
+    def met(self, qpos: Array, aim: Array, fixed: npt.NDArray[np.bool_]) -> Array | None:
+        """Positions (nq,) at which they are met, as little away from those given as may be; None if none was found.
+
+        Args:
+          qpos: to begin with. aim: where the fixed degrees of freedom, (nv,), go. The others follow them in small
+            steps, so that a loop does not flip over.
+        """
+        place, move, model = qpos.copy(), np.zeros(self.model.nv), self.model
+        mujoco.mj_differentiatePos(model, move, 1.0, qpos, aim)
+        move[~fixed] = 0.0
+        steps = max(1, int(np.ceil(np.abs(move).max(initial=0.0) / _STRIDE)))
+        off = np.zeros(0)
+        for _ in range(steps):
+            mujoco.mj_integratePos(model, place, move / steps, 1.0)
+            for _ in range(_NEWTON):
+                off, slopes = self.at(place)
+                within_reach = slopes[:, ~fixed].any(axis=1)  # others need to be met at the aim only
+                if np.abs(off[within_reach]).max(initial=0.0) < _MET:
+                    break
+                step = np.zeros(model.nv)
+                step[~fixed] = -np.linalg.lstsq(slopes[:, ~fixed], off, rcond=_RANK)[0]
+                mujoco.mj_integratePos(model, place, step, 1.0)
+                if np.abs(step).max() < _MET:  # as near as it gets on the way: only the aim is to be consistent
+                    break
+            else:
+                return None
+        return place if np.abs(off).max(initial=0.0) < _TYPED else None
+
+    def closed(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
+        """Positions (nq,) and velocities (nv,) near those given at which they are met; None if none were found."""
+        place = self.met(qpos, qpos, np.zeros(self.model.nv, dtype=bool))
+        if place is None:
+            return None
+        _, slopes = self.at(place)
+        return place, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2).
+
+    Attributes:
+      of: degree of freedom -> axis, where its position is the origin's coordinate.
+      shifted: degree of freedom -> its axis and the origin's coordinate at its zero, where that is another one.
+      moving: whether anything moves the origin along each axis, (3,).
+    """
+
+    of: dict[int, int]
+    shifted: dict[int, tuple[int, float]]
+    moving: tuple[bool, ...]
+
+
+def position_of(mjcf: MjcfModel, body: int) -> Axes:
+    """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
+    model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
+    candidates = {
+        one.dof + i: one.qpos.start + i for one in mjcf.joints if one.kind in ("free", "slide")
+        for i in range(3 if one.kind == "free" else 1)
+    }  # fmt: skip
+    origins, positions = np.zeros((5, 3)), np.zeros((5, model.nq))
+    for trial in range(5):
+        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        origins[trial], positions[trial] = data.xpos[body], data.qpos
+    exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
+    for dof, number in candidates.items():
+        for axis in range(3):
+            away = origins[:, axis] - positions[:, number]
+            if np.abs(away).max() < 1e-9:
+                exact[dof] = axis
+            elif np.ptp(away) < 1e-9:
+                shifted[dof] = (axis, float(away.mean()))
+    return Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
+
+
+def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
+    """World positions of points (K, 3) in the axes of bodies (K,), at MuJoCo's positions (nq,)."""
+    data = placed(model, qpos)
+    return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
+
+
+def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vectors: Array) -> Array:
+    """Vectors (..., k, 3) along the world's axes, each in the axes of the body of its geom (k,), at rest."""
+    axes = placed(model).xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
+    # By elements, so that the bits of one do not depend on how many others there are.
+    x, y, z = (vectors[..., i, None] * axes[:, i] for i in range(3))
+    return x + y + z
+
+
+def site_frame(model: mujoco.MjModel, site: int) -> tuple[int, Array, Array]:
+    """The body of a site, and the site's position (3,) and axes (3, 3) in the body's axes."""
+    return int(model.site_bodyid[site]), model.site_pos[site].copy(), axes_of(model.site_quat[site])
+
+
+def axes_of(quaternion: Array) -> Array:
+    """The rotation matrix (3, 3) of a quaternion (4,) of length 1."""
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, quaternion)
+    return axes.reshape(3, 3)
+
+
+def farthest_out(model: mujoco.MjModel, body: int) -> tuple[int, Array, float]:
+    """The geom in a body's tree that is farthest from the body's origin at rest; the body itself if there is no geom.
+
+    Returns:
+      The number of the geom's body, its position (3,) there, and the radius of its bounding ball in metres.
+    """
+    data = placed(model)
+    moves = (model.body_rootid[model.geom_bodyid] == model.body_rootid[body]) & (model.geom_rbound > 0)
+    own = np.flatnonzero(moves & (model.body_weldid[model.geom_bodyid] != 0))
+    if not len(own):
+        return body, np.zeros(3), 0.0
+    geom = int(own[np.argmax(np.linalg.norm(data.geom_xpos[own] - data.xpos[body], axis=1))])
+    return int(model.geom_bodyid[geom]), model.geom_pos[geom].copy(), float(model.geom_rbound[geom])
+
+
+def reach_of(model: mujoco.MjModel, body: int) -> float:
+    """The largest distance of the colliding geoms of a body, or of bodies that it carries, from its origin, in metres.
+
+    If no geom collides, the visual geoms count instead.
+    """
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    reach = 0.0
+    for geom in np.flatnonzero(collides).tolist() if collides.any() else range(model.ngeom):
+        if (path := path_to(model, geom, body)) is not None:
+            offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path)]
+            reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(one) for one in offsets)))
+    return reach
+
+
+def path_to(model: mujoco.MjModel, geom: int, body: int) -> list[int] | None:
+    """The bodies from a geom's own up to `body`, without it; None if that one does not carry the geom."""
+    path = [int(model.geom_bodyid[geom])]
+    while path[-1] not in (0, body):
+        path.append(int(model.body_parentid[path[-1]]))
+    return path[:-1] if path[-1] == body else None
