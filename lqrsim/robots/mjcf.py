@@ -24,6 +24,7 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_shape import ShapeInWorld, shape_in
+from lqrsim.problem.constraints import Constraint
 from lqrsim.problem.costs import Cost
 from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.problem.obstacle_cost import ObstacleCost
@@ -32,6 +33,7 @@ from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.problem.state_bounds import StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
+from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
@@ -213,6 +215,29 @@ class MjcfRobot(Robot):
     def dynamics(self) -> MjcfDynamics:
         return self._dynamics
 
+    @cached_property
+    def _forces(self) -> tuple[tuple[ForceLimit, ...], tuple[str, ...]]:
+        return limited_forces(self.mjcf)
+
+    @property
+    def force_limits(self) -> ForceLimits:
+        """The limits of forces as constraints, for a problem with `unlimited` as its dynamics.
+
+        They are those of `forcerange` and `actuatorfrcrange` where the force is linear in state and control, as of
+        motors and servos. MuJoCo clips forces, and a solver cannot tell how a force that is clipped comes back.
+
+        Raises:
+          InputError: there is no such limit.
+        """
+        if not self._forces[0]:
+            raise InputError(f"MjcfRobot {self.name}: force_limits: got none that are linear, want problems without")
+        return ForceLimits(self._forces[0])
+
+    @cached_property
+    def unlimited(self) -> MjcfDynamics:
+        """The dynamics without these limits. Raises InputError if there are none."""
+        return self.force_limits.removed_from(self.dynamics)
+
     def with_parameters(self, **values: float) -> "MjcfRobot":
         """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
 
@@ -309,6 +334,7 @@ class MjcfRobot(Robot):
         attitude: float = 0.1,
         limits: float = 100.0,
         clearance: float | None = None,
+        force_limits: bool = True,
     ) -> Problem:
         """Make a problem: from one state to another, within the actuators' limits, with costs on obstacles.
 
@@ -335,6 +361,8 @@ class MjcfRobot(Robot):
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
           clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
             default obstacles only add cost.
+          force_limits: whether limits of forces are constraints, as in `force_limits`, and not in the dynamics. Those
+            that no control keeps at the start stay in the dynamics, as all do with False: then forces may saturate.
 
         Returns:
           The Problem.
@@ -365,9 +393,16 @@ class MjcfRobot(Robot):
         bounds = self._bounds(start, goal)
         if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
-        kept = []
+        kept: list[Constraint] = []
         if clearance is not None:
-            kept = [Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance))]
+            kept.append(Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance)))
+        sides = np.array([controls.low, controls.high])
+        if (
+            check_flag("force_limits", force_limits)
+            and (forces := ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])).limits
+        ):
+            kept.append(forces)
+            dynamics = forces.removed_from(dynamics)
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
@@ -423,12 +458,23 @@ class MjcfRobot(Robot):
             else f"  body: {self.body}, whose position is not among the states",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
             f"  held at rest by: {_listed(told)}{short}",
-            *([f"  dry friction, in plans and runs: {_listed(dry)}"] if (dry := self._dry()) else []),
+            *(f"  {what}: {_listed(found)}" for what, found in self._known_forces().items() if found),
             *(f"  {what} at rest: {_listed(found)}" for what, found in self._amiss().items() if found),
             f"  obstacles: {_listed(self.scene.world.names)}",
             *([f"  carried, without contacts, by: {_listed(mounts)}"] if (mounts := self._mounts()) else []),
         ]
         return "\n".join(lines)
+
+    def _known_forces(self) -> dict[str, list[str]]:
+        """Limits of forces and dry friction, with what a plan does about them."""
+        kept, clipped = self._forces
+        return {
+            "force limits, constraints of plans": [
+                f"{one.name.partition(' ')[2]} {one.low:.4g} to {one.high:.4g} {one.unit}" for one in kept
+            ],
+            "force limits, clipped in plans as in runs": [name.partition(" ")[2] for name in clipped],
+            "dry friction, in plans and runs": self._dry(),
+        }
 
     def _mounts(self) -> list[str]:
         """The obstacles that bodies touch in every position, with these bodies."""

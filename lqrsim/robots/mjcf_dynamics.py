@@ -179,6 +179,13 @@ class MjcfDynamics(Dynamics):
             other._set_mjcf(self.mjcf)
             yield f"{softness:g}", other
 
+    def unlimited(self, actuators: tuple[int, ...], joints: tuple[int, ...]) -> "MjcfDynamics":
+        """The same without limits on the forces of these actuators and on the sums at these joints."""
+        other = copy.copy(self)
+        other._stated = self._stated | {"unlimited": (actuators, joints)}
+        other._set_mjcf(self.mjcf)
+        return other
+
     def contact_modes(self, dt: float) -> ContactModes | None:
         model, known = self.physics.model, not self.parameters and ContactModes.known_for(self.physics.model)
         substeps = round(dt / float(model.opt.timestep))

@@ -25,7 +25,8 @@ class MjcfPhysics:
     The model is the MJCF's own, except that
 
     - obstacles do not collide: costs and constraints keep clear of them;
-    - controls are not clipped to their range, which would hide from a solver the direction back into the range;
+    - controls are not clipped to their range, which would hide from a solver the direction back into the range, nor are
+      forces whose limits are constraints;
     - the constraint solver ends nearer to its solution;
     - an unstable simulation is not reset.
 
@@ -35,6 +36,7 @@ class MjcfPhysics:
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
         impedance.
+      unlimited: ids of the actuators and of the joints whose forces are not limited here.
 
     Attributes:
       model: MuJoCo's model. numbers: the numbers for the kernel, without a wrench and loads. team: the words that its
@@ -50,9 +52,12 @@ class MjcfPhysics:
         obstacles: tuple[int, ...],
         loaded: bool = False,
         softness: float = 0.0,
+        unlimited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ()),
     ) -> None:
         self.model = copy.copy(model)
         _prepare(self.model, obstacles)
+        self.model.actuator_forcelimited[list(unlimited[0])] = 0
+        self.model.jnt_actfrclimited[list(unlimited[1])] = 0
         if softness > 0:
             _soften(self.model, softness)
         self.carriers = carriers_of(model)
