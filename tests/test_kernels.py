@@ -93,7 +93,9 @@ from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.limit_cost import LimitCost
 from lqrsim.results.archive import sha256
+from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.scenes.mjcf_holding import ForceLimit
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
@@ -943,6 +945,9 @@ class TestParts:
         of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))
         of_constraint(ls.StateBounds(x=(0.5, np.inf), y=(-np.inf, 0.2)).bind(CART))
         of_constraint(ls.GoalState([1.0, 0.0, 0.0]).bind(CART), equality=1)
+        rng = np.random.default_rng(0)
+        limits = [ForceLimit(f"of a{i}", "N", -1.0, 2.0, rng.normal(size=6), False, i) for i in range(2)]
+        of_constraint(ForceLimits(limits, rng.normal(size=(4, 2, 6))).bind(CART))
 
     @pytest.mark.parametrize("seed", range(4))
     def test_projection(self, seed: int) -> None:

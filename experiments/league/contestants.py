@@ -125,15 +125,12 @@ class _Took:
 
 def _timed(call: Callable[[], T]) -> tuple[T, _Took]:
     """What a call returns, and the least processor time of up to REPEATS calls, as many as take little together."""
-    took, total = _Took(np.inf, np.inf), 0.0
-    for _ in range(REPEATS):
+    calls: list[tuple[T, _Took]] = []
+    while not calls or (len(calls) < REPEATS and sum(took.processor for _, took in calls) < LITTLE):
         processor, wall = time.process_time(), time.perf_counter()
         returned = call()
-        one = _Took(time.process_time() - processor, time.perf_counter() - wall)
-        took, total = min(took, one, key=lambda each: each.processor), total + one.processor
-        if total > LITTLE:
-            break
-    return returned, took
+        calls.append((returned, _Took(time.process_time() - processor, time.perf_counter() - wall)))
+    return calls[-1][0], min((took for _, took in calls), key=lambda took: took.processor)
 
 
 def _moments(log: Sequence[ls.types.Iteration], took: _Took, before: int = 0) -> list[Moment]:

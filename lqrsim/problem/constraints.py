@@ -28,6 +28,7 @@ from lqrsim.kernels import residual_constraint
 from lqrsim.problem.costs import ProblemPart
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.residual import Residual
+from lqrsim.results.solution_parts import Trajectory
 
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
 STEPS = ("all", "final")  # the steps at which a constraint can act
@@ -137,6 +138,13 @@ class Constraint(ProblemPart[ConstraintTerm]):
           InputError: it does not fit the system.
         """
         return {}
+
+    def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "Constraint | None":
+        """The constraint as it is to be along a plan, with as many rows, if the plan misses it within its periods.
+
+        `smooth` solves again with what this returns, a few times, until it is None.
+        """
+        return None
 
     def _bind_beside(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         """As `_bind_at`, beside constraints that require final values of states, by their indices."""

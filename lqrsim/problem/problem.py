@@ -32,6 +32,7 @@ from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution_parts import Trajectory
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -231,6 +232,13 @@ class Problem:
         costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
         terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
         return self._with(**costs, _terms=self._terms | terms)
+
+    def _refined(self, plan: Trajectory) -> "Problem | None":
+        """The problem with constraints as they are to be along a plan that misses some within its periods, or None."""
+        refined = [one._refined(self.dynamics, plan) for one in self.constraints]
+        if not any(refined):
+            return None
+        return self.with_constraints([new or old for new, old in zip(refined, self.constraints, strict=True)])
 
     def with_constraints(self, constraints: Sequence[Constraint]) -> "Problem":
         """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`.

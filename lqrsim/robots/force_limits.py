@@ -6,141 +6,116 @@ these limits and with the limits as constraints, where forces are linear in the 
 never clips, and both models are the same along it.
 """
 
-import copy
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import mujoco
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.declarations import M, N, W
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
-from lqrsim.scenes.mjcf_model import MjcfModel, Side, unlogged
+from lqrsim.scenes.mjcf_holding import ForceLimit
 
-_PROBES, _LINEAR = 4, 1e-9  # random states and controls at which a force is compared with its slopes; relative error
-
-
-class ForceLimit(NamedTuple):
-    """A limited force that is linear in state and control.
-
-    Attributes:
-      name, unit: of the force, as "of actuator" or "on joint". low, high: its limits.
-      slopes: (1+n+m,) its value at zero, and its slopes.
-      of_joint: whether the limit is that of a joint, on the sum of all actuators, or of an actuator. id: its id.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    slopes: Array
-    of_joint: bool
-    id: int
-
-    def can_be_kept(self, state: Array, low: Array, high: Array) -> bool:
-        """Whether some control (m,) between `low` and `high` keeps it in a state (n,)."""
-        n = len(state)
-        slopes = self.slopes[1 + n :]
-        ends = np.stack([np.where(slopes != 0, slopes * side, 0.0) for side in (low, high)])
-        force = self.slopes[0] + self.slopes[1 : 1 + n] @ state
-        return bool(force + ends.min(axis=0).sum() <= self.high and force + ends.max(axis=0).sum() >= self.low)
+# Fraction of its range that a plan keeps a force from its limits: MuJoCo's implicit integrators step differently where
+# a force is clipped, by however little.
+SPARED = 1e-3
 
 
 class ForceLimits(Constraint):
-    """The forces of actuators and joints within their limits, at the beginning of each control period.
+    """The forces of actuators and joints within their limits, at two instants of each control period.
+
+    One is its beginning. The other is the physics step at which a plan's force is nearest to a limit, or beyond it: a
+    stiff servo's force can change its sign within a period. The state there is predicted by its derivatives along a
+    plan, and before there is one by those at the start. `smooth` chooses instants and derivatives again along its own
+    plan as long as a force is beyond its limit at a physics step.
 
     `MjcfRobot.force_limits` makes it, for problems with `MjcfRobot.unlimited` as their dynamics. Limits of actuators
     whose forces are not linear, such as those of muscles, stay in the dynamics.
 
     Attributes:
-      limits: the limited forces.
+      limits: the limited forces, L of them.
+      later: (K, L, 1+n+m) each force at the second instant, of each of K steps or of all: its value at zero, and its
+        slopes in state and control; None for the beginning alone.
     """
 
-    def __init__(self, limits: Sequence[ForceLimit]) -> None:
-        self.limits = tuple(limits)
+    def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
+        self.limits, self.later = tuple(limits), later
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
         actuators, joints = (tuple(one.id for one in self.limits if one.of_joint is joint) for joint in (False, True))
         return dynamics.unlimited(actuators, joints)
 
+    def with_ends(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
+        """These limits at the last physics step of each period, too, predicted by the derivatives at a state."""
+        last = dt - dynamics.period
+        if last <= 0:
+            return self
+        return ForceLimits(self.limits, _ahead(self._slopes, *dynamics.linearize(state, control, last))[None])
+
+    @property
+    def _slopes(self) -> Array:
+        """(L, 1+n+m)."""
+        return np.stack([one.slopes for one in self.limits])
+
+    def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
+        assert isinstance(dynamics, MjcfDynamics)
+        count, slopes = round(plan.dt / dynamics.period), self._slopes
+        if count < 2:
+            return None
+        low, high = (np.array([getattr(one, side) for one in self.limits]) for side in ("low", "high"))
+        later = np.empty((plan.steps, *slopes.shape))
+        beyond = False
+        for t in range(plan.steps):
+            state, control = plan.states[t], plan.controls[t]
+            places = [dynamics.step(state, control, k * dynamics.period) for k in range(1, count)]
+            forces = np.array([slopes[:, 0] + slopes[:, 1:] @ np.concatenate([place, control]) for place in places])
+            excess = np.maximum(forces - high, low - forces) / (high - low)
+            worst = excess.argmax(axis=0)
+            beyond |= bool((excess > 0).any())
+            for k in set(worst.tolist()):
+                ahead = _ahead(slopes, *dynamics.linearize(state, control, (k + 1) * dynamics.period))
+                later[t, worst == k] = ahead[worst == k]
+        return ForceLimits(self.limits, later) if beyond else None
+
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        size = len(dynamics.state_coordinates) + len(dynamics.control_coordinates)
-        rows, described, ranges = [], [], []
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         for one in self.limits:
-            if len(one.slopes) != 1 + size:
-                raise InputError(
-                    f"ForceLimits: got forces of {len(one.slopes) - 1} states and controls, want {size}, as the"
-                    " dynamics have"
-                )
-            for side, sign, word in ((one.low, 1.0, "at least"), (one.high, -1.0, "at most")):
-                rows.append(sign * (one.slopes - side * np.eye(1, 1 + size)[0]))
-                described.append(f"the force {one.name} of {word} {side:g} {one.unit}")
-                ranges.append(one.high - one.low)
+            if len(one.slopes) != 1 + n + m:
+                got = f"forces of {len(one.slopes) - 1} states and controls"
+                raise InputError(f"ForceLimits: got {got}, want {n + m}, as the dynamics have")
+        later = self._slopes[None] if self.later is None else self.later
+        table = np.concatenate([np.broadcast_to(self._slopes, later.shape), later], axis=1)
+        limits, described = (*self.limits, *self.limits), []
+        for side, word in (("low", "at least"), ("high", "at most")):
+            described += [f"the force {one.name} of {word} {getattr(one, side):g} {one.unit}" for one in limits]
+        low, high = (table.copy(), -table)
+        ranges = np.array([one.high - one.low for one in limits])
+        low[..., 0] -= [one.low for one in limits] + SPARED * ranges
+        high[..., 0] += [one.high for one in limits] - SPARED * ranges
+        rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
-            source_of(__name__), np.ravel(rows), len(rows), described.__getitem__, uses_control=True, convex=True,
-            ranges=np.array(ranges),
+            source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
+            uses_control=True, convex=True, ranges=np.tile(ranges, 2),
         )  # fmt: skip
 
 
-def limited_forces(mjcf: MjcfModel) -> tuple[tuple[ForceLimit, ...], tuple[str, ...]]:
-    """The limited forces of an MJCF that are linear, and the names of the others.
-
-    A force is linear if its differences about zero predict it at random states.
-    """
-    limited: list[tuple[str, str, Side, int, bool, int]] = []
-    units = {one.name: "N m" if one.kind == "hinge" else "N" for one in mjcf.joints}
-    for i, one in enumerate(mjcf.actuators):
-        unit = units.get(one.joint or "", "N")
-        limited.append((f"of {one.name}", unit, one.forces, one.outputs.start, False, i))
-    for i, one in enumerate(mjcf.joints):
-        limited.append((f"on {one.name}", units[one.name], one.forces, mjcf.model.nout + one.dof, True, i))
-    limited = [one for one in limited if np.isfinite(one[2]).any()]
-    if not limited:
-        return (), ()
-    slopes, linear = _slopes(mjcf)
-    found = (ForceLimit(name, unit, *sides, slopes[:, place].copy(), *of) for name, unit, sides, place, *of in limited)
-    kept = tuple(one for one, (*_, place, _, _) in zip(found, limited, strict=True) if linear[place])
-    return kept, tuple(name for name, *_, place, _, _ in limited if not linear[place])
+def _ahead(slopes: Array, a: Array, b: Array, c: Array) -> Array:
+    """Forces (L, 1+n+m) of the state A x + B u + c, by x and u."""
+    n = len(c)
+    by_state, by_control = slopes[:, 1 : 1 + n], slopes[:, 1 + n :]
+    return np.hstack([slopes[:, :1] + (by_state @ c)[:, None], by_state @ a, by_state @ b + by_control])
 
 
-def _slopes(mjcf: MjcfModel) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Forces of all actuators' outputs and on all joints: their values at zero and slopes, (1+n+m, nout+nv), and
-    whether they are linear.
-    """
-    model = copy.copy(mjcf.model)
-    model.actuator_forcelimited[:] = 0
-    model.jnt_actfrclimited[:] = 0
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    data, nv, n = mujoco.MjData(model), model.nv, 2 * model.nv + model.na
-
-    def forces(z: Array) -> Array:
-        data.qpos[:], data.qvel[:] = mjcf.qpos_of(z[:nv]), z[nv : 2 * nv]
-        data.act[:], data.ctrl[:] = z[2 * nv : n], z[n:]
-        for part in (mujoco.mj_fwdPosition, mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation):
-            part(model, data)
-        return np.concatenate([data.actuator_force, data.qfrc_actuator])
-
-    with unlogged():
-        slopes = np.stack([(forces(one) - forces(-one)) / 2 for one in np.eye(n + model.nu)])
-        zero, linear = forces(np.zeros(n + model.nu)), np.ones(slopes.shape[1], dtype=bool)
-        for z in np.random.default_rng(0).normal(size=(_PROBES, n + model.nu)):
-            size = np.abs(zero) + np.abs(z) @ np.abs(slopes)
-            linear &= np.abs(forces(z) - zero - z @ slopes) <= _LINEAR * size
-    return np.vstack([zero, slopes]), linear
-
-
-# The kernel: a row's value at zero, and its slopes in states and controls, are the numbers of `data`, row by row.
+# The kernel. `data` has the numbers of steps and rows, and for each step and row its value at zero and its slopes.
 
 
 def value(x, u, t, row, data):
     """The distance to a limit."""
-    first = row * (1 + W)
+    first = row_at(t, row, data)
     total = data[first]
     for i in range(N):
         total += data[first + 1 + i] * x[i]
@@ -151,6 +126,11 @@ def value(x, u, t, row, data):
 
 def slope(x, u, t, row, data, gradient):
     """Add its gradient (W,)."""
-    first = row * (1 + W)
+    first = row_at(t, row, data)
     for i in range(W):
         gradient[i] += data[first + 1 + i]
+
+
+def row_at(t, row, data):
+    """The index at which the numbers of a row at a step begin."""
+    return 2 + (min(t, int(data[0]) - 1) * int(data[1]) + row) * (1 + W)

@@ -33,10 +33,10 @@ from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.problem.state_bounds import StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
-from lqrsim.robots.force_limits import ForceLimit, ForceLimits, limited_forces
+from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
-from lqrsim.scenes.mjcf_holding import Holding, efforts, holding, settled
+from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, limited_forces, settled
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
@@ -49,6 +49,7 @@ _ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits
 _PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
 _REST = 1e-6  # m/s^2, largest acceleration at rest
 _PERIOD = 0.02  # s, control period, rounded to a whole number of physics steps
+_WILD = 2.0  # factor by which a deviation grows in a period where MuJoCo's steps are unstable; robots fall slower
 _LISTED = 12  # largest number of names in a printed line
 
 
@@ -362,7 +363,8 @@ class MjcfRobot(Robot):
           clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
             default obstacles only add cost.
           force_limits: whether limits of forces are constraints, as in `force_limits`, and not in the dynamics. Those
-            that no control keeps at the start stay in the dynamics, as all do with False: then forces may saturate.
+            that no control keeps at the start stay in the dynamics, as all do if MuJoCo's steps are unstable without
+            them, or with False: then forces may saturate.
 
         Returns:
           The Problem.
@@ -393,20 +395,21 @@ class MjcfRobot(Robot):
         bounds = self._bounds(start, goal)
         if check_number("limits", limits, at_least=0.0) > 0 and any(bounds):
             cost = cost + LimitCost(*bounds, weight=limits)
+        period = dynamics.period_near(_PERIOD) or dynamics.period if dt is None else dt
         kept: list[Constraint] = []
         if clearance is not None:
             kept.append(Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance)))
         sides = np.array([controls.low, controls.high])
-        if (
-            check_flag("force_limits", force_limits)
-            and (forces := ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])).limits
-        ):
-            kept.append(forces)
-            dynamics = forces.removed_from(dynamics)
+        forces = ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])
+        if check_flag("force_limits", force_limits) and forces.limits:
+            free = forces.removed_from(dynamics)
+            if _is_stable(free, start, first.controls, period):
+                dynamics = free
+                kept.append(forces.with_ends(dynamics, start, first.controls, period))
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(
-            dynamics=dynamics, dt=dynamics.period_near(_PERIOD) or float(model.opt.timestep) if dt is None else dt,
+            dynamics=dynamics, dt=period,
             steps=steps, initial=FixedState(start), stage_cost=cost,
             final_cost=QuadraticCost(_weights("weights", weights, n), about=goal),
             control_limits=(controls.low, controls.high),
@@ -616,6 +619,15 @@ class MjcfRobot(Robot):
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
         state, nv = vectors_of("state", state, len(self.dynamics.state_coordinates)), self.mjcf.model.nv
         return self.mjcf.qpos_of(state[..., :nv]), state[..., nv : 2 * nv].copy()
+
+
+def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> bool:
+    """Whether no deviation from a state grows by more than `_WILD` in a period: explicit steps of stiff servos may."""
+    try:
+        motion = dynamics.linearize(state, control, dt)[0]
+    except InputError:  # beyond all numbers
+        return False
+    return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _WILD
 
 
 def _weights(field: str, given: PerEntry, size: int) -> PerEntry:

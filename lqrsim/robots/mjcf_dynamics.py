@@ -191,10 +191,14 @@ class MjcfDynamics(Dynamics):
         substeps = round(dt / float(model.opt.timestep))
         return ContactModes(model, self._stated["actuators"], substeps) if known else None
 
+    @property
+    def period(self) -> float:
+        """The physics step in seconds."""
+        return float(self.mjcf.model.opt.timestep)
+
     def period_near(self, dt: float) -> float:
         """The whole number of physics steps nearest to `dt`, in seconds."""
-        timestep = float(self.physics.model.opt.timestep)
-        return round(check_number("dt", dt) / timestep) * timestep
+        return round(check_number("dt", dt) / self.period) * self.period
 
     def check_period(self, dt: float) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""

@@ -73,6 +73,7 @@ ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 
 PUSHES = 2  # plans of pushes from which a descent begins
+REFINEMENTS = 4  # of constraints along a plan; an arm's force limits need one or two
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
 
@@ -87,10 +88,12 @@ def solve(
     threads: int = 1,
     callback: Callback | None = None,
     stop: Stop | None = None,
+    refinements: int = REFINEMENTS,
 ) -> Solution:
     """Solve one problem. For `attentive` see `Budget`; `threads` is for the search among starts.
 
-    `stop` is that of a solve of which this one is a part; its time limit is then for both.
+    `stop` is that of a solve of which this one is a part; its time limit is then for both. `refinements` is how often
+    constraints that the plan misses within its periods may be refined.
     """
     if problem.duration is not None:
 
@@ -118,6 +121,14 @@ def solve(
     solution = search.solution()
     for run in runs:
         run.give_back()
+    refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
+    if refined is not None:
+        again = replace(settings, start=solution, starts=None)
+        before, solution = solution.iterations, solve(
+            refined, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
+            refinements=refinements - 1,
+        )  # fmt: skip
+        solution = replace(solution, iterations=(*before, *solution.iterations))
     return stop.finish(solution)
 
 

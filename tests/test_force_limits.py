@@ -1,0 +1,191 @@
+"""Limits of forces as constraints of a plan: what is linear, by MuJoCo; and plans that the file itself repeats."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sampling import examples
+from scipy.optimize import LinearConstraint, minimize
+
+import lqrsim as ls
+from lqrsim.errors import Array
+
+# Two links that a floor does not stop, with what is filled in as actuators.
+ARM = """
+<mujoco>
+  <option timestep="{timestep}" integrator="{integrator}"/>
+  <worldbody>
+    <body>
+      <joint name="a" axis="0 1 0" damping="0.2" armature="0.05" {joint}/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1" contype="0" conaffinity="0"/>
+      <body pos="0.3 0 0">
+        <joint name="b" axis="0 1 0" damping="0.2" armature="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="-0.5"/></fixed></tendon>
+  <actuator>{actuators}</actuator>
+</mujoco>
+"""
+SERVOS = """
+<position name="pa" joint="a" kp="{kp}" kv="{kv}" ctrlrange="-3 3" forcerange="-{most} {most}"/>
+<position name="pb" joint="b" kp="{kp}" kv="{kv}" ctrlrange="-3 3" forcerange="-{other} {other}"/>
+"""
+
+
+def robot(
+    folder: Path, actuators: str, *, timestep: float = 0.002, integrator: str = "implicitfast", joint: str = ""
+) -> ls.MjcfRobot:
+    path = folder / "arm.xml"
+    path.write_text(ARM.format(actuators=actuators, timestep=timestep, integrator=integrator, joint=joint))
+    return ls.MjcfRobot(path)
+
+
+def replayed(arm: ls.MjcfRobot, plan: ls.Trajectory) -> tuple[Array, Array]:
+    """The plan's controls by `mj_step` of the file as it is: the states at the knots, and all forces without limits."""
+    model = arm.scene.model
+    free = mujoco.MjModel.from_xml_string(arm.mjcf.xml)
+    free.actuator_forcelimited[:] = free.jnt_actfrclimited[:] = 0
+    data, shadow = mujoco.MjData(model), mujoco.MjData(free)
+    data.qpos[:], data.qvel[:] = arm.configuration(plan.states[0])
+    states, forces = [plan.states[0]], []
+    for control in plan.controls:
+        data.ctrl[:] = control
+        for _ in range(round(plan.dt / model.opt.timestep)):
+            shadow.qpos[:], shadow.qvel[:], shadow.ctrl[:] = data.qpos, data.qvel, data.ctrl
+            mujoco.mj_forward(free, shadow)
+            forces.append(np.concatenate([shadow.actuator_force, shadow.qfrc_actuator]))
+            mujoco.mj_step(model, data)
+        states.append(arm.state(data.qpos, data.qvel, near=plan.states[len(states)]))
+    return np.array(states), np.array(forces)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "joint", "linear", "others"),
+    [
+        (SERVOS.format(kp=900, kv=40, most=20, other=9), "", ["of pa", "of pb"], []),
+        ('<motor name="m" joint="a" gear="3" ctrlrange="-1 1"/>', 'actuatorfrcrange="-2 2"', ["on a"], []),
+        ('<motor name="t" tendon="both" gear="2" forcerange="-5 4"/>', "", ["of t"], []),
+        ('<intvelocity name="i" joint="b" kp="50" kv="2" actrange="-2 2" forcerange="-5 5"/>', "", ["of i"], []),
+        ('<damper name="d" joint="a" kv="3" ctrlrange="0 1" forcerange="-5 5"/>', "", [], ["of d"]),
+        ('<muscle name="u" tendon="both" lengthrange="-1 1" forcerange="-5 5"/><motor joint="b"/>', "", [], ["of u"]),
+        ('<motor name="m" joint="a"/>', "", [], []),
+    ],
+)  # fmt: skip
+def test_a_force_is_a_constraint_if_it_is_linear(
+    tmp_path: Path, actuators: str, joint: str, linear: list[str], others: list[str]
+) -> None:
+    """And the constraint's values are those of MuJoCo at random states, to rounding."""
+    arm = robot(tmp_path, actuators, joint=joint)
+    kept, rest = arm._forces
+    assert [one.name for one in kept] == linear
+    assert list(rest) == others
+    told = str(arm)
+    assert ("force limits, constraints of plans" in told) == bool(linear)
+    assert ("force limits, clipped in plans as in runs" in told) == bool(others)
+    if not linear:
+        with pytest.raises(ls.InputError, match="force_limits: got none"):
+            _ = arm.force_limits
+        return
+    free = arm.unlimited.physics.model
+    assert not free.actuator_forcelimited.any()
+    assert not free.jnt_actfrclimited.any()
+    data, rng = mujoco.MjData(free), np.random.default_rng(0)
+    for _ in range(20):
+        state, control = rng.normal(size=len(arm.dynamics.state_coordinates)), rng.normal(size=free.nu)
+        data.qpos[:], data.qvel[:] = arm.configuration(state)
+        data.act[:], data.ctrl[:] = state[2 * free.nv :], control
+        mujoco.mj_forward(free, data)
+        for one in kept:
+            force = data.qfrc_actuator[0] if one.of_joint else data.actuator_force[one.id]
+            assert one.slopes @ [1.0, *state, *control] == pytest.approx(force, rel=1e-9, abs=1e-9)
+
+
+@settings(max_examples=examples(4), deadline=None)
+@given(
+    servo=st.sampled_from([(80.0, "Euler"), (80.0, "RK4"), (900.0, "implicitfast"), (4000.0, "implicitfast")]),
+    most=st.floats(8.0, 20.0), other=st.floats(2.5, 6.0), goal=st.tuples(st.floats(-0.8, 0.8), st.floats(-0.8, 0.8)),
+)  # fmt: skip
+def test_the_file_repeats_a_plan_of_servos_that_press(
+    tmp_path_factory: pytest.TempPathFactory, servo: tuple[float, str], most: float, other: float,
+    goal: tuple[float, float],
+) -> None:  # fmt: skip
+    """MuJoCo clips nothing along it, at any physics step, so that the file's own steps are the plan's to rounding."""
+    (kp, integrator), folder = servo, tmp_path_factory.mktemp("arm")
+    arm = robot(folder, SERVOS.format(kp=kp, kv=kp / 20, most=most, other=other), integrator=integrator)
+    start = arm.at(a=np.pi / 2)  # it hangs
+    problem = arm.problem(start, arm.at(a=np.pi / 2 + goal[0], b=goal[1]), steps=25, dt=0.02)
+    assert len(problem.constraints) == 1
+    solution = ls.smooth(problem)
+    assert solution.status is ls.Status.CONVERGED, solution.detail
+    states, forces = replayed(arm, solution.trajectory)
+    assert (np.abs(forces[:, :2]).max(axis=0) <= [most, other]).all()
+    np.testing.assert_allclose(states, solution.trajectory.states, rtol=0, atol=1e-8)
+
+
+def test_limits_stay_where_the_physics_without_them_is_unstable(tmp_path: Path) -> None:
+    """A damping of 200 N m s/rad on 0.03 kg m2 is too much for an explicit step of 2 ms; clipped, it is bounded."""
+    arm = robot(tmp_path, SERVOS.format(kp=4000, kv=200, most=20, other=9), integrator="RK4")
+    assert not arm.problem(arm.at(a=1.5), arm.at(a=1.2), steps=20).constraints
+
+
+def test_a_limit_that_no_control_keeps_at_the_start_stays_in_the_dynamics(tmp_path: Path) -> None:
+    """The target is out of reach by 0.5 rad there, which is 450 N m of 20."""
+    arm = robot(tmp_path, SERVOS.format(kp=900, kv=40, most=20, other=9).replace("-3 3", "-1 1"))
+    problem = arm.problem(arm.at(a=1.5), arm.at(a=0.9), steps=20)
+    (kept,) = problem.constraints
+    assert [one.name for one in kept.limits] == ["of pb"]
+    assert problem.dynamics.physics.model.actuator_forcelimited.tolist() == [True, False]
+    assert not arm.problem(arm.at(a=1.5), arm.at(a=0.9), steps=20, force_limits=False).constraints
+
+
+@pytest.mark.parametrize(
+    "bounds", [((-0.3, 0.6), (-1.2, 1.2)), ((-0.05, 0.35), (-0.9, 0.7)), ((-0.1, 0.5), (-0.6, 2.0))]
+)
+def test_constraints_with_a_linear_file_are_those_of_a_quadratic_program(
+    tmp_path: Path, bounds: tuple[tuple[float, float], ...]
+) -> None:
+    """A mass on a slide, moved by a motor: against SciPy's trust region on the controls alone, to 1e-5 of the cost."""
+    path = tmp_path / "slide.xml"
+    path.write_text(
+        """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body><joint name="q" type="slide" axis="1 0 0"/>
+        <geom size="0.1" mass="2" contype="0" conaffinity="0"/></body></worldbody>
+        <actuator><motor name="m" joint="q" ctrlrange="-6 6"/></actuator></mujoco>"""
+    )
+    cart, steps, h = ls.MjcfRobot(path), 30, 0.04
+    goal = 0.3
+    problem = ls.Problem(
+        dynamics=cart.dynamics, dt=h, steps=steps, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.05]),
+        final_cost=ls.QuadraticCost([80.0, 20.0], about=[goal, 0.0]), control_limits=(-6.0, 6.0),
+        constraints=[ls.StateBounds(q=bounds[0], q_velocity=bounds[1]), ls.GoalState(q_velocity=0.0)],
+    )  # fmt: skip
+    solution = ls.smooth(problem)
+    assert solution.status is ls.Status.CONVERGED, solution.detail
+    # Two steps of semi-implicit Euler a period.
+    step, push = np.array([[1.0, 0.02], [0.0, 1.0]]), np.array([0.02**2, 0.02]) / 2.0
+    a, b = step @ step, step @ push + push
+    by_control = np.zeros((steps + 1, 2, steps))
+    for t in range(steps):
+        by_control[t + 1] = a @ by_control[t]
+        by_control[t + 1, :, t] += b
+
+    def cost(u: Array) -> float:
+        end = by_control[-1] @ u - [goal, 0.0]
+        return 0.025 * float(u @ u) + 0.5 * float(end @ ([80.0, 20.0] * end))
+
+    def slope(u: Array) -> Array:
+        return 0.05 * u + by_control[-1].T @ ([80.0, 20.0] * (by_control[-1] @ u - [goal, 0.0]))
+
+    kept = [LinearConstraint(by_control[1:, 0], *bounds[0]), LinearConstraint(by_control[1:-1, 1], *bounds[1])]
+    kept.append(LinearConstraint(by_control[-1, 1], 0.0, 0.0))
+    best = minimize(
+        cost, np.zeros(steps), jac=slope, method="SLSQP", bounds=[(-6.0, 6.0)] * steps,
+        constraints=kept, options={"maxiter": 500, "ftol": 1e-14},
+    )  # fmt: skip
+    assert best.success
+    assert solution.cost == pytest.approx(best.fun, rel=2e-5)
+    np.testing.assert_allclose(solution.trajectory.states[:, 1].clip(*bounds[1]), solution.trajectory.states[:, 1])
