@@ -271,7 +271,7 @@ def _beside_fatrop(problems: dict[str, Any]) -> list[str]:
     for name, family in problems.items():
         ours = family["solvers"].get("lqrsim")
         theirs = [family["solvers"][one] for one in FATROPS if one in family["solvers"]]
-        if ours is None or not theirs:
+        if ours is None or len(theirs) < len(FATROPS):
             continue
         pairs = []
         for i, cost in enumerate(ours["cost"]):
