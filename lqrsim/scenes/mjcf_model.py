@@ -19,19 +19,8 @@ import numpy.typing as npt
 from lqrsim import rotations
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.scenes import mjcf_text
-from lqrsim.scenes.mjcf_text import DEEPEST, UNNAMED
+from lqrsim.scenes.mjcf_text import DEEPEST, UNNAMED, mujoco
 from lqrsim.scenes.world import World
-
-try:
-    import mujoco
-except Exception as error:
-    # MuJoCo chooses its OpenGL while it is imported; if the chosen one is missing, it can raise anything.
-    if "MUJOCO_GL" not in os.environ:
-        raise
-    raise InputError(
-        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
-        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
-    ) from None
 
 _KINDS = {
     mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",

@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, excerpt, keep
-from lqrsim.scenes.mjcf_model import MjcfModel, mujoco  # which says what is wrong if MuJoCo cannot be imported
+from lqrsim.scenes.mjcf_model import MjcfModel
+from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 
 _FLAGS = mujoco.mjtDisableBit
