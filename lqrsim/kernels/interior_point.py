@@ -67,6 +67,7 @@ LOWER, POWER = (
 )  # factor by which the parameter then falls at least, and power of the parameter, if that is less
 HIGHER = 10.0  # the largest barrier parameter of Mehrotra's rule, relative to the first
 LEAST = 0.1  # least barrier parameter, relative to the tolerance
+HALF = 0.5  # the same where there is no crossover: of all rows together
 NOTHING, FAR = 1e-4, 1e-2  # least scale of the first plan, relative to the typical cost of a change; if infinite
 SHORTEST = 1e-7  # fraction of a step below which the line search gives up
 MARGIN = 1e-5  # improvement that the filter requires
@@ -219,7 +220,8 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
     """Run the iterations `first` to `last` - 1, until the measures are within tolerance or no step helps.
 
     Then a crossover to the active set makes controls end exactly at their limits. If it fails, the barrier falls
-    further, which shows which rows are active even if most of the cost is constant.
+    further, which shows which rows are active even if most of the cost is constant. Without second derivatives of the
+    dynamics there is no crossover: its steps have no line search, and the plan ends inside the constraints.
 
     With `closing`, no iteration follows.
     """
@@ -227,16 +229,13 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
     if isnan(mem.target):  # the first call
         mem.target = tolerance
     while True:
-        if within(tolerance, violation, mem):
-            mem.solved = 1.0
-        if stages.learns == 1:
-            if mem.solved != 0 and (ended or central(tolerance, mem)):
-                return done, CONVERGED
-            if ended:
-                return done, STALLED
+        inside = within(tolerance, violation, mem)
+        mem.solved = 1.0 if inside or (mem.solved != 0 and stages.learns == 0) else 0.0
+        if stages.learns == 1 and inside and (ended or central(tolerance, mem)):
+            return done, CONVERGED
         close = max(mem.complementarity, mem.stationarity) < mem.target
         if stages.learns == 0 and mem.solved != 0 and (ended or close or mem.since >= CROSSINGS):
-            if not within(tolerance, violation, mem):
+            if not inside:
                 go_back(stages, work, mem)
                 return done, STALLED
             if cross(tolerance, violation, stages, work, mem):
@@ -276,8 +275,9 @@ def within(tolerance, violation, mem):
 
 
 def central(tolerance, mem):
-    """Whether the barrier costs no more than the tolerance: where there is no crossover, the plan ends inside."""
-    return mem.pairs * mem.parameter <= tolerance * mem.scale and mem.pairs * mem.complementarity <= 10 * tolerance
+    """Whether the barrier costs no more than the tolerance, relative to the cost."""
+    close = mem.pairs * mem.complementarity <= OUTLIER * tolerance
+    return close and mem.pairs * mem.parameter <= tolerance * mem.scale
 
 
 @compact
@@ -285,7 +285,7 @@ def iterate(done, tolerance, stages, work, mem):
     """Do one iteration; return whether a step was found."""
     least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
     if stages.learns == 1:
-        least = 0.5 * tolerance * mem.scale / max(mem.pairs, 1.0)
+        least = HALF * tolerance * mem.scale / max(mem.pairs, 1.0)
     lower_barrier(done, least, free, stages, work, mem)
     part = -1.0
     while True:
