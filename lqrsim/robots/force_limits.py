@@ -39,10 +39,13 @@ class ForceLimits(Constraint):
       limits: the limited forces, L of them.
       later: (K, L, 1+n+m) each force at the second instant, of each of K steps or of all: its value at zero, and its
         slopes in state and control; None for the beginning alone.
+      spared: (K, L) further distances from the limits there: what earlier plans went beyond them, at whatever step.
     """
 
-    def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
-        self.limits, self.later = tuple(limits), later
+    def __init__(
+        self, limits: Sequence[ForceLimit], later: Array | None = None, spared: Array | float = 0.0
+    ) -> None:  # fmt: skip
+        self.limits, self.later, self.spared = tuple(limits), later, spared
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
@@ -67,19 +70,18 @@ class ForceLimits(Constraint):
         if count < 2:
             return None
         low, high = (np.array([getattr(one, side) for one in self.limits]) for side in ("low", "high"))
-        later = np.empty((plan.steps, *slopes.shape))
-        beyond = False
+        later, spared = np.empty((plan.steps, *slopes.shape)), np.zeros((plan.steps, len(slopes)))
         for t in range(plan.steps):
             state, control = plan.states[t], plan.controls[t]
             places = [dynamics.step(state, control, k * dynamics.period) for k in range(1, count)]
             forces = np.array([slopes[:, 0] + slopes[:, 1:] @ np.concatenate([place, control]) for place in places])
-            excess = np.maximum(forces - high, low - forces) / (high - low)
+            excess = np.maximum(forces - high, low - forces)
             worst = excess.argmax(axis=0)
-            beyond |= bool((excess > 0).any())
+            spared[t] = np.maximum(excess.max(axis=0), 0.0)
             for k in set(worst.tolist()):
                 ahead = _ahead(slopes, *dynamics.linearize(state, control, (k + 1) * dynamics.period))
                 later[t, worst == k] = ahead[worst == k]
-        return ForceLimits(self.limits, later) if beyond else None
+        return ForceLimits(self.limits, later, self.spared + spared) if spared.any() else None
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
@@ -94,8 +96,10 @@ class ForceLimits(Constraint):
             described += [f"the force {one.name} of {word} {getattr(one, side):g} {one.unit}" for one in limits]
         low, high = (table.copy(), -table)
         ranges = np.array([one.high - one.low for one in limits])
-        low[..., 0] -= [one.low for one in limits] + SPARED * ranges
-        high[..., 0] += [one.high for one in limits] - SPARED * ranges
+        spared = np.broadcast_to(SPARED * ranges, low.shape[:2]).copy()
+        spared[:, len(self.limits) :] += self.spared
+        low[..., 0] -= [one.low for one in limits] + spared
+        high[..., 0] += [one.high for one in limits] - spared
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
