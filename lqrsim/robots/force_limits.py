@@ -22,6 +22,7 @@ from lqrsim.scenes.mjcf_holding import ForceLimit
 # Fraction of its range that a plan keeps a force from its limits: MuJoCo's implicit integrators step differently where
 # a force is clipped, by however little.
 SPARED = 1e-3
+MORE = 0.02  # largest further fraction that is spared for a force that was beyond its limit at another physics step
 
 
 class ForceLimits(Constraint):
@@ -39,7 +40,8 @@ class ForceLimits(Constraint):
       limits: the limited forces, L of them.
       later: (K, L, 1+n+m) each force at the second instant, of each of K steps or of all: its value at zero, and its
         slopes in state and control; None for the beginning alone.
-      spared: (K, L) further distances from the limits there: what earlier plans went beyond them, at whatever step.
+      spared: (K, L) further distances from the limits there: what earlier plans went beyond them, at whatever step, but
+        at most `MORE` of the range for each.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class ForceLimits(Constraint):
         if count < 2:
             return None
         low, high = (np.array([getattr(one, side) for one in self.limits]) for side in ("low", "high"))
+        beyond = False
         later, spared = np.empty((plan.steps, *slopes.shape)), np.zeros((plan.steps, len(slopes)))
         for t in range(plan.steps):
             state, control = plan.states[t], plan.controls[t]
@@ -77,11 +80,13 @@ class ForceLimits(Constraint):
             forces = np.array([slopes[:, 0] + slopes[:, 1:] @ np.concatenate([place, control]) for place in places])
             excess = np.maximum(forces - high, low - forces)
             worst = excess.argmax(axis=0)
-            spared[t] = np.maximum(excess.max(axis=0), 0.0)
+            beyond |= bool((excess > 0).any())
+            spared[t] = np.clip(excess.max(axis=0), 0.0, MORE * (high - low))
             for k in set(worst.tolist()):
                 ahead = _ahead(slopes, *dynamics.linearize(state, control, (k + 1) * dynamics.period))
                 later[t, worst == k] = ahead[worst == k]
-        return ForceLimits(self.limits, later, self.spared + spared) if spared.any() else None
+        first = self.later is None or len(self.later) == 1  # whose derivatives are not those along a plan
+        return ForceLimits(self.limits, later, 0.0 if first else self.spared + spared) if beyond else None
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
