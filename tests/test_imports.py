@@ -66,7 +66,7 @@ FLOORS_WITHIN = {
     ),
     "solvers": (
         ("budget", "compiled", "initial_guess"),
-        ("certify", "settings", "stages"),
+        ("certify", "settings", "stages", "step_stability"),
         ("curvature",),
         ("engine", "interior_point", "parallel"),
         ("active_set", "assembly", "augmented_lagrangian", "contact_modes", "infeasibility", "multistart"),

@@ -1002,6 +1002,9 @@ class TestParts:
         sizes, numbers = {"N": n, "M": m, "W": n + m}, numbers_of(dynamics)
         replay(dynamics.step_source, sizes, "advance", x, u, numbers, dt, np.zeros(n))
         replay(dynamics.step_source, sizes, "step_jacobian", x, u, numbers, dt, np.zeros(n), np.zeros((n, n + m)))
+        if not dynamics.discrete:
+            along = x[None].copy(), u[None].copy(), numbers, np.zeros((1, n, n))
+            replay(dynamics.step_source, sizes, "state_jacobians", 1, *along)
         if dynamics.curvature_source is not None:
             arrays = np.linspace(-1.0, 2.0, n), np.zeros(n), np.zeros((n, n + m)), np.zeros((n + m, n + m))
             replay(dynamics.curvature_source, sizes, "step_curvature", x, u, numbers, dt, *arrays)

@@ -3,7 +3,7 @@
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
 
-from lqrsim.kernels.declarations import M, N, W, rate, rate_jacobian, stack, zeros
+from lqrsim.kernels.declarations import M, N, W, compact, rate, rate_jacobian, stack, zeros
 
 
 def advance(x, u, p, h, out):
@@ -81,3 +81,11 @@ def step_jacobian(x, u, p, h, out, jacobian):
         for j in range(W):
             jacobian[i, j] = h / 6 * (jacobian[i, j] + second[i, j])
         jacobian[i, i] += 1
+
+
+@compact
+def state_jacobians(count, states, controls, p, slopes):
+    """Write df/dx to slopes (count, N, N), which are zero on entry, at states (count, N) and controls (count, M)."""
+    for t in range(count):
+        k, fu = stack(N), zeros(N, M)
+        rate_jacobian(states[t], controls[t], p, k, slopes[t], fu)

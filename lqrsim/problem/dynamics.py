@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.edge_pushing import weighted_hessian
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of, text_source
@@ -20,6 +21,7 @@ from lqrsim.codegen.user_functions import (
     check_signature,
     level_of,
     name_of,
+    numbers_of,
     plain_calls,
     with_derivatives,
 )
@@ -398,6 +400,26 @@ class Dynamics:
           InputError: it cannot.
         """
         check_number("dt", dt)
+
+    def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
+        """The Runge-Kutta steps of control periods of `dt` seconds.
+
+        Args:
+          states: (k, n), at which each period begins.
+          controls: (k, m).
+          dt: seconds.
+
+        Returns:
+          The duration of a step in seconds, and df/dx (k, n, n); None if the steps are another method's.
+        """
+        slopes = np.zeros((len(states), states.shape[1], states.shape[1]))
+        of = in_c_order(states), in_c_order(controls), numbers_of(self)
+        self.compiled.state_jacobians(len(states), *of, slopes)
+        return dt, slopes
+
+    def _with_finer_steps(self, dt: float, most: float) -> str:
+        """How Runge-Kutta's steps in a control period of `dt` seconds become as short as `most` seconds, as text."""
+        return f"use dt of at most {most:g} s, with {math.ceil(dt / most)} times as many steps"
 
     def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
         """A context in which a solver works.

@@ -38,7 +38,8 @@ class Solution(Plan):
       problem_digest: hash of everything that defines the problem.
       problem_parts: what the problem asks for, by part, as `print(problem)` says it; empty in older files.
       versions: versions of lqrsim and of the libraries that the bits depend on, and the processor.
-      remedy: a remedy to try in this case; empty for a success, unless its goal is one that no control comes nearer to.
+      remedy: a remedy to try in this case; empty for a success, unless its goal is one that no control comes nearer to,
+        or its Runge-Kutta steps are unstable.
       scenario: the scenario that the command line solved; empty if a program called the solver.
       candidates: the starts that were tried, if there were several.
     """

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import math
 import threading
 from collections.abc import Iterator
 from functools import cached_property, partial
@@ -22,7 +23,15 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel, unlogged
-from lqrsim.scenes.mjcf_physics import MjcfPhysics, carriers_of, check_planned, touches, untouched_body
+from lqrsim.scenes.mjcf_physics import (
+    RK4,
+    MjcfPhysics,
+    carriers_of,
+    check_planned,
+    state_jacobians,
+    touches,
+    untouched_body,
+)
 
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
@@ -190,6 +199,16 @@ class MjcfDynamics(Dynamics):
         model, known = self.physics.model, not self.parameters and ContactModes.known_for(self.physics.model)
         substeps = round(dt / float(model.opt.timestep))
         return ContactModes(model, self._stated["actuators"], substeps) if known else None
+
+    def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
+        model, nv = self.physics.model, self.mjcf.model.nv
+        if model.opt.integrator != RK4:
+            return None
+        places, actuators = self.mjcf.qpos_of(states[:, :nv]), self._stated["actuators"]
+        return self.period, state_jacobians(model, places, states[:, nv:], controls, actuators)
+
+    def _with_finer_steps(self, dt: float, most: float) -> str:
+        return f'set <option timestep="{dt / math.ceil(dt / most):.9g}"/>, or integrator="implicitfast", in the MJCF'
 
     @property
     def period(self) -> float:

@@ -3,7 +3,7 @@
 import copy
 import ctypes
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -15,7 +15,9 @@ from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.scenes.mjcf_model import unlogged
 
+RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
+_DIFFERENCE = 1e-6  # step of `mjd_transitionFD`, that of MuJoCo's own tests
 _CLOSE, _LOOKS = 1e-10, 100  # tolerance in m, and largest number of iterations, of distances
 
 
@@ -121,7 +123,7 @@ class MjcfPhysics:
         numbers[kernel.COUNT], numbers[kernel.MODEL] = len(self._flags), model._address
         numbers[kernel.STEP], numbers[kernel.STEP_SKIP] = functions["mj_step"], functions["mj_stepSkip"]
         # RK4 ends with the stages of its last evaluation.
-        numbers[kernel.KEEPS] = model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        numbers[kernel.KEEPS] = model.opt.integrator != RK4
         numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
@@ -196,6 +198,32 @@ def untouched_body(model: mujoco.MjModel, states: Array, state: int) -> str:
             if int(roots[body]) in (first, second) and first and second:
                 return ""
     return model.body(body).name
+
+
+def state_jacobians(
+    model: mujoco.MjModel, qpos: Array, rest: Array, controls: Array, actuators: Sequence[int]
+) -> Array:
+    """Derivatives (k, n, n) of the rates of positions, velocities and activations by these.
+
+    They are those of an explicit Euler step, which MuJoCo can differentiate, divided by the step. Positions change
+    with the velocities alone: that the axes of a ball turn with it is left out.
+
+    Args:
+      qpos: (k, nq). rest: (k, n - nv), velocities and activations. controls: (k, m), of these actuators.
+    """
+    explicit = copy.copy(model)
+    explicit.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
+    explicit.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    data, nv, n = mujoco.MjData(explicit), model.nv, 2 * model.nv + model.na
+    found, step = np.zeros((len(qpos), n, n)), np.zeros((n, n))
+    found[:, :nv, nv : 2 * nv] = np.eye(nv)
+    for slopes, place, other, control in zip(found, qpos, rest, controls, strict=True):
+        data.qpos[:], data.qvel[:], data.act[:], data.qacc_warmstart[:] = place, other[:nv], other[nv:], 0.0
+        data.ctrl[list(actuators)] = control
+        with unlogged():
+            mujoco.mjd_transitionFD(explicit, data, _DIFFERENCE, True, step, None, None, None)
+        slopes[nv:] = (step - np.eye(n))[nv:] / model.opt.timestep
+    return found
 
 
 def _placed(model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:

@@ -18,6 +18,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult
 from lqrsim.solvers.settings import can_be_exact
+from lqrsim.solvers.step_stability import unstable_step
 from lqrsim.versions import versions
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
@@ -50,6 +51,8 @@ def assemble(
             control_coordinates=problem.applied_coordinates,
         )  # fmt: skip
 
+    unstable = unstable_step(problem, states, controls, sound=found.success)
+    said = found.detail, _usable(found, options), _fragile(problem, found), unstable.detail if unstable else ""
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -60,8 +63,8 @@ def assemble(
     return Solution._assembled(
         later,
         status=found.status,
-        detail="; ".join(part for part in (found.detail, _usable(found, options), _fragile(problem, found)) if part),
-        remedy=remedy_of(problem, found, log, options),
+        detail="; ".join(part for part in said if part),
+        remedy=unstable.remedy if unstable else remedy_of(problem, found, log, options),
         policy=policy(*law, nominal[:-1]),
         cost_to_go=copy_of(found.values.get("cost_to_go")),
         cost_to_come=copy_of(found.values.get("cost_to_come")),
