@@ -26,6 +26,7 @@ class Robot(abc.ABC):
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on its own body; none by default.
       drag: linear drag against its velocity through the air, in N s/m; wind acts through it. None by default.
+        A fluid of the MJCF needs none.
       activations: number of states of MuJoCo's actuators, `act`; they are the robot's last states. None by default.
       radius: radius in metres of its collision circle if the world is seen from above, else of its collision ball. For
         a robot with neither a position nor balls its size in pictures.

@@ -63,13 +63,13 @@ class Effects:
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._kicks = self._hooks("kick")
-        # Without a wind of a simulator it is a force.
-        blown = plant.simulator is not None and plant.simulator.wind
-        wind = (slice(6, 9), 1.0) if blown else (slice(0, 3), plant.robot.drag)
+        winds = [(slice(6, 9), 1.0)] if plant.has_medium else []
+        if plant.simulator is None or not plant.has_medium:  # an MJCF may have a drag beside its fluid
+            winds.append((slice(0, 3), plant.robot.drag))
         self._pushes = [_ForceHook(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
         for one in self._effects:
             self._pushes += [_ForceHook(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [one])]
-            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [one])]
+            self._pushes += [_ForceHook(*hook, *wind) for hook in self._hooks("wind", [one]) for wind in winds]
 
     def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
         """The hooks of one kind, of all effects or these, each with its label for messages."""

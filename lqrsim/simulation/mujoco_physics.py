@@ -50,6 +50,8 @@ class MujocoPhysics(Physics):
         self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
         self._ctrl, self._wrench = self.simulations.bind("ctrl"), self.simulations.bind("xfrc_applied")
         self._act = self.simulations.bind("act") if plant.robot.activations else np.zeros((trials, 0))
+        # Velocity of the medium, to which winds are added.
+        self._medium = self.simulations.expand("opt.wind") if plant.has_medium else None
         self._in_qpos, self._in_qvel, self._in_ctrl = (_span(one) for one in (plant.qpos, plant.qvel, plant.ctrl))
         self.solid = np.zeros(trials, dtype=bool)
         self._before = self.simulations.state
@@ -116,6 +118,8 @@ class MujocoPhysics(Physics):
     def advance(self, controls: Array, wrench: Array, wind: Array) -> Period:
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
+        if self._medium is not None:
+            self._medium[:] = self.plant.model.opt.wind + wind
         if self.solidifies:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
             self._had_warned = self.warnings.copy()

@@ -119,6 +119,15 @@ class Plant:
         return float(self.model.opt.timestep)
 
     @property
+    def has_medium(self) -> bool:
+        """Whether wind is the velocity of a medium, and not a force: a simulator's, or the fluid of the MJCF."""
+        if self.simulator is not None:
+            return self.simulator.wind
+        flags, option = mujoco.mjtDisableBit, self.model.opt
+        passive = int(flags.mjDSBL_SPRING) | int(flags.mjDSBL_DAMPER)  # without both, MuJoCo has no passive forces
+        return (option.density > 0 or option.viscosity > 0) and option.disableflags & passive != passive
+
+    @property
     def weight(self) -> float:
         """Weight of the robot in N."""
         if self.simulator is not None:

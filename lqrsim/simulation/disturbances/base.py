@@ -55,8 +55,8 @@ class Effect:
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
-      wind: (step, true states (K, n)) -> wind in m/s, world axes, (K, 3); a force of `robot.drag` times the wind unless
-        the plant's simulator has a wind.
+      wind: (step, true states (K, n)) -> wind in m/s, world axes, (K, 3): the velocity of the medium if the plant
+        `has_medium`, and a force of `robot.drag` times the wind unless a simulator has a wind.
       kick: (step, true states (K, n), saturated controls (K, m)) -> jump of the states at the end of the control
         period, (K, n).
       displaced: (K, obstacles, 3), displacement of each of the plant's obstacles from its place in the scene, in m.

@@ -21,7 +21,7 @@ from lqrsim.simulation.disturbances.noise import (
     InitialStateError,
     MeasurementNoise,
 )
-from lqrsim.simulation.disturbances.wind import Dryden
+from lqrsim.simulation.disturbances.wind import Dryden, Gusts
 from lqrsim.simulation.plant import Plant
 
 # Strengths relative to light; as in MIL-F-8785C, with 15, 30 and 45 knots for light, moderate and severe turbulence.
@@ -32,6 +32,8 @@ MEASURED = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
 # Error of the start by unit: our choice, the order of a careful placement by hand.
 PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 
+LIQUID = 100.0  # kg/m^3; a medium that is denser has currents, not the turbulence of air
+
 
 def preset(name: str, plant: Plant) -> list[Disturbance]:
     """The disturbances of a preset that the plant supports, in the order in which they act. Each can be scaled by 2.
@@ -39,7 +41,7 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     Presets leave out disturbances whose strength depends on the robot or the plan. Latency and delay come in whole
     control periods, and the 6 to 7 ms of motion capture are less than half a period. For pushes, time and direction
     matter. A quadrotor does not survive the loss of an actuator. There is no `MotorLag` for a robot whose actuators
-    have their own states, because its MJCF describes their lag.
+    have their own states, because its MJCF describes their lag. In a liquid there are currents in place of turbulence.
 
     Args:
       name: calm, light, moderate, strong or severe.
@@ -57,6 +59,7 @@ def _light(plant: Plant) -> list[Disturbance]:
     """All disturbances at strength 1, in the order in which they act."""
     space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
     ranges = np.subtract(controls.high, controls.low)
+    liquid = plant.simulator is None and plant.has_medium and plant.model.opt.density > LIQUID
     lag = MotorLag(0.024)  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
     return [
         InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
@@ -73,7 +76,8 @@ def _light(plant: Plant) -> list[Disturbance]:
         ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
         *([] if plant.robot.activations else [lag]),
         ForceNoise(0.01 * plant.weight),  # our choice: 1 % of the weight
-        Dryden("light", altitude=2.0),
+        # Our choice: severe are 0.15 m/s along each axis, which change within minutes.
+        Gusts(0.05, time_constant=60.0) if liquid else Dryden("light", altitude=2.0),
     ]
 
 

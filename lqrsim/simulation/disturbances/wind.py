@@ -1,6 +1,7 @@
-"""Constant wind, gusts, and Dryden turbulence.
+"""Constant wind, gusts, and Dryden turbulence; in a liquid, currents.
 
-They act through the robot's linear drag, F = drag * wind, or as the wind of a simulator that simulates wind.
+They act through the robot's linear drag, F = drag * wind, as the velocity of the fluid of an MJCF (`density`,
+`viscosity`), or as the wind of a simulator that simulates wind.
 """
 
 from collections.abc import Sequence
@@ -31,13 +32,13 @@ ROUGHNESS = 0.15  # ft, roughness length of the ground in MIL-F-8785C's mean win
 
 
 class Wind(Disturbance):
-    """Base class of winds, which need a robot with drag, or a simulator with a wind."""
+    """Base class of winds, which need a robot with drag, an MJCF with a fluid, or a simulator with a wind."""
 
     def check(self, plant: Plant) -> None:
-        if not plant.robot.drag > 0 and not (plant.simulator and plant.simulator.wind):
+        if not plant.robot.drag > 0 and not plant.has_medium:
             raise InputError(
                 f"{type(self).__name__}: got robot {plant.robot.name}, which wind cannot push without drag, want one"
-                " with a `drag` in N s/m"
+                " with a `drag` in N s/m, or an MJCF with the density or viscosity of a fluid"
             )
 
     def blow(self, plant: Plant, wind: Array) -> Effect:
@@ -47,10 +48,11 @@ class Wind(Disturbance):
 
 @dataclass(frozen=True)
 class MeanWind(Wind):
-    """A constant wind.
+    """A constant wind, or a current.
 
     Args:
-      velocity: velocity of the wind in m/s along the world's axes, (3,).
+      velocity: velocity of the wind in m/s along the world's axes, (3,). In an MJCF with a fluid it is added to the
+        file's own `wind`.
     """
 
     velocity: Sequence[float]
@@ -82,7 +84,9 @@ class MeanWind(Wind):
 
 @dataclass(frozen=True)
 class Gusts(Wind):
-    """Gusts that rise and fade: an Ornstein-Uhlenbeck process on each axis, in its stationary state from the start.
+    """Gusts, or currents, that rise and fade: an Ornstein-Uhlenbeck process on each axis.
+
+    It is in its stationary state from the start.
 
     Args:
       std: standard deviation of the wind in m/s; one number, or three along the world's axes.
