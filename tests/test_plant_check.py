@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
+from tracking import track, weave
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
@@ -118,11 +119,56 @@ def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: 
         ({"problem": swung(), "around": (0.0, np.inf)}, "around: got inf"),
         ({"problem": ls.scenarios.differential_drive().problem}, "problem: got a problem with the states"),
         ({"problem": 3}, "problem: got 3, want a Problem of the robot"),
+        ({"plan": 3}, "plan: got 3, want a Plan of the robot, such as a Solution, or None"),
+        ({"plan": weave(3)}, "plan: got a plan with the states x, y, heading, want angle, speed, as the robot has"),
     ],
 )  # fmt: skip
 def test_a_problem_that_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
         ls.check_plant(Arm(), arm(""), **options)
+
+
+def drawn(count: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The states (k, 2) and controls (k, 1) of single samples."""
+    scene = arm("")
+    found = [ls.check_plant(Arm(), scene, seed=seed, samples=1, **options) for seed in range(count)]
+    return np.array([one.state for one in found]), np.array([one.control for one in found])
+
+
+def test_samples_are_about_the_line_from_start_to_goal() -> None:
+    """Of 300, the moments within 4.5 standard errors."""
+    count, end = 300, 1e-3
+    problem = swung(final_cost=ls.QuadraticCost(np.ones(2), about=(0.3 + end, 0.0)), steps=50)
+    states, controls = drawn(count, problem=problem)
+    angle, speed = states.T
+    along = (angle - 0.3) / end  # on 20 points of the line, uniformly, and 0.3 of its length beside them
+    assert abs(along.mean() - 0.5) < 4.5 * np.sqrt((1 / 12 + 0.09) / count)
+    # 1.1 for the 20 points: the variance of k / 19 is (20^2 - 1) / (12 * 19^2), 1.105 / 12.
+    assert along.var() == pytest.approx(1.105 / 12 + 0.09, rel=4.5 * np.sqrt(2 / count))
+    fastest = 2 * end / 1.0  # of a motion that takes 50 steps of 0.02 s, with constant acceleration
+    assert speed.std() == pytest.approx(0.3 * fastest, rel=4.5 / np.sqrt(2 * count))
+    low, high = Arm().dynamics.control_coordinates.low[0], Arm().dynamics.control_coordinates.high[0]
+    assert np.ptp(controls) > 0.9 * (high - low)
+
+
+def test_samples_are_about_a_plan() -> None:
+    """Each is near one of its knots: 300 normal numbers in three coordinates stay within 4.5."""
+    swing = 0.1 * np.sin(np.arange(40) / 5)[:, None]
+    plan = track(Arm(), (0.3, 0.1), swing, 0.02)
+    states, controls = drawn(300, plan=plan)
+    knots = np.hstack([plan.trajectory.states[:-1], plan.trajectory.controls])
+    away = np.abs(np.hstack([states, controls])[:, None] - knots) / (0.3 * np.ptp(knots, axis=0))
+    assert away.max(axis=2).min(axis=1).max() < 4.5
+    assert away[:, 0].max(axis=1).max() > 4.5  # and not all near the first
+
+
+def test_a_plan_between_stops_agrees_near_it() -> None:
+    """The dynamics do not know of the stops, which most of what is drawn by default is past."""
+    stops = '<joint name="shoulder" type="hinge" axis="0 -1 0" limited="true" range="-2 2"/>'
+    scene = scene_from_xml(arm("").xml.replace('<joint name="shoulder" type="hinge" axis="0 -1 0"/>', stops), "stops")
+    plan = track(Arm(), (0.01, 0.0), np.zeros((50, 1)), 0.02)  # a pendulum's swing of 0.01 rad
+    assert ls.check_plant(Arm(), scene, plan=plan).good
+    assert not ls.check_plant(Arm(), scene).good
 
 
 @settings(max_examples=examples(12))

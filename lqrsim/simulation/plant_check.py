@@ -1,6 +1,7 @@
 """A comparison of a robot's dynamics with its MJCF in MuJoCo, or with another simulator."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
@@ -13,6 +14,7 @@ from lqrsim.errors import Array, InputError, check_array, check_count, check_kin
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.plan import Plan
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.mjcf_model import unlogged
 from lqrsim.scenes.scene import Scene
@@ -22,6 +24,9 @@ from lqrsim.simulation.simulator import Simulator, states_of
 
 MOST_STEPS = 1_000_000  # physics steps in a check; they run one by one
 PRINTED = 8  # pairs of geoms in contact
+SPREAD = 0.3  # of samples, relative to what a state or control changes by, or in its unit if that is unknown
+SLIGHT = 0.1  # what a state or control that does not change counts as changing, relative to others of its unit
+LINE = 20  # points of the line from a start to a goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +113,10 @@ def check_plant(
     *,
     simulator: Simulator | None = None,
     problem: Problem | None = None,
+    plan: Plan | None = None,
     period: float | None = None,
     around: npt.ArrayLike | None = None,
-    spread: float = 0.3,
+    spread: float | None = None,
     controls: Limits | None = None,
     settle: float | None = None,
     samples: int = 50,
@@ -128,13 +134,16 @@ def check_plant(
       robot: the robot, with its dynamics.
       scene: a scene whose MJCF has the robot.
       simulator: a simulator to compare the dynamics with, in place of MuJoCo; it does not report contacts.
-      problem: a problem of the robot. The random states keep its StateBounds, and the controls its limits: beyond them
-        the dynamics need not hold.
+      problem: a problem of the robot. The random states are about the line from its start to its goal and keep its
+        StateBounds, and the controls keep its limits: elsewhere the dynamics need not hold.
+      plan: a plan of the robot, such as a Solution. The random states and controls are about those of the plan.
       period: control period in seconds, a multiple of the physics step; by default the multiple nearest to 0.02 s.
-      around: (n,) mean of the random states; by default the problem's start, or zero.
-      spread: their standard deviation, in each state's unit.
+      around: (n,) mean of the random states; by default as the plan or the problem says, or zero.
+      spread: their standard deviation, in each state's unit; by default 0.3 of what the state changes by along the plan
+        or the line, or else 0.3. Rates of what moves along a line change as much as with constant acceleration.
       controls: (lowest, highest) random control, each a number or (m,), or a dictionary of name or unit of a control:
         (lowest, highest); by default, and for controls that are not named, the limits of the problem, or the dynamics'.
+        Within them controls are equally probable, or normal about those of a plan.
       settle: seconds with constant control before the comparison, for velocities that only MuJoCo has, such as wheel
         speeds; by default 0.5 if MuJoCo has more velocities than half the number of states, else 0.
       samples: number of random states.
@@ -149,16 +158,10 @@ def check_plant(
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
     n = len(robot.dynamics.state_coordinates)
-    start = None if problem is None else _checked(problem, robot).start
-    if around is None:
-        around = np.zeros(n) if start is None else start
-    middle = check_array("around", around, (n,))
-    lowest, highest = _state_range(robot, problem, middle)
-    low, high = _control_range(robot, controls, problem)
+    near = _Region.of(robot, problem, plan, around, spread, controls)
     taken_away = [plant.model.geom(name).id for name in plant.obstacles]
     plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
     rng = np.random.default_rng(check_seed("seed", seed))
-    spread = check_number("spread", spread, at_least=0.0)
     if settle is None:
         settle = 0.5 if simulator is None and 2 * len(plant.qvel) > n else 0.0
     waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
@@ -172,7 +175,7 @@ def check_plant(
     found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
-            state, control = _drawn(rng, middle, spread, lowest, highest), rng.uniform(low, high)
+            state, control = near.draw(rng)
             if simulator is not None:
                 found.append(_in_simulator(simulator, plant, state, control, round(waiting), period))
                 continue
@@ -192,46 +195,108 @@ class _Sample(NamedTuple):
     predicted: Array
 
 
-def _checked(problem: Problem, robot: Robot) -> Problem:
-    """The problem. Raises InputError unless it has the robot's states and controls."""
-    check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
-    check_same_system("problem", "a problem", spaces_of(problem.dynamics), spaces_of(robot.dynamics), "the robot")
-    return problem
+class _Region(NamedTuple):
+    """Where samples are.
+
+    Attributes:
+      states: (k, n), each the mean of some samples. spread: (n,), their standard deviation. within: (2, n), bounds.
+      controls: (k, m), means; None for controls that are equally probable in their range. control_spread: (m,).
+      control_range: (2, m).
+    """
+
+    states: Array
+    spread: Array
+    within: Array
+    controls: Array | None
+    control_spread: Array
+    control_range: Array
+
+    @classmethod
+    def of(
+        cls, robot: Robot, problem: Problem | None, plan: Plan | None, around: npt.ArrayLike | None,
+        spread: float | None, controls: Limits | None,
+    ) -> "_Region":  # fmt: skip
+        """The region by the arguments of `check_plant`."""
+        own = states, inputs = spaces_of(robot.dynamics)
+        n, points, middles, seconds = len(states), np.zeros((1, len(states))), None, 0.0
+        if problem is not None:
+            check_kind("problem", problem, Problem, "a Problem of the robot, such as scenario.problem, or None")
+            check_same_system("problem", "a problem", spaces_of(problem.dynamics), own, "the robot")
+            start, goal, seconds = problem.start, problem.weighed_goal, problem.steps * problem.dt
+            start = np.zeros(n) if start is None else start
+            points = np.linspace(start, start if goal is None else np.where(np.isnan(goal), start, goal), LINE)
+        if plan is not None:
+            check_kind("plan", plan, Plan, "a Plan of the robot, such as a Solution, or None")
+            check_same_system("plan", "a plan", spaces_of(plan.policy), own, "the robot")
+            points, middles = plan.trajectory.states[:-1], plan.trajectory.controls
+            check_array("plan: trajectory", np.hstack([points, middles]), (None, n + len(inputs)))
+        scale = SPREAD * _changes(points, states.units, seconds)
+        if around is not None:
+            points, middles = check_array("around", around, (n,))[None], None
+        if spread is not None:
+            scale = np.full(n, check_number("spread", spread, at_least=0.0))
+        within = _state_range(robot, problem, points[0])
+        ranges = _control_range(robot, controls, problem, bounded=middles is None)
+        control_spread = np.zeros(len(inputs))
+        if middles is not None:
+            control_spread, middles = SPREAD * _changes(middles, inputs.units, 0.0), np.clip(middles, *ranges)
+        return cls(np.clip(points, *within), scale, within, middles, control_spread, ranges)
+
+    def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        """A state (n,) and a control (m,)."""
+        k = int(rng.integers(len(self.states))) if len(self.states) > 1 else 0
+        state = _drawn(rng, self.states[k], self.spread, *self.within)
+        if self.controls is None:
+            return state, rng.uniform(*self.control_range)
+        return state, _drawn(rng, self.controls[k], self.control_spread, *self.control_range)
 
 
-def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> tuple[Array, Array]:
-    """The lowest and the highest state, (n,) each, infinite where unbounded, and the mean, which lies between them."""
+def _changes(points: Array, units: Sequence[str], seconds: float) -> Array:
+    """What each column of points (k, n) changes by, in its unit: at least a little, and 1 if nothing is known of it."""
+    own = np.ptp(points, axis=0).tolist()
+    most = {unit: max(change for change, other in zip(own, units, strict=True) if other == unit) for unit in units}
+    changes = []
+    for change, unit in zip(own, units, strict=True):
+        known = max(change, SLIGHT * most[unit])
+        if not known and seconds and unit.endswith("/s"):  # the peak of a motion that is accelerated, then braked
+            known = 2 * most.get(unit.removesuffix("/s"), 0.0) / seconds
+        changes.append(known or 1.0)
+    return np.array(changes)
+
+
+def _state_range(robot: Robot, problem: Problem | None, middle: Array) -> Array:
+    """The lowest and the highest state, (2, n), infinite where unbounded, and the first mean, which lies between."""
     names = robot.dynamics.state_coordinates.names
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    within = np.tile([[-np.inf], [np.inf]], len(names))
     for one in () if problem is None else problem.constraints:
-        for i, (least, most) in one.state_bounds(robot.dynamics).items():
-            low[i], high[i] = max(low[i], np.min(least)), min(high[i], np.max(most))  # the widest of all knots
-    for name, least, mean, most in zip(names, low, middle, high, strict=True):
+        for i, (least, most) in one.state_bounds(robot.dynamics).items():  # the widest of all knots
+            within[:, i] = max(within[0, i], np.min(least)), min(within[1, i], np.max(most))
+    for name, least, mean, most in zip(names, within[0], middle, within[1], strict=True):
         if not least <= mean <= most:
             raise InputError(
                 f"around: got {mean:g} for {name}, want one within the problem's bounds, {least:g} to {most:g}"
             )
-    return low, high
+    return within
 
 
-def _drawn(rng: np.random.Generator, middle: Array, spread: float, low: Array, high: Array) -> Array:
-    """A normal state (n,) about `middle`, truncated to the bounds, coordinate by coordinate."""
-    state = middle + spread * rng.normal(size=len(middle))
-    for i in np.flatnonzero((state < low) | (state > high)):
-        ends = special.ndtr((np.array([low[i], high[i]]) - middle[i]) / spread)
-        state[i] = np.clip(middle[i] + spread * special.ndtri(rng.uniform(*ends)), low[i], high[i])  # for rounding
-    return state
+def _drawn(rng: np.random.Generator, middle: Array, spread: Array, low: Array, high: Array) -> Array:
+    """A normal vector (n,) about `middle`, truncated to the bounds, coordinate by coordinate."""
+    drawn = middle + spread * rng.normal(size=len(middle))
+    for i in np.flatnonzero((drawn < low) | (drawn > high)):
+        ends = special.ndtr((np.array([low[i], high[i]]) - middle[i]) / spread[i])
+        drawn[i] = np.clip(middle[i] + spread[i] * special.ndtri(rng.uniform(*ends)), low[i], high[i])  # for rounding
+    return drawn
 
 
-def _control_range(robot: Robot, controls: Limits | None, problem: Problem | None) -> tuple[Array, Array]:
-    """The lowest and the highest control, (m,) each. Raises InputError unless they are finite and in order."""
+def _control_range(robot: Robot, controls: Limits | None, problem: Problem | None, *, bounded: bool) -> Array:
+    """The lowest and the highest control, (2, m). Raises InputError unless they are in order, and, if so, bounded."""
     space = robot.dynamics.control_coordinates if problem is None else problem.applied_coordinates
     low, high = space._ranges("controls", {} if controls is None else controls)
     if not (low <= high).all():
         raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
-    if not np.isfinite([low, high]).all():
+    if bounded and not np.isfinite([low, high]).all():
         raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
-    return low, high
+    return np.array([low, high])
 
 
 def _sample(

@@ -169,8 +169,8 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "outcomes": ({"rollout": rollout, "problem": place.problem, "goal_radius": 0.1},),
         "check_plant": ({
-            "robot": robot, "scene": place.scenario.scene, "problem": place.scenario.problem, "period": 1 / 60,
-            "around": np.zeros(3), "spread": 0.3,
+            "robot": robot, "scene": place.scenario.scene, "problem": place.scenario.problem,
+            "plan": place.solution, "period": 1 / 60, "around": np.zeros(3), "spread": 0.3,
             "controls": ([-0.1, -0.1], [0.1, 0.1]), "settle": 0.0, "samples": 1, "tolerance": 0.1, "seed": 0,
         }, 0.3),
     }  # fmt: skip
