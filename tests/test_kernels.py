@@ -1039,6 +1039,7 @@ class TestParts:
         x[:3] = (0.8, 0.1, 0.1) if touching else (0.3, 0.1, 0.2)
         of_term(ls.ObstacleCost(world, geoms=robot.geoms, sharpness=5.0).bind(robot.dynamics), x, u)
         of_constraint(ls.Clearance(world, geoms=robot.geoms, margin=0.1).bind(robot.dynamics), 0, x, u)
+        of_constraint(robot.self_clearance(1.0).bind(robot.dynamics), 0, x, u)
         pose = {"position": (0.4, 0.2, 0.3), "orientation": (0.6, 0.0, 0.8, 0.0)}
         for wanted in (pose, {"position": pose["position"]}, {"orientation": pose["orientation"]}):
             of_term(ls.SiteCost("tip", **wanted).bind(robot.dynamics), x, u)

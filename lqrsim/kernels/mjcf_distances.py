@@ -1,8 +1,9 @@
-"""Distances between a robot's geoms and obstacle geoms, by MuJoCo's `mj_geomDistance`. Written in the kernels' subset.
+"""Distances between a robot's geoms and others, by MuJoCo's `mj_geomDistance`. Written in the kernels' subset.
 
 `data` has the address that `mjcf_dynamics.py` calls p, the numbers of rows and of pairs of geoms, the largest distance
-of interest, and for each pair: its row, the robot's geom and its body, the obstacle's geom, the sum of the radii of
-their bounding spheres, and whether the obstacle is a plane. A row is the least distance of its pairs. Pairs whose
+of interest, and for each pair: its row, the robot's geom and its body, the other geom, which is an obstacle's or on
+another body of the robot, the sum of the radii of their bounding spheres, whether the other is a plane, and its body if
+that moves, else 0. A row is the least distance of its pairs. Pairs whose
 bounding spheres are farther apart than the least distance so far are skipped.
 """
 
@@ -34,7 +35,7 @@ from lqrsim.kernels.mjcf_dynamics import (
 from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio
 
 ROWS = 1  # number of rows
-LARGEST, PAIRS, PAIR = 3, 4, 6  # indices of the largest distance and the pairs in data, and count of numbers per pair
+LARGEST, PAIRS, PAIR = 3, 4, 7  # indices of the largest distance and the pairs in data, and count of numbers per pair
 TOUCHING = 1e-12  # m; the segment between two geoms that touch has no direction
 
 
@@ -87,11 +88,14 @@ def find(x, displaced, moved, data, first, out, which, segments):
 
 
 def find_with_slopes(x, data, first, out, slopes, which, segments):
-    """The same, and the derivatives: the speed of the nearest point, against the direction to the obstacle's."""
+    """The same, and the derivatives: the speed of the nearest point, against the direction to the other's.
+
+    If the other moves too, it is the difference of both speeds.
+    """
     p = at(data[0])
     slot, nv = take_slot(p), int(p[NV])
     one = at(p[SLOTS] + 8 * SLOT * slot)
-    moves, normal, nowhere = stack(3 * N), stack(3), stack(1)
+    moves, others, normal, there, nowhere = stack(3 * N), stack(3 * N), stack(3), stack(3), stack(1)
     write_positions(x, p, at(one[QPOS]))
     call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
     call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
@@ -101,6 +105,12 @@ def find_with_slopes(x, data, first, out, slopes, which, segments):
             pair = PAIRS + PAIR * int(which[row])
             write_normal(one, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
             call(p[JAC], at(p[MODEL]), at(one[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
+            if data[pair + 6] > 0:
+                for i in range(3):
+                    there[i] = segments[row, 3 + i]
+                call(p[JAC], at(p[MODEL]), at(one[DATA]), others, 0, there, int32(int(data[pair + 6])))
+                for j in range(3 * nv):
+                    moves[j] -= others[j]
             for j in range(nv):
                 for i in range(3):
                     slopes[first + row, j] -= normal[i] * moves[nv * i + j]

@@ -36,6 +36,7 @@ from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
+from lqrsim.robots.self_clearance import SelfClearance
 from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, limited_forces, settled
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
@@ -239,6 +240,26 @@ class MjcfRobot(Robot):
         """The dynamics without these limits. Raises InputError if there are none."""
         return self.force_limits.removed_from(self.dynamics)
 
+    def self_clearance(self, margin: float = 0.0) -> SelfClearance:
+        """The constraint that links which MuJoCo lets collide are some distance apart, at the steps of a plan.
+
+        MuJoCo does not let bodies collide that are fixed to each other, parent and child, or in an `<exclude>` of the
+        MJCF. Links that touch in every position are left out, and so is what the robot handles.
+
+        Args:
+          margin: the least distance in metres.
+
+        Raises:
+          InputError: the margin is not a number, or no two links can collide.
+        """
+        found = SelfClearance(self.mjcf, self.body, margin)
+        if not found.links:
+            want = "an MJCF that lets two links collide"
+            raise InputError(
+                f"MjcfRobot {self.name}: self_clearance: got no pair of links that can collide, want {want}"
+            )
+        return found
+
     def with_parameters(self, **values: float) -> "MjcfRobot":
         """The robot with other numbers in its MJCF, for plans and plants: `robot.with_parameters(mass=0.6)`.
 
@@ -335,6 +356,7 @@ class MjcfRobot(Robot):
         attitude: float = 0.1,
         limits: float = 100.0,
         clearance: float | None = None,
+        self_clearance: float | None = None,
         force_limits: bool = True,
     ) -> Problem:
         """Make a problem: from one state to another, within the actuators' limits, with costs on obstacles.
@@ -362,6 +384,8 @@ class MjcfRobot(Robot):
             it: 0.1 rad or m, 5 % of the joint's range, and the distances at start and goal.
           clearance: least distance to all obstacles in metres, as a constraint, like `lqrsim solve --clearance`; by
             default obstacles only add cost.
+          self_clearance: least distance in metres of links that MuJoCo lets collide, as a constraint: the method
+            `self_clearance`; by default links may touch, as MuJoCo has it.
           force_limits: whether limits of forces are constraints, as in `force_limits`, and not in the dynamics. Those
             that no control keeps at the start stay in the dynamics, as all do if MuJoCo's steps are unstable without
             them, or with False: then forces may saturate.
@@ -399,6 +423,11 @@ class MjcfRobot(Robot):
         kept: list[Constraint] = []
         if clearance is not None:
             kept.append(Clearance(self.scene.world, **self.shape, margin=check_number("clearance", clearance)))
+        if self_clearance is not None:
+            apart = self.self_clearance(check_number("self_clearance", self_clearance))
+            for field, state in (("start", start), ("goal", goal)):
+                apart.check(field, dynamics, state)
+            kept.append(apart)
         sides = np.array([controls.low, controls.high])
         forces = ForceLimits([one for one in self._forces[0] if one.can_be_kept(start, *sides)])
         if check_flag("force_limits", force_limits) and forces.limits:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_number, vectors_of
+from lqrsim.errors import Array, InputError, vectors_of
 from lqrsim.kernels import differences, mjcf_distances, mjcf_places
 from lqrsim.problem.collision_shape import CollisionGeoms, GeomDistances
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
@@ -36,13 +36,9 @@ class MjcfGeoms(CollisionGeoms):
         self.scene = scene
         model, pairs = scene.model, mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))
         self._pairs, self._levers = pairs, mjcf_obstacles.levers(model)
-        plane = np.array([one.kind == "plane" for one in scene.world.obstacles], dtype=bool)
         number = {geom: i for i, geom in enumerate(scene.geoms)}
         self._number = np.array([number[geom] for geom in pairs[:, 1].tolist()], dtype=np.int64)
-        self._plane = plane[self._number] if len(pairs) else np.zeros(0, dtype=bool)
         self._bodies = model.geom_bodyid[pairs[:, 0]].astype(np.int64)
-        own = model.geom_rbound[pairs[:, 0]]
-        self._bounds = own + np.where(self._plane, 0.0, model.geom_rbound[pairs[:, 1]])
 
     @property
     def size(self) -> float:
@@ -132,12 +128,7 @@ class MjcfGeoms(CollisionGeoms):
 
     def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
         """The kernel's data, except the address of p."""
-        columns = [
-            rows, self._pairs[chosen, 0], self._bodies[chosen], self._pairs[chosen, 1], self._bounds[chosen],
-            self._plane[chosen],
-        ]  # fmt: skip
-        table = np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)
-        return np.concatenate([[count, len(chosen), check_number("reach", reach)], table.ravel()])
+        return mjcf_obstacles.distance_data(self.scene.model, self._pairs[chosen], rows, count, reach)
 
     def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.intp], Array]:
         """The indices of the pairs, and the kernel's data with the address of p, for all distances to each obstacle."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.capsules import Capsule
-from lqrsim.errors import Array
+from lqrsim.errors import Array, check_number
 from lqrsim.scenes.mjcf_kinematics import placed
 
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -82,19 +82,47 @@ def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
     """
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
     fixed = np.array(obstacles, dtype=np.int64)
-    kinds, others = model.geom_contype, model.geom_conaffinity
-    touch = (kinds[moving][:, None] & others[fixed]) | (others[moving][:, None] & kinds[fixed]) != 0
-    if model.nexclude:
-        own, far = model.geom_bodyid[moving].astype(np.int64)[:, None], model.geom_bodyid[fixed].astype(np.int64)
-        signs = np.minimum(own, far) << 16 | np.maximum(own, far)
-        touch &= ~np.isin(signs, model.exclude_signature)
-    rows, columns = (dict(zip(ids.tolist(), range(len(ids)), strict=True)) for ids in (moving, fixed))
-    for one, other in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True):
-        for mover, obstacle in ((one, other), (other, one)):
-            if mover in rows and obstacle in columns:
-                touch[rows[mover], columns[obstacle]] = True
-    first, second = np.nonzero(touch)
-    return np.stack([moving[first], fixed[second]], axis=1)
+    pairs = np.stack(np.meshgrid(moving, fixed, indexing="ij"), axis=-1).reshape(-1, 2)
+    return pairs[_collide_by_kind(model, pairs) | _are_stated(model, pairs)]
+
+
+def link_pairs(model: mujoco.MjModel, body: int) -> Pairs:
+    """The pairs of geoms on two links of the robot that MuJoCo lets collide.
+
+    It does not if their bodies are fixed to each other, are parent and child, or are excluded, but for a pair in the
+    MJCF. Pairs that touch in every position of the joints are left out. Links are the bodies of kinematic trees that
+    actuators move, and of the tree of `body`, and what carries them: what the robot handles is none.
+    """
+    data, welds = placed(model), model.body_weldid
+    mujoco.mj_fwdPosition(model, data)  # which also finds what actuators move
+    trees = [model.body_treeid[body], *model.dof_treeid[data.moment_colind]]
+    own = np.flatnonzero((welds[model.geom_bodyid] != 0) & np.isin(model.body_treeid[model.geom_bodyid], trees))
+    pairs = np.stack([own[one] for one in np.triu_indices(len(own), 1)], axis=1).astype(np.int64)
+    one, other = welds[model.geom_bodyid[pairs]].T
+    joined = one == other
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        above = welds[model.body_parentid]
+        joined |= (above[one] == other) | (above[other] == one)
+    pairs = pairs[_collide_by_kind(model, pairs) & ~joined | _are_stated(model, pairs)]
+    base = np.flatnonzero((welds[model.geom_bodyid] == 0) & np.isin(model.geom_bodyid, [*_base(model)]))
+    fixed = touching_pairs(model, base.tolist())
+    pairs = np.concatenate([pairs, fixed[np.isin(fixed[:, 0], own)]])
+    return pairs[~_always_touch(model, pairs, carried=False)]
+
+
+def _collide_by_kind(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that collide by contype and conaffinity, and whose bodies are not excluded."""
+    kinds, others = model.geom_contype[pairs], model.geom_conaffinity[pairs]
+    low, high = np.sort(model.geom_bodyid[pairs].astype(np.int64), axis=1).T
+    touch = (kinds[:, 0] & others[:, 1]) | (others[:, 0] & kinds[:, 1]) != 0
+    return touch & ~np.isin(low << 16 | high, model.exclude_signature)
+
+
+def _are_stated(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that are pairs in the MJCF."""
+    stated = np.stack([model.pair_geom1, model.pair_geom2], axis=1).astype(np.int64)
+    low, high = np.sort(pairs, axis=1).T
+    return np.isin(low * model.ngeom + high, np.sort(stated, axis=1) @ [model.ngeom, 1])
 
 
 def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
@@ -109,6 +137,21 @@ def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
         extra = np.stack(np.meshgrid(moving, untouched, indexing="ij"), axis=-1).reshape(-1, 2)
         pairs = np.concatenate([pairs, extra])
     return pairs
+
+
+def distance_data(model: mujoco.MjModel, pairs: Pairs, rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
+    """The data of `kernels/mjcf_distances.py`, except the address of p.
+
+    Args:
+      pairs: (K, 2) geoms, the first of which moves. rows: (K,) the row of each pair, of `count` rows.
+      reach: largest distance of interest, in m.
+    """
+    bodies, radii = model.geom_bodyid[pairs], model.geom_rbound[pairs]  # that of a plane is 0
+    planes = model.geom_type[pairs[:, 1]] == int(mujoco.mjtGeom.mjGEOM_PLANE)
+    moving = np.where(model.body_weldid[bodies[:, 1]] != 0, bodies[:, 1], 0)
+    columns = [rows, pairs[:, 0], bodies[:, 0], pairs[:, 1], radii.sum(axis=1), planes, moving]
+    table = np.stack(columns, axis=1).astype(np.float64)
+    return np.concatenate([[count, len(pairs), check_number("reach", reach)], table.ravel()])
 
 
 def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
@@ -185,13 +228,17 @@ def _close(model: mujoco.MjModel, data: mujoco.MjData, pair: Pairs) -> bool:
     return mujoco.mj_geomDistance(model, data, *pair.tolist(), 2 * _NEAR, None) < _NEAR
 
 
-def _always_touch(model: mujoco.MjModel, pairs: Pairs) -> npt.NDArray[np.bool_]:
-    """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom."""
+def _always_touch(model: mujoco.MjModel, pairs: Pairs, *, carried: bool = True) -> npt.NDArray[np.bool_]:
+    """Flags (K,) of the pairs that touch in every position of the joints that carry the moving geom.
+
+    Without `carried` a free joint may carry both.
+    """
     if not len(pairs):
         return np.zeros(0, dtype=bool)
     data = placed(model)
     always = _touch(model, data, pairs)
-    always &= ~_moved_by(model, pairs, _FREE)
+    if carried:
+        always &= ~_moved_by(model, pairs, _FREE)
     kept = np.flatnonzero(always)
     for qpos in _random_positions(model) if len(kept) else ():
         data.qpos[:] = qpos

@@ -69,6 +69,14 @@ def ilqr_stated(**stated: Any) -> ls.Solution:
 CART = """<mujoco><worldbody><body name="cart"><joint name="slider" type="slide" axis="1 0 0" range="-1 1"
   limited="true"/><geom size="0.1"/></body></worldbody><actuator><motor name="push" joint="slider"/></actuator>
   <keyframe><key name="left" qpos="-0.5"/></keyframe></mujoco>"""
+FOLDED = """
+<mujoco>
+  <worldbody><body name="a"><joint name="a"/><geom size="0.1"/>
+    <body name="b" pos="0.5 0 0"><joint name="b"/><geom size="0.1"/>
+      <body name="c" pos="0.5 0 0"><joint name="c"/><geom size="0.1"/></body></body></body></worldbody>
+  <actuator><motor joint="b"/></actuator>
+</mujoco>
+"""
 
 
 def problems(place: Place) -> dict[str, tuple[Any, ...]]:
@@ -94,6 +102,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     file = place.folder / "cart.xml"
     file.write_text(CART, encoding="utf-8")
     slider = ls.MjcfRobot(file)
+    links = place.folder / "folded.xml"
+    links.write_text(FOLDED, encoding="utf-8")
+    folded = ls.MjcfRobot(links)
     noise = ls.Noise(shaken, size=1, parameters={"share": 0.1}, level="plain")
     known: dict[str, ls.Robot] = {
         "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive(),
@@ -125,6 +136,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "MjcfRobot.problem": ({
             "self": slider, "start": slider.at(), "goal": slider.at(slider=0.2), "steps": 5, "dt": 0.02,
             "weights": 10.0, "effort": [1.0], "damping": 1e-3,
+        }, 0.3),
+        "MjcfRobot.self_clearance": ({"self": folded, "margin": 0.01},),
+        "MjcfRobot.problem of links": ({
+            "call": folded.problem, "start": folded.at(), "goal": folded.at(b=0.2), "steps": 5, "self_clearance": 0.01,
         }, 0.3),
         **{f"{kind}.among": ({"self": robot, "world": place.plant.world},) for kind, robot in known.items()},
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
