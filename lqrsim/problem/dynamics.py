@@ -19,6 +19,7 @@ from lqrsim.codegen.user_functions import (
     UserFunction,
     check_derivative,
     check_signature,
+    interrupt_of,
     level_of,
     name_of,
     numbers_of,
@@ -415,6 +416,8 @@ class Dynamics:
         slopes = np.zeros((len(states), states.shape[1], states.shape[1]))
         of = in_c_order(states), in_c_order(controls), numbers_of(self)
         self.compiled.state_jacobians(len(states), *of, slopes)
+        if error := interrupt_of(self.functions):  # as by Ctrl-C
+            raise error
         return dt, slopes
 
     def _with_finer_steps(self, dt: float, most: float) -> str:
