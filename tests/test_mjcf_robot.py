@@ -510,6 +510,36 @@ def test_a_free_body_passes_pillars(clearance: float | None) -> None:
         assert min(apart) == pytest.approx(clearance, abs=1e-5)
 
 
+@pytest.mark.parametrize("turn", [5.0, 6.1, 2 * np.pi, 6.5, 8.0])
+def test_a_plan_that_comes_near_a_whole_turn_says_so(turn: float) -> None:
+    """There a tilt of 0.02 rad is at least 0.3 rad of the rotation vector: |r| / (2 sin(|r| / 2)) times as much."""
+    motors = "".join(f'<motor joint="b" gear="{gear}"/>' for gear in ("1 0 0", "0 1 0", "0 0 1"))
+    robot = ls.MjcfRobot(
+        scene_from_xml(
+            f"""<mujoco><option timestep="0.02" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
+            <joint name="b" type="ball" damping="0.1"/><geom type="box" size="0.1 0.1 0.1" mass="5"/></body></worldbody>
+            <actuator>{motors}</actuator></mujoco>""",
+            "ball",
+        )
+    )
+    goal = robot.at(b_rx=0.6 * turn, b_rz=0.8 * turn)
+    solution = ls.smooth(robot.problem(robot.at(), goal, steps=50, dt=0.04, weights=1e4))
+    assert solution.status is ls.Status.CONVERGED
+    states, space, amplified = solution.trajectory.states, robot.dynamics.state_coordinates, []
+    for state in states:
+        tilted = np.zeros(4)
+        mujoco.mju_mulQuat(tilted, robot.configuration(state)[0], np.array([np.cos(0.01), 0.0, np.sin(0.01), 0.0]))
+        amplified.append(np.linalg.norm(space.difference(robot.state(tilted, np.zeros(3)), state)[:3]))
+    said = re.search(r"at ([\d.e-]+) s b_rx, b_ry, b_rz are ([\d.e-]+) rad from a whole turn", solution.detail)
+    assert (said is not None) == (max(amplified) > 0.3), solution.detail
+    assert (said is not None) == (turn > 6)
+    if said:
+        knot = round(float(said[1]) / 0.04)
+        off = abs(np.linalg.norm(states[knot, :3]) - 2 * np.pi)
+        assert float(said[2]) == pytest.approx(off, rel=0.05)
+        assert off <= np.abs(np.linalg.norm(states[:, :3], axis=1) - 2 * np.pi).min()
+
+
 def test_a_free_body_does_not_tumble_on_its_way() -> None:
     """The attitude of what it handles costs nothing."""
     robot = rov_among('<body name="crate" pos="0 3 1" gravcomp="1"><freejoint name="crate"/><geom size="0.1"/></body>')
