@@ -732,6 +732,16 @@ class TestRareEnds:
             log["cost"] = costs
             assert replay(source, SIZES, "cycling", with_rows(log), len(log) - 1) == cycling
             assert replay(source, SIZES, "no_progress", with_rows(log), len(log) - 1) == stuck
+        settings = Begun(problem()).run._options(np.zeros(1, LOG), 1e-4)._replace(gap_tolerance=1e-3)
+        swinging, falling, small = [3e-2, 1e-2, 2e-2] * 4, [1e-1 * 0.8**k for k in range(12)], [1e-4] * 12
+        for gaps, change, stuck in (
+            (swinging, 1e-5, True), (swinging, 1e-3, False), (swinging[:5], 1e-5, False), (falling, 1e-5, False),
+            (small, 1e-5, False), (swinging, -1e-5, True),
+        ):  # fmt: skip
+            log = np.zeros(len(gaps), LOG)
+            log["gap"], log["improvement"] = gaps, change
+            log["improvement"][: -declarations.LINGER] = 1.0
+            assert replay(source, SIZES, "lingering", with_rows(log), len(log) - 1, settings) == stuck
         for old, cost in ((1.0, 2.0), (1.0, np.inf), (3.0, 3.0), (1.0, np.nan), (0.0, 0.0)):
             replay(source, SIZES, "relative_improvement", old, cost, 1e-3)
         for failed, decrease, cost in ((-1, 1.0, 2.0), (3, 1.0, 2.0), (-1, np.inf, 1.0), (-1, 1.0, np.nan)):

@@ -465,8 +465,8 @@ def test_weights_of_a_problem_by_name_and_by_unit() -> None:
         robot.problem(start, goal, weights={"N": 1.0})
 
 
-def test_a_free_body_does_not_tumble_on_its_way() -> None:
-    """Eight thrusters, which could turn it in any way while it flies; the attitude of what it handles costs nothing."""
+def rov_among(others: str) -> ls.MjcfRobot:
+    """A body with eight thrusters, which could turn it in any way while it flies, and what else there is."""
     places = [(x, y) for x in (-0.15, 0.15) for y in (-0.1, 0.1)]
     sites = "".join(f'<site name="{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(places))
     thrusters = "".join(
@@ -474,16 +474,75 @@ def test_a_free_body_does_not_tumble_on_its_way() -> None:
         f'<motor site="{i}" gear="0 0 1 0 0 0" ctrlrange="-35 35"/>'
         for i, (x, y) in enumerate(places)
     )
-    robot = ls.MjcfRobot(
+    return ls.MjcfRobot(
         scene_from_xml(
             f"""<mujoco><option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/><worldbody>
             <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/><geom type="ellipsoid" mass="11.5"
-            size="0.25 0.18 0.13"/>{sites}</body><body name="crate" pos="0 3 1" gravcomp="1"><freejoint name="crate"/>
-            <geom size="0.1"/></body></worldbody><actuator>{thrusters}</actuator></mujoco>""",
+            size="0.25 0.18 0.13"/>{sites}</body>{others}</worldbody><actuator>{thrusters}</actuator></mujoco>""",
             "rov",
         ),
         body="rov",
     )
+
+
+@pytest.mark.parametrize("clearance", [None, 0.2])
+def test_a_free_body_passes_pillars(clearance: float | None) -> None:
+    """With a clearance that the plan without one does not have; an arrival within its own size needs no second search.
+
+    Without curvature the interior point goes up and down by 1e-4 of the cost here; what converges are multipliers.
+    """
+    pillars = ((1.6, 0.15, 0.35), (3.4, -0.35, 0.35))
+    robot = rov_among("".join(f'<geom type="cylinder" size="{r} 2" pos="{x} {y} 2"/>' for x, y, r in pillars))
+    goal = robot.at(rov_x=5.0, rov_y=0.3, rov_z=1.4)
+    problem = robot.problem(robot.at(), goal, steps=40, dt=0.2, clearance=clearance)
+    solution = ls.smooth(problem, max_iterations=80, threads=1)
+    assert solution.status is ls.Status.CONVERGED, solution
+    assert not [one for one in solution.candidates if "times the weight" in one.start]
+    model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+    apart = []
+    for state in solution.trajectory.states:
+        data.qpos[:] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        apart += [mujoco.mj_geomDistance(model, data, 0, geom, 9.0, None) for geom in range(1, model.ngeom)]
+    # MuJoCo's distances are good to some 1e-6 m.
+    assert min(apart) > (-1e-5 if clearance is None else clearance - 1e-5)
+    if clearance is not None:
+        assert min(apart) == pytest.approx(clearance, abs=1e-5)
+
+
+@pytest.mark.parametrize("turn", [5.0, 6.1, 2 * np.pi, 6.5, 8.0])
+def test_a_plan_that_comes_near_a_whole_turn_says_so(turn: float) -> None:
+    """There a tilt of 0.02 rad is at least 0.3 rad of the rotation vector: |r| / (2 sin(|r| / 2)) times as much."""
+    motors = "".join(f'<motor joint="b" gear="{gear}"/>' for gear in ("1 0 0", "0 1 0", "0 0 1"))
+    robot = ls.MjcfRobot(
+        scene_from_xml(
+            f"""<mujoco><option timestep="0.02" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
+            <joint name="b" type="ball" damping="0.1"/><geom type="box" size="0.1 0.1 0.1" mass="5"/></body></worldbody>
+            <actuator>{motors}</actuator></mujoco>""",
+            "ball",
+        )
+    )
+    goal = robot.at(b_rx=0.6 * turn, b_rz=0.8 * turn)
+    solution = ls.smooth(robot.problem(robot.at(), goal, steps=50, dt=0.04, weights=1e4))
+    assert solution.status is ls.Status.CONVERGED
+    states, space, amplified = solution.trajectory.states, robot.dynamics.state_coordinates, []
+    for state in states:
+        tilted = np.zeros(4)
+        mujoco.mju_mulQuat(tilted, robot.configuration(state)[0], np.array([np.cos(0.01), 0.0, np.sin(0.01), 0.0]))
+        amplified.append(np.linalg.norm(space.difference(robot.state(tilted, np.zeros(3)), state)[:3]))
+    said = re.search(r"at ([\d.e-]+) s b_rx, b_ry, b_rz are ([\d.e-]+) rad from a whole turn", solution.detail)
+    assert (said is not None) == (max(amplified) > 0.3), solution.detail
+    assert (said is not None) == (turn > 6)
+    if said:
+        knot = round(float(said[1]) / 0.04)
+        off = abs(np.linalg.norm(states[knot, :3]) - 2 * np.pi)
+        assert float(said[2]) == pytest.approx(off, rel=0.05)
+        assert off <= np.abs(np.linalg.norm(states[:, :3], axis=1) - 2 * np.pi).min()
+
+
+def test_a_free_body_does_not_tumble_on_its_way() -> None:
+    """The attitude of what it handles costs nothing."""
+    robot = rov_among('<body name="crate" pos="0 3 1" gravcomp="1"><freejoint name="crate"/><geom size="0.1"/></body>')
     goal = robot.at(rov_x=5.0, rov_y=0.3, rov_z=1.4, rov_rz=0.5)
     problem = robot.problem(robot.at(), goal, steps=80, dt=0.1)
     solution = ls.smooth(problem, max_iterations=40, starts=1, threads=1)

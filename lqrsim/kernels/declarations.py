@@ -22,10 +22,10 @@ RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
 NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH, IN_VALLEY = 10, 11, 12, 13
 LONGEST_CYCLE = 8
-# Numbers of iterations without a lower cost, and with a decrease below a thousandth, that count as no progress. Neither
-# number is reached if the method converges on the paper's queries:
+# Numbers of iterations without a lower cost, with a decrease below a thousandth, and with a settled cost but a gap that
+# does not halve, that count as no progress. None is reached if the method converges on the paper's queries:
 # `python experiments/benchmark_reliability.py --sections overhead`.
-NO_FALL, SLOW_FALL = 12, 30
+NO_FALL, SLOW_FALL, LINGER = 12, 30, 10
 # The ladder of regularisation begins with fractions of the convex models in a mixture with those of second order, tried
 # in turn until one has a minimum. Weights on changes of the controls follow.
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)

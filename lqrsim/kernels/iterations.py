@@ -15,6 +15,7 @@ from lqrsim.kernels.declarations import (
     DIVERGED,
     ILQR,
     IN_VALLEY,
+    LINGER,
     LONGEST_CYCLE,
     MAX_ITERATIONS,
     NO_FALL,
@@ -69,7 +70,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
       2. the gap is below `settings.valley`: IN_VALLEY;
       3. cost and gap have settled: COST_CONVERGED, or CONVERGED if the rollout is optimal, too;
       4. there were `settings.max_iterations`: MAX_ITERATIONS, or DIVERGED without a finite cost;
-      5. the costs repeat, CYCLING; or, if `memory.watched`, they no longer fall: NO_PROGRESS.
+      5. the costs repeat, CYCLING; or, if `memory.watched`, they no longer fall, or the gap does not: NO_PROGRESS.
 
     Args:
       settings: IterationSettings. model: ProblemModel. memory, log: rows of MEMORY and LOG.
@@ -119,7 +120,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         outcome = outcome_of(settled, settings, left, cost, full)
         if outcome == RUNNING and cycling(log, done):
             outcome = CYCLING
-        if outcome == RUNNING and memory.watched > 0 and no_progress(log, done):
+        if outcome == RUNNING and memory.watched > 0 and (no_progress(log, done) or lingering(log, done, settings)):
             outcome = NO_PROGRESS
         if outcome != RUNNING:
             return done + 1, outcome, False, -1
@@ -186,6 +187,19 @@ def no_progress(log, done):
         if least < reference - 1e-3 * abs(reference) or (least < inf and not reference < inf):
             reference, slow = least, 0
     return since >= NO_FALL or slow >= SLOW_FALL
+
+
+def lingering(log, done, settings):
+    """Whether the cost has settled for LINGER iterations, in which the gap has not halved.
+
+    States of least cost then swing to and fro about the rollout, as where the dynamics curve; damped iterations do not.
+    """
+    if done < LINGER or log[done].gap < settings.gap_tolerance:
+        return False
+    for i in range(LINGER):
+        if not abs(log[done - i].improvement) < settings.tolerance:
+            return False
+    return log[done].gap > 0.5 * log[done - LINGER].gap
 
 
 def optimality(settings, plan, model, cost, negligible):

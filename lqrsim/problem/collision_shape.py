@@ -279,7 +279,8 @@ class KeepsClear:
 
     Attributes:
       world: the obstacles. shape: the robot's shape, as the keyword that was given: radius, balls or geoms.
-      radius: the given radius; for balls the largest radius, for geoms 0. balls, geoms: None if not given.
+      radius: the given radius; for balls the largest, for geoms that of the largest bounding sphere.
+      balls, geoms: None if not given.
     """
 
     def _set_shape(
@@ -299,7 +300,8 @@ class KeepsClear:
         if radius is not None:
             self.shape["radius"] = check_number(f"{who}: radius", radius, at_least=0.0)
         self.world, self.balls, self.geoms = world, balls, geoms
-        self.radius: float = self.shape.get("radius", 0.0 if balls is None else float(balls.radii.max()))
+        largest = geoms.size if geoms is not None else 0.0 if balls is None else float(balls.radii.max())
+        self.radius: float = self.shape.get("radius", largest)
 
     @property
     def kept_clear(self) -> "KeepsClear":

@@ -23,6 +23,9 @@ from lqrsim.versions import versions
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
 BESIDE, LITTLE = 8, 1e-9
+# Distance of a rotation vector from a whole turn, in rad, below which the solution says so. With 0.01 rad of noise, a
+# quadrotor that hovers 0.35 rad from there stays level, and one at 0.17 rad tumbles.
+WHOLE = 0.3
 FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
@@ -52,7 +55,7 @@ def assemble(
         )  # fmt: skip
 
     unstable = unstable_step(problem, states, controls, sound=found.success)
-    said = found.detail, _usable(found, options), _fragile(problem, found), unstable.detail if unstable else ""
+    said = found.detail, _usable(found, options), *_doubts(problem, found), unstable.detail if unstable else ""
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -109,13 +112,40 @@ def _usable(found: RunResult, options: dict[str, object]) -> str:
     )
 
 
+def _doubts(problem: Problem, found: RunResult) -> tuple[str, ...]:
+    """Where feedback may fail although the plan is right, in words."""
+    if not np.isfinite(found.states).all():
+        return ()
+    return _near_whole_turn(problem, found), _fragile(problem, found)
+
+
+def _near_whole_turn(problem: Problem, found: RunResult) -> str:
+    """Where a rotation vector of the plan is nearly a whole turn, in words; or empty.
+
+    All rotation vectors of whole turns are the same attitude. Next to them a small error of the attitude is a large one
+    of the vector, or of the axis about which it turns.
+    """
+    space = problem.dynamics.state_coordinates
+    for first in space.rotation_vectors:
+        angles = np.linalg.norm(found.states[:, first : first + 3], axis=1)
+        turns = np.round(angles / (2 * np.pi))
+        apart = np.where(turns > 0, np.abs(angles - 2 * np.pi * turns), np.inf)
+        if apart.min() < WHOLE:
+            knot, names = int(apart.argmin()), ", ".join(space.names[first : first + 3])
+            return (
+                f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from a whole turn, where rotation"
+                " vectors are singular: the policy may take an attitude beside the plan's for another turn"
+            )
+    return ""
+
+
 def _fragile(problem: Problem, found: RunResult) -> str:
     """Where the policy leaves the plan from a start that differs by rounding, in words; or empty.
 
     Where a contact begins or ends, a step may jump, and rounding decides which way. Only then is it looked at.
     """
     states, space = found.states, problem.dynamics.state_coordinates
-    if not problem.dynamics.discrete or not np.isfinite(states).all() or not problem.dynamics.touches(states):
+    if not problem.dynamics.discrete or not problem.dynamics.touches(states):
         return ""
     for draw in range(BESIDE):
         signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))

@@ -72,7 +72,7 @@ _STATUS = {
 _DETAILS = {
     declarations.NO_START: "rollout of the initial controls",
     declarations.CYCLING: "the iterations repeat themselves",
-    declarations.NO_PROGRESS: "the least cost so far no longer falls",
+    declarations.NO_PROGRESS: "the least cost so far no longer falls, or the gap does not",
     declarations.STALLED: "the line search found no lower cost",
 }
 

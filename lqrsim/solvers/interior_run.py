@@ -58,16 +58,24 @@ class InteriorRun:
         self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
 
-    def solve(self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = ()) -> RunResult | None:
-        """The result from a plan; None if the budget is over, or there is no result. The iterations go to the log."""
+    def solve(
+        self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
+    ) -> RunResult | None:
+        """The result from a plan; None if the budget is over, or there is no result. The iterations go to the log.
+
+        `stale` is the number of iterations without a new least stationarity that ends it; by default it may take any.
+        """
         budget, run, found = self._budget, self._run, None
         if budget.left < 2 or budget.stop.due:
             return None
-        laps = Laps(budget)
+        laps, least, since = Laps(budget), np.inf, 0
 
         def watch(measures: Measures, seconds: float) -> bool:
+            nonlocal least, since
             measures.record(laps, seconds=seconds)
-            return budget.stop.due
+            since = 0 if measures.stationarity < least else since + 1
+            least = min(least, measures.stationarity)
+            return budget.stop.due or since == stale
 
         with budget.stop.heeding():
             point = InteriorPoint(
