@@ -722,7 +722,7 @@ class Search:
         elif self._cut_short and np.isfinite(found.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
-        elif not stop.due or self._looked[0] is found:
+        elif not stop.due or (self._still is not None and not self._moves(found)):
             found = self._told_of_unmoved(found)
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -747,6 +747,8 @@ class Search:
         elif otherwise:
             what = "with which the robot touches that body" if problem.dynamics.discrete else f"that change {names}"
             remedy = f"begin with start=[...], controls {what}"
+        if self._budget.stop.due:
+            status, remedy = Status.TIME_LIMIT, ""
         return replace(found, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
 
     def _of_approaches(self, found: RunResult) -> str:
