@@ -416,6 +416,16 @@ def test_a_crane_with_a_rope_converges(winch: str, load: str, lifted: float) -> 
 
 
 @pytest.mark.long
+def test_a_body_that_nothing_touches_is_moved() -> None:
+    """As the page says, from nothing, here in a few iterations: the box is past most of its way."""
+    script: Any = import_module("mjcf_contacts")
+    found = script.solved(script.CASES[0], script.Config(quick=True))
+    assert found["off"] < 0.3 * found["way"]
+    assert found["cost"] < found["rest"]
+    assert "a disc pushes a box ahead" in script.report({"rows": [found]})
+
+
+@pytest.mark.long
 def test_the_packaged_quadrotor_by_its_mjcf() -> None:
     """MuJoCo's steps lead to the optimum of the formulas: to 1e-6 of the cost is wanted, what is left is rounding."""
     script: Any = import_module("mjcf_packaged")

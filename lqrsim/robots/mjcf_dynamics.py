@@ -22,6 +22,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
+from lqrsim.scenes.mjcf_approach import Approaches
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel, unlogged
 from lqrsim.scenes.mjcf_physics import (
     RK4,
@@ -187,6 +188,18 @@ class MjcfDynamics(Dynamics):
             other._stated = self._stated | {"softness": softness}
             other._set_mjcf(self.mjcf)
             yield f"{softness:g}", other
+
+    def approaches(self, states: Array, moves: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
+        nv = self.physics.model.nv
+        wanted = moves[:nv] if moves[:nv].any() else moves[nv : 2 * nv]  # a velocity points the way
+        if not wanted.any():
+            return
+        found, other = Approaches(self.mjcf, states, wanted), copy.copy(self)
+        other._stated = self._stated | {"obstacles": (*self._stated["obstacles"], *found.thing)}
+        with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
+            other._set_mjcf(self.mjcf)
+            for words, positions in found:
+                yield words, other, np.pad(positions, [(0, 0), (0, len(moves) - nv)], constant_values=np.nan)
 
     def unlimited(self, actuators: tuple[int, ...], joints: tuple[int, ...]) -> "MjcfDynamics":
         """The same without limits on the forces of these actuators and on the sums at these joints."""

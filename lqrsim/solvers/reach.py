@@ -3,20 +3,26 @@
 Such a plan is stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its place.
 """
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.problem import Problem
+from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.solvers import compiled
 from lqrsim.solvers.engine import RunResult
-from lqrsim.solvers.multistart import SWAYS, sinusoidal_controls
+from lqrsim.solvers.multistart import FOLLOWED, SWAYS, sinusoidal_controls
 
 LEFT = 1e-3  # slope of the final cost, relative to the slope at the end of a given plan, that has died away
 MOST_OF = (
     0.1  # part of the cost that a change of a state by its size would save, from which on its goal counts as missed
 )
+NEARER = 0.3  # part of the way to its goal that a body must be taken
+LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its weight along an approach is scaled
 NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 
@@ -29,7 +35,7 @@ def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allow
     end, goal, start = states[-1], problem.goal, states[0]
     sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    missed = np.abs(_final_cost(problem, end, controls[-1])[1]) * sizes > MOST_OF * abs(cost)
+    missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(cost)
     for i, number in goals_of(problem.constraints, problem.dynamics).items():
         missed[i] |= abs(end[i] - number) > allowed
     if not missed.any():
@@ -56,18 +62,54 @@ def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int
 
 def goal_left(problem: Problem, found: RunResult, given: RunResult) -> bool:
     """Whether a plan has gone farther from the goal than a given one, to where the final cost has no slope."""
-    value, slope = _final_cost(problem, found.states[-1], found.controls[-1])
-    before, steeper = _final_cost(problem, given.states[-1], given.controls[-1])
+    value, slope, _ = _final_cost(problem, found.states[-1])
+    before, steeper, _ = _final_cost(problem, given.states[-1])
     return value > before and float(np.abs(slope).max()) < LEFT * float(np.abs(steeper).max())
 
 
-def _final_cost(problem: Problem, state: Array, control: Array) -> tuple[float, Array]:
-    """The final cost and its gradient (n,)."""
-    n, joint = len(state), len(state) + len(control)
-    hessian, gradient = np.zeros((joint, joint)), np.zeros(joint)
+def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
+    """The final cost, its gradient (n,) and its Hessian (n, n)."""
+    n, m = len(state), len(problem.nominal_control)
+    hessian, gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
     final = compiled.arguments(problem).final
-    module, at = compiled.costs_module(problem), (state.copy(), control.copy(), problem.steps)
-    return module.cost_quadratic(*at, final, hessian, gradient), gradient[:n]
+    at = state.copy(), np.zeros(m), problem.steps
+    value = compiled.costs_module(problem).cost_quadratic(*at, final, hessian, gradient)
+    return value, gradient[:n], hessian[:n, :n]
+
+
+def missing(problem: Problem, state: Array, places: list[int]) -> Array:
+    """By how much these states of a final state (n,) are short of the goal, (n,); zero for all others."""
+    found, (_, slope, curvature) = np.zeros(len(state)), _final_cost(problem, state)
+    found[places] = -np.linalg.lstsq(curvature[np.ix_(places, places)], slope[places])[0]
+    for i, number in goals_of(problem.constraints, problem.dynamics).items():
+        found[i] = number - state[i] if i in places else 0.0
+    return found
+
+
+def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, places: list[int]) -> bool:
+    """Whether these states end nearer to their goal in a plan than in another, by a good part of the way."""
+    if not np.isfinite(plan.states[-1]).all():
+        return False
+    ways = [missing(problem, one.states[-1], places) for one in (plan, other)]
+    return bool(np.linalg.norm(ways[0]) < (1 - NEARER) * np.linalg.norm(ways[1]))
+
+
+def approaches(problem: Problem, found: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
+    """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
+    body to its goal, in words. Their solutions are starts in which the robot touches the body.
+
+    The goals of the body itself are left out of the constraints, as it does not move there.
+    """
+    for words, dynamics, about in problem.dynamics.approaches(found.states, missing(problem, found.states[-1], places)):
+        drawn = ~np.isnan(about)
+        ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
+        ways = np.maximum(ways, LEAST_WAY * ways.max())
+        weights = np.where(drawn[0], FOLLOWED * abs(found.cost) / (problem.steps * ways**2), 0.0)
+        stage = problem.stage_cost + QuadraticCost(
+            drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
+        )
+        kept = [one for one in problem.constraints if not one.final_states(problem.dynamics)]
+        yield words, replace(problem, dynamics=dynamics, constraints=kept).with_costs(stage_cost=stage)
 
 
 def moved_otherwise(problem: Problem, states: Array, places: list[int]) -> bool:

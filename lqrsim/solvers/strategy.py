@@ -25,6 +25,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
@@ -72,7 +73,9 @@ ROUNDS, AGAIN, FELL, NEAR = 5, 2, 1e-3, 0.1
 # sizes; and the relative decrease of cost that such a step must lead to.
 SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 
-PUSHES = 2  # plans of pushes from which a descent begins
+PUSHES = 2  # plans of pushes and approaches from which a descent begins
+SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
+APPROACH = 15  # iterations along an approach; without contacts most converge in three
 REFINEMENTS = 4  # of constraints along a plan; an arm's force limits need one or two
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
@@ -226,6 +229,13 @@ class Search:
         self.tried = not self._settings.safeguard
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._looked: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
+        # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
+        # nearer, with the name of its start; the approaches that were tried; and the name and the cost of the cheapest
+        # start that brings them nearer.
+        self._still: tuple[RunResult, list[int]] | None = None
+        self._moved: tuple[str, RunResult] | None = None
+        self._approached: list[str] = []
+        self._nearer: tuple[str, float] | None = None
         self._softer: list[Candidate] = []  # plans for softer contacts
         self._soft: list[tuple[str, Problem]] = []  # the problem with contacts of each softness, the widest first
 
@@ -457,21 +467,62 @@ class Search:
         return self._default and self.may_go_on and bool(self._unmoved())
 
     def move(self) -> None:
-        """Begin with pushes by one control at a time."""
-        found, places = self.best[1], self._unmoved()
-        problem, plans = self._problem, list[tuple[float, str, Array]]()
+        """Begin with motions that change these states: pushes by one control at a time, and approaches to a body."""
+        problem, found, places = self._problem, self.best[1], self._unmoved()
+        self._still = found, places
+        plans = list[tuple[bool, float, str, InitialGuess]]()
+
+        def consider(name: str, begin: InitialGuess, plan: Motion) -> bool:
+            """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
+            cost = float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0])
+            if not (np.isfinite(cost) and reach.differ(plan, found, places)):
+                return False
+            nearer = self._moves(plan)
+            plans.append((not nearer, cost, name, begin))
+            return nearer and cost < SAVES * found.cost
+
         for name, controls, plan in pushes(problem):
-            if reach.differ(plan, found, places):
-                plans.append(
-                    (float(compiled.costs_of(problem, plan.states[None], plan.controls[None])[0]), name, controls)
-                )
-        for _, name, controls in sorted(plans, key=lambda one: one[0])[:PUSHES]:
-            run = self._add(resolve(controls, problem), name)
-            self._offer(
-                run,
-                other := self._finish(run, refine),
-                better=found.violation >= other.violation and other.cost < self.best[1].cost,
-            )
+            consider(name, resolve(controls, problem), plan)
+        for name, through in reach.approaches(problem, found, places):
+            if self._budget.stop.due:
+                break
+            drawn = self._solve_through(through)
+            self._approached.append(name)
+            plan = Motion(*compiled.rollout(problem, *drawn.law, found.states[0].copy()))
+            if consider(name, policy_of(drawn, name), plan):
+                break
+        plans.sort(key=lambda one: one[:2])
+        self._nearer = next(((name, cost) for away, cost, name, _ in plans if not away), None)
+        for _, _, name, begin in plans[:PUSHES]:
+            run = self._add(begin, name)
+            with problem.dynamics.solving(self._threads):
+                begun, other = run.given(), self._finish(run, refine)
+            if run.is_worse(other, begun):  # a plan that no step can begin from is left by smoothing
+                status = Status.TIME_LIMIT if self._budget.stop.due else Status.STALLED
+                other = replace(begun, status=status, detail="no step lowers the cost of this plan")
+            self._offer(run, other, better=found.violation >= other.violation and other.cost < self.best[1].cost)
+            if self._moves(other) and (self._moved is None or other.cost < self._moved[1].cost):
+                self._moved = name, other
+
+    def _solve_through(self, through: Problem) -> RunResult:
+        """Plan along an approach through the body."""
+        run = self._another(resolve(None, through), through)
+        with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
+            return refine(run, Known()).kept()
+
+    def _moves(self, plan: RunResult | Motion) -> bool:
+        """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
+        return self._still is not None and reach.comes_nearer(self._problem, plan, *self._still)
+
+    def _is_better(self, found: RunResult) -> bool:
+        """Whether a plan is better than the best.
+
+        Where only one of them moves a body that was out of reach, the cost decides. To leave it alone converges easily.
+        """
+        best = self.best[1]
+        if self._moves(found) == self._moves(best):
+            return found.rank < best.rank
+        return found.violation <= best.violation and found.cost < best.cost
 
     def _unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
@@ -534,16 +585,22 @@ class Search:
         Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
         earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
         softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
-        are good, and a third of the plans goes on at each.
+        are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
+        less: for the softest contacts, it would leave the body alone again.
         """
-        problem = self._problem
+        problem, moved = self._problem, self._moved
+        begin = self.best[1] if moved is None else moved[1]
         self._soft = [
             (name, dataclasses.replace(problem, dynamics=dynamics))
-            for name, dynamics in problem.dynamics.softened(self.best[1].states)
+            for name, dynamics in problem.dynamics.softened(begin.states)
         ]
         if not self._soft:
             return
         (name, widest), *harder = self._soft
+        if moved is not None:
+            self._stiffen({f", {moved[0]}": begin}, harder, [], self._budget.left)
+            if self.best[1].success or self._budget.stop.due:
+                return
         found = {"": self._keep_softer(name, *self._search_softly(widest))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
             if not self._budget.stop.due:
@@ -610,7 +667,7 @@ class Search:
         stages = ", ".join([*before, *(name for name, _ in soft)])
         detail = f"begun with contacts of softness {stages}{origin}; {ended.detail}".removesuffix("; ")
         ended = replace(ended, detail=detail)
-        self._offer(run, ended, better=ended.rank < self.best[1].rank)
+        self._offer(run, ended, better=self._is_better(ended))
         return ended
 
     def _solve_softly(self, name: str, soft: Problem, begin: InitialGuess, most: int) -> RunResult:
@@ -665,7 +722,7 @@ class Search:
         elif self._cut_short and np.isfinite(found.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             found = replace(found, status=Status.TIME_LIMIT, detail=f"{found.detail}; {untried}".removeprefix("; "))
-        elif not stop.due:
+        elif not stop.due or (self._still is not None and not self._moves(found)):
             found = self._told_of_unmoved(found)
         detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
@@ -680,15 +737,31 @@ class Search:
         problem, places = self._problem, self._unmoved()
         if not places:
             return found
-        detail = "; ".join(part for part in (reach.described(problem, found.states, places), found.detail) if part)
+        parts = reach.described(problem, found.states, places), self._of_approaches(found), found.detail
         otherwise = reach.moved_otherwise(problem, found.states, places)
         status = Status.STALLED if found.success and otherwise else found.status
         names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
-        if otherwise:
+        if self._nearer is not None:
+            remedy = f"raise the weight of {names} until moving it costs less than leaving it"
+        elif otherwise:
             what = "with which the robot touches that body" if problem.dynamics.discrete else f"that change {names}"
             remedy = f"begin with start=[...], controls {what}"
-        return replace(found, status=status, detail=detail, remedy=remedy)
+        if self._budget.stop.due:
+            status, remedy = Status.TIME_LIMIT, ""
+        return replace(found, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
+
+    def _of_approaches(self, found: RunResult) -> str:
+        """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
+        if self._nearer is not None:
+            name, cost = self._nearer
+            return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {found.cost:.3g}"
+        if self._approached:
+            tried = ", ".join(dict.fromkeys(self._approached))
+            return f"nothing that was tried brings it nearer to its goal: {tried}"
+        untouched = any(self._problem.dynamics.untouched_body(found.states, i) for i in self._unmoved())
+        known = "nothing that is driven can collide with it, or it is to turn on the spot"
+        return f"no approach is known: {known}" if self._still is not None and untouched else ""
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
@@ -728,8 +801,10 @@ class Search:
 
     @property
     def may_soften(self) -> bool:
-        """Whether no plan has converged, and softer contacts may be tried."""
-        return self._default and self.may_go_on and not self.best[1].success
+        """Whether softer contacts may lead to a better plan: none has converged, or the best leaves a body alone."""
+        best = self.best[1]
+        alone = self._moved is not None and not self._moves(best)
+        return self._default and self.may_go_on and (alone or not best.success)
 
     @property
     def is_guided(self) -> bool:
@@ -838,7 +913,12 @@ ATTEMPTS = (
     *FIRST,
     Attempt("paths to the left and to the right", lambda search: search.touches, Search.look_aside),
     Attempt("a plan beside a saddle", lambda search: search.is_at_saddle, Search.leave_saddles),
-    Attempt("pushes by one control at a time", lambda search: search.misses_unmoved, Search.move),
+    Attempt(
+        "pushes by one control at a time, and approaches to a body that nothing touches",
+        lambda search: search.misses_unmoved,
+        Search.move,
+        others=True,
+    ),
     Attempt("a plan without risk", lambda search: search.risked_too_much, Search.retry_without_risk),
     Attempt("plans for softer contacts", lambda search: search.may_soften, Search.soften, others=True),
     Attempt("the plan that the caller gave", lambda search: search.has_left_given, Search.keep, others=True),

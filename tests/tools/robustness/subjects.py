@@ -31,6 +31,7 @@ HOOKS |= {
     "softened",
     "touches",
     "untouched_body",
+    "approaches",
     "contact_modes",
     "check_period",
     "ControllerRun.control",
