@@ -30,9 +30,9 @@ from lqrsim.scenes.scene import scene_from_xml
 
 OWN = {"arm of six hinges": ARM, "reacher": REACHER, "two links": TWO_LINKS}
 SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges come after it
-NEARER = 0.8  # factor by which a goal is brought nearer
+NEARER, NEARINGS = 0.8, 8  # factor by which a goal is brought nearer, and how often
+DRAWS = 100  # of a goal, until a ramp to it is possible
 REACHED = 0.05  # of the range of a joint, or of a turn or of 1 m where it has none
-NOWHERE = 1e-3  # rad or m, a goal that is as good as the start
 LEFT = 0.05  # fraction of its range that a goal keeps from a joint's limits
 
 
@@ -116,19 +116,21 @@ def widths(model: mujoco.MjModel) -> Array:
 def drawn(config: Config, robot: ls.MjcfRobot, start: Array, dt: float, seed: int) -> Array:
     """A goal that a smooth ramp reaches within the limits."""
     model, rng = robot.scene.model, np.random.default_rng([config.seed, seed])
-    away = np.zeros(len(start))
-    for joint in driven(model):
-        dof, limited = model.jnt_dofadr[joint], model.jnt_limited[joint]
-        low, high = model.jnt_range[joint] if limited else (-np.pi / 2, np.pi / 2)
-        there = start[dof] + config.share * rng.uniform(-1, 1) * (high - low)
-        if limited:
-            there = np.clip(there, low + LEFT * (high - low), high - LEFT * (high - low))
-        away[dof] = there - start[dof]
-    while not ramp_is_possible(robot, start, start + away, config.steps, dt):
-        away *= NEARER
-        if np.abs(away).max() < NOWHERE:
-            raise ls.errors.InputError(f"{robot.name}: got no ramp from the start that is within the limits")
-    return robot.with_closed_loops(start + away)
+    for _ in range(DRAWS):
+        away = np.zeros(len(start))
+        for joint in driven(model):
+            dof, limited = model.jnt_dofadr[joint], model.jnt_limited[joint]
+            low, high = model.jnt_range[joint] if limited else (-np.pi / 2, np.pi / 2)
+            there = start[dof] + config.share * rng.uniform(-1, 1) * (high - low)
+            if limited:
+                there = np.clip(there, low + LEFT * (high - low), high - LEFT * (high - low))
+            away[dof] = there - start[dof]
+        for _ in range(NEARINGS):
+            goal = robot.with_closed_loops(start + away)
+            if ramp_is_possible(robot, start, goal, config.steps, dt):
+                return goal
+            away *= NEARER
+    raise ls.errors.InputError(f"{robot.name}: got no ramp from the start that is within the limits")
 
 
 def driving(model: mujoco.MjModel) -> list[int]:

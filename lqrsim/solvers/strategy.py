@@ -156,13 +156,21 @@ def outlined(
         )  # fmt: skip
     if settings.start is not None:
         return problem, rough, ()
-    least = replace(rough, max_iterations=min(OUTLINED, settings.max_iterations), starts=1)
     free = problem.with_constraints([one for one in problem.constraints if not one._refines])
-    outline = solve(free, least, attentive=attentive, threads=threads, callback=callback, stop=stop)
-    if np.isfinite(outline.cost):
-        problem = problem._refined(outline.trajectory) or problem
+    with stop.not_counting():  # compiling
+        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop, attentive=attentive)
+        start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+        check_functions(free, start, guess.offset[0].copy())
+        run = SolveRun.lent(free, rough, guess, start, budget)
+    budget.report_to(callback)
+    with problem.dynamics.solving(threads), stop.reporting("smooth", attentive):
+        run.smooth(OUTLINED)
+    if np.isfinite(run.work.cost):
+        outline = Trajectory(*copied(run.work.best), problem.dt)
+        problem = problem._refined(outline) or problem
         rough = replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough
-    return problem, rough, outline.iterations
+    run.give_back()
+    return problem, rough, tuple(budget.log)
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
