@@ -7,7 +7,7 @@ kernel, and write `bind`.
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -117,6 +117,8 @@ class ConstraintTerm(Term):
 class Constraint(ProblemPart[ConstraintTerm]):
     """A constraint."""
 
+    _refines: ClassVar[bool] = False  # whether `_refined` may return another
+
     def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
         """The final values that it requires of states, by their indices.
 
@@ -140,7 +142,7 @@ class Constraint(ProblemPart[ConstraintTerm]):
         return {}
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "Constraint | None":
-        """The constraint as it is to be along a plan, with as many rows, if the plan misses it within its periods.
+        """The constraint as it is to be along a plan, if the plan misses it within its periods.
 
         `smooth` solves again with what this returns, a few times, until it is None.
         """

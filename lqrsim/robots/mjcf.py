@@ -434,7 +434,7 @@ class MjcfRobot(Robot):
             free = forces.removed_from(dynamics)
             if _is_stable(free, start, first.controls, period):
                 dynamics = free
-                kept.append(forces.with_ends(dynamics, start, first.controls, period))
+                kept.append(forces.within(dynamics, start, first.controls, period))
         if len(self.scene.world):
             cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms, sharpness=_SHARPNESS, weight=_SHYNESS)
         return Problem(

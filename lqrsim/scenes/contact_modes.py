@@ -7,6 +7,7 @@ period is in general discontinuous. If a force changes sign, it has a kink.
 """
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -84,7 +85,12 @@ class ContactModes:
     Args:
       model: model of the physics. actuators: ids of the controlled actuators. substeps: physics steps of a control
         period.
+
+    Attributes:
+      look: called before each part of a long computation, which its exception ends.
     """
+
+    look: Callable[[], None] = staticmethod(lambda: None)
 
     def __init__(self, model: mujoco.MjModel, actuators: tuple[int, ...], substeps: int) -> None:
         self._model, self._actuators, self._substeps = model, list(actuators), substeps

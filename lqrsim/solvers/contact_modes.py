@@ -47,6 +47,10 @@ SMALL = 1e-3  # change of a control in neighbouring plans, as a fraction of its 
 SAMPLES, RAY = 50, 8  # number of sampled neighbouring plans; number of doublings of a ray across a switch
 
 
+class OutOfTime(Exception):
+    """No time is left for a descent and its certificate."""
+
+
 @dataclass(frozen=True, eq=False)
 class CostedPlan:
     """A plan and its cost: states (T+1, n) and controls (T, m)."""
@@ -68,6 +72,7 @@ class ModeModel:
     """
 
     def __init__(self, problem: Problem, modes: ContactModes, plan: CostedPlan) -> None:
+        self.look = modes.look
         states, controls, steps = plan.states, plan.controls, problem.steps
         n, m, size = states.shape[1], controls.shape[1], problem.steps * controls.shape[1]
         self.periods = [linearized(problem, modes, x, u) for x, u in zip(states[:-1], controls, strict=True)]
@@ -139,6 +144,7 @@ def minimize(model: ModeModel, curvature: Array, *, across: int | None = None, d
     Args:
       across: a switch that must be crossed by `depth` instead; the change is then as small as possible.
     """
+    model.look()
     try:
         factor = scipy.linalg.cholesky(curvature, lower=True)
     except np.linalg.LinAlgError:
@@ -375,6 +381,7 @@ class Descent:
 
 def linearized(problem: Problem, modes: ContactModes, state: Array, control: Array) -> Period:
     """A period. If no switch is near, the compiled derivatives are used, which are as good and faster."""
+    modes.look()
     end, switches = modes.step(state, control)
     if len(switches.names):
         return modes.linearize(state, control)
@@ -421,9 +428,31 @@ def keep_modes(run: SolveRun, found: RunResult) -> RunResult | None:
     pairs = zip(plan.states[:-1], plan.controls, strict=True)
     if not np.isfinite(plan.cost) or not any(len(modes.step(x, u)[1].names) for x, u in pairs):
         return None
-    descent = Descent(problem, modes, plan, run.final, run.budget)
-    status = descent.run()
-    plan, gain = descent.plan, descent.model.gain
+
+    def look() -> None:
+        if run.budget.stop.due:
+            raise OutOfTime
+
+    modes.look = look
+    descent = None
+    try:
+        descent = Descent(problem, modes, plan, run.final, run.budget)
+        return with_certificate(run, modes, descent, descent.run())
+    except OutOfTime:
+        if descent is None or descent.plan is plan:
+            return None
+        plan = descent.plan
+        found = RunResult(
+            status=Status.TIME_LIMIT, detail="no time was left for a certificate within its contact modes",
+            states=plan.states, controls=plan.controls, cost=plan.cost, violation=0.0, gap=np.nan,
+            law=compiled.law_about(plan.states, plan.controls, descent.model.gain),
+        )  # fmt: skip
+        return run.certified(found)
+
+
+def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, status: Status) -> RunResult:
+    """The result of a descent that ended with this status, and its certificate."""
+    problem, plan, gain = run.problem, descent.plan, descent.model.gain
     law = compiled.law_about(plan.states, plan.controls, gain)
     pulls, limits = descent.pulls()
     optimality, value = optimality_in_mode(problem, modes, plan, gain, pulls, limits)

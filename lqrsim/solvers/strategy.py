@@ -30,7 +30,7 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Curvature, Iteration, Status, Trajectory
 from lqrsim.solvers import compiled, reach
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
@@ -76,7 +76,10 @@ SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 PUSHES = 2  # plans of pushes and approaches from which a descent begins
 SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
 APPROACH = 15  # iterations along an approach; without contacts most converge in three
-REFINEMENTS = 4  # of constraints along a plan; an arm's force limits need one or two
+# Refinements of constraints along a plan, of which force limits of arms need two or three: along an outline, which takes
+# this number of iterations without them; then along a plan of this tolerance, also in the constraints' units; and then
+# along plans that have converged.
+REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-2
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
 
@@ -107,6 +110,9 @@ def solve(
     if stop is None:
         stop = Stop()
         stop.begin(settings.time_limit)
+    before, asked = tuple[Iteration, ...](), settings
+    if refinements == REFINEMENTS and any(one._refines for one in problem.constraints):
+        problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)
     with stop.not_counting():  # compiling
         given = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
@@ -125,14 +131,49 @@ def solve(
     for run in runs:
         run.give_back()
     refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
-    if refined is not None:
-        again = replace(settings, start=solution, starts=None)
-        before, solution = solution.iterations, solve(
-            refined, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
+    if before:
+        solution = replace(solution, iterations=(*before, *solution.iterations))
+    if refined is not None or (settings is not asked and solution.success and not stop.due):
+        before, again = solution.iterations, replace(asked, start=solution, starts=None)
+        solution = solve(
+            refined or problem, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
             refinements=refinements - 1,
         )  # fmt: skip
         solution = replace(solution, iterations=(*before, *solution.iterations))
     return stop.finish(solution)
+
+
+def outlined(
+    problem: Problem, settings: SmootherSettings, attentive: bool, threads: int, callback: Callback | None, stop: Stop
+) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
+    """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
+
+    With a start, the constraints are refined along the plan that follows from it. Without, the outline is a few
+    iterations without these constraints, and the start of what follows.
+    """
+    rough = settings
+    if settings.second_order(problem):
+        tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
+        rough = replace(
+            settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=max(missed, PRELIMINARY)
+        )  # fmt: skip
+    if settings.start is not None:
+        return problem, rough, ()
+    free = problem.with_constraints([one for one in problem.constraints if not one._refines])
+    with stop.not_counting():  # compiling
+        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop, attentive=attentive)
+        start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+        check_functions(free, start, guess.offset[0].copy())
+        run = SolveRun.lent(free, rough, guess, start, budget)
+    budget.report_to(callback)
+    with problem.dynamics.solving(threads), stop.reporting("smooth", attentive):
+        run.smooth(OUTLINED)
+    if np.isfinite(run.work.cost):
+        outline = Trajectory(*copied(run.work.best), problem.dt)
+        problem = problem._refined(outline) or problem
+        rough = replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough
+    run.give_back()
+    return problem, rough, tuple(budget.log)
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
