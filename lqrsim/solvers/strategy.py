@@ -76,7 +76,7 @@ SADDLES, AWAY, FELL_FROM = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 PUSHES = 2  # plans of pushes and approaches from which a descent begins
 SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
 APPROACH = 15  # iterations along an approach; without contacts most converge in three
-# Refinements of constraints along a plan, of which force limits of arms need two or three: along an outline, which takes
+# Refinements of constraints along a plan, of which arms' force limits need two or three: along an outline, which takes
 # this number of iterations without them; then along a plan of this tolerance, also in the constraints' units; and then
 # along plans that have converged.
 REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-2
