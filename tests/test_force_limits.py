@@ -12,6 +12,7 @@ from scipy.optimize import LinearConstraint, minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.solvers.compiled import costs_of
 
 # Two links that a floor does not stop, with what is filled in as actuators.
 ARM = """
@@ -189,3 +190,28 @@ def test_constraints_with_a_linear_file_are_those_of_a_quadratic_program(
     assert best.success
     assert solution.cost == pytest.approx(best.fun, rel=2e-5)
     np.testing.assert_allclose(solution.trajectory.states[:, 1].clip(*bounds[1]), solution.trajectory.states[:, 1])
+
+
+def test_a_plan_with_dry_friction_ends_where_the_cost_no_longer_changes(tmp_path: Path) -> None:
+    """No gradient vanishes at a kink. Of plans beside it that clip nothing, none is cheaper by more than 2 %."""
+    arm = robot(tmp_path, SERVOS.format(kp=900, kv=40, most=40, other=15), joint='frictionloss="0.3"')
+    problem = arm.problem(arm.at(a=np.pi / 2), arm.at(a=np.pi / 2 + 0.5, b=0.5), steps=25, dt=0.02)
+    solution = ls.smooth(problem, time_limit=120.0)
+    assert solution.status is ls.Status.COST_CONVERGED, solution.detail
+    assert "derivatives of the dynamics jump" in solution.detail
+    draws, policy, kept = np.random.default_rng(0), solution.policy, []
+    for size in [0.0, *np.geomspace(1e-7, 1e-3, 60)]:
+        xs, us = [solution.trajectory.states[0]], []
+        offsets = policy.offset + size * np.cumsum(draws.normal(size=policy.offset.shape), axis=0)
+        for gain, offset in zip(policy.gain, offsets, strict=True):
+            us.append(np.clip(gain @ xs[-1] + offset, *problem.control_limits))
+            xs.append(arm.dynamics.step(xs[-1], us[-1], problem.dt))
+        plan = ls.Trajectory(np.array(xs), np.array(us), problem.dt)
+        states, forces = replayed(arm, plan)
+        np.testing.assert_allclose(states, plan.states, rtol=0, atol=1e-8)
+        if (np.abs(forces[:, :2]).max(axis=0) <= [40, 15]).all():
+            kept.append(plan)
+    costs = costs_of(problem, np.array([one.states for one in kept]), np.array([one.controls for one in kept]))
+    assert costs[0] == pytest.approx(solution.cost, rel=1e-9)
+    assert len(costs) > 20
+    assert costs.min() > (1 - 0.02) * solution.cost

@@ -80,6 +80,10 @@ SETTLED = 1e-3  # fraction of the tolerances at which these end
 FINER, FINEST = 1e-2, 1e-13  # factor by which the target falls if these fail, and its least value
 CREEP, CREEPING = 0.1, 20  # fraction of a step that is short; number of short steps in a row that end the run
 CRAWL = 0.5  # factor by which stationarity falls too little, so that the Hessians need what is learned of them
+# Where derivatives of the dynamics jump, as by dry friction, no plan is stationary. The stationarity above which that
+# may be; the change of cost, relative to the cost, that is none; the number of such iterations after which the barrier
+# falls nevertheless; and after which the run ends, if the barrier costs no more than that change.
+STEEP, FLAT, FALLS, ENDS = 1e-3, 1e-3, 2, 6
 SLOW = 0.01  # unless the constraints are satisfied and the cost falls by this fraction during them
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # fraction of a step that softens equalities; factor, limit
 ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that is implausible
@@ -149,6 +153,7 @@ def begin(begun, stages, work, mem):
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    mem.unchanged, mem.level = 0.0, inf
     for at in range(rows.size * (steps + 1)):
         now.slacks.slack[at], now.slacks.excess[at], rows.force[at] = 0.0, 0.0, 0.0
         if rows.live[at] != 0:
@@ -255,7 +260,7 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         row.gap, row.complementarity = mem.gap, mem.complementarity
         done += 1
         mem.since += 1
-        ended = creeping(violation, mem)
+        ended = creeping(violation, mem) or (stages.learns == 1 and settled(violation, mem))
 
 
 def creeping(violation, mem):
@@ -266,6 +271,16 @@ def creeping(violation, mem):
     else:
         mem.short += 1
     return mem.short >= CREEPING
+
+
+def settled(violation, mem):
+    """Whether the cost no longer changes at the least barrier, though the plan is not stationary."""
+    kept = mem.violation <= violation and mem.stationarity > STEEP
+    if kept and abs(mem.cost - mem.level) <= FLAT * abs(mem.level):
+        mem.unchanged += 1
+    else:
+        mem.unchanged, mem.level = 0.0, mem.cost
+    return mem.unchanged >= ENDS and mem.pairs * mem.parameter <= FLAT * mem.scale
 
 
 def within(tolerance, violation, mem):
@@ -286,6 +301,8 @@ def iterate(done, tolerance, stages, work, mem):
     least, free = LEAST * mem.target * mem.scale, falls_lately(work, mem)
     if stages.learns == 1:
         least = HALF * tolerance * mem.scale / max(mem.pairs, 1.0)
+        if mem.unchanged >= FALLS and mem.parameter > least:
+            mem.parameter, mem.filtered, mem.unchanged = max(least, LOWER * LOWER * mem.parameter), 0.0, 0.0
     lower_barrier(done, least, free, stages, work, mem)
     part = -1.0
     while True:

@@ -795,12 +795,13 @@ MEMORY = _row(
 # farthest_gap: largest violations. violated, merit, slope: of the iterate, for the line search. tried: the cost of its
 # trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier falls. since:
 # number of iterations since the last attempt to cross over. short: number of short steps in a row. before: cost at the
-# first of these. kept, kept_scale: cost and scale of the point to go back to.
+# first of these. unchanged, level: number of iterations in a row in which the constraints were kept and the cost was
+# that of the first, `level`. kept, kept_scale: cost and scale of the point to go back to.
 INTERIOR = _row(
     "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
     "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed",
     "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before",
-    "kept", "kept_scale",
+    "unchanged", "level", "kept", "kept_scale",
 )  # fmt: skip
 
 # The state of an active set between calls. cost, stationarity, violation, gap, complementarity, scale, typical: as

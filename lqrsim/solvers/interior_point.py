@@ -11,7 +11,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ITERATE, SETTLE
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, SETTLE
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
@@ -51,7 +51,8 @@ class Found:
     Attributes:
       plan: states and controls, feasible except for gaps. gain: (T, m, n) about it. measures: its measures.
       multipliers: multipliers of each constraint (T+1, rows), and of the limits (T, m), positive if a control presses
-        against its upper limit. solved: whether all measures are within tolerance.
+        against its upper limit. solved: whether all measures are within tolerance. flat: whether it ended because the
+        cost no longer changed, without being stationary.
       sizes: typical sizes. scale: the cost to which measures are relative.
     """
 
@@ -61,6 +62,7 @@ class Found:
     multipliers: tuple[Array, ...]
     pressing: Array
     solved: bool
+    flat: bool
     sizes: Sizes
     scale: float
 
@@ -177,6 +179,6 @@ class InteriorPoint:
             pressing[:, i] -= sign * stages.force[:-1, row]
         return Found(
             plan=Motion(*map(np.copy, self.plan)), gain=stages.about.policy.gain, measures=self.measures,
-            multipliers=known, pressing=pressing, solved=solved, sizes=self.sizes,
-            scale=float(self._memory["scale"][0]),
+            multipliers=known, pressing=pressing, solved=solved,
+            flat=bool(self._memory["unchanged"][0] >= ENDS), sizes=self.sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip

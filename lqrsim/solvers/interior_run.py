@@ -12,6 +12,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AT_LIMIT, FIRMNESS
+from lqrsim.kernels.interior_point import ENDS, FLAT
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
@@ -24,6 +25,14 @@ from lqrsim.solvers.settings import has_curvature
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan
 FAINT = 1e-9  # factor by which penalties are smaller where a plan ends inside: its certificate is that of multipliers
+# What is said where the cost no longer changes, and the gradient does not vanish.
+KINKED = (
+    "the derivatives of the dynamics jump along the plan, as by dry friction or at a joint's limit, where no gradient"
+    f" vanishes; the cost has not changed by {FLAT:g} of itself in {ENDS} iterations, but plans beside it may cost less"
+)
+# Distance from the plan at which derivatives are compared, relative to sizes of states and controls; and the difference
+# that is a jump, relative to the largest derivative: along arms without dry friction it is 1e-5 to 1e-4.
+BESIDE, JUMP = 1e-4, 3e-3
 UPDATES = 5  # largest number of updates of the multipliers, if Newton's last steps violate constraints
 
 
@@ -94,7 +103,22 @@ class InteriorRun:
             return None
         if found.solved and (result := self._polished(found)) is not None and result.success:
             return result
-        return self._rolled_out(found.plan, found.gain)
+        result = self._rolled_out(found.plan, found.gain)
+        if found.flat and result.violation <= self.allowed and self._jumps(found):
+            found.measures._replace(cost=result.cost, gap=0.0, violation=result.violation).record(Laps(self._budget))
+            return replace(result, status=Status.COST_CONVERGED, detail=KINKED)
+        return result
+
+    def _jumps(self, found: Found) -> bool:
+        """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
+        dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
+        for x, u in zip(found.plan.states[:-1], found.plan.controls, strict=True):
+            beside = [one + BESIDE * size * draws.choice([-1.0, 1.0], len(one))
+                      for one, size in ((x, found.sizes.states), (u, found.sizes.controls))]  # fmt: skip
+            here, there = (np.hstack(dynamics.linearize(*at, dt)[:2]) for at in ((x, u), beside))
+            if np.abs(there - here).max() > JUMP * np.abs(here).max():
+                return True
+        return False
 
     def start(self) -> RunResult:
         """The rollout of the initial policy."""

@@ -79,7 +79,7 @@ APPROACH = 15  # iterations along an approach; without contacts most converge in
 # Refinements of constraints along a plan, of which arms' force limits need two or three: along an outline, which takes
 # this number of iterations without them; then along a plan of this tolerance, also in the constraints' units; and then
 # along plans that have converged.
-REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-2
+REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-3
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
 
@@ -133,7 +133,7 @@ def solve(
     refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
     if before:
         solution = replace(solution, iterations=(*before, *solution.iterations))
-    if refined is not None or (settings is not asked and solution.success and not stop.due):
+    if refined is not None or (settings is not asked and solution.status is Status.CONVERGED and not stop.due):
         before, again = solution.iterations, replace(asked, start=solution, starts=None)
         solution = solve(
             refined or problem, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
@@ -149,7 +149,7 @@ def outlined(
     """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
 
     With a start, the constraints are refined along the plan that follows from it. Without, the outline is a few
-    iterations without these constraints, and the start of what follows.
+    iterations without these constraints, and the start of what follows if it does not keep them.
     """
     rough = settings
     if settings.second_order(problem):
@@ -168,12 +168,12 @@ def outlined(
     budget.report_to(callback)
     with problem.dynamics.solving(threads), stop.reporting("smooth", attentive):
         run.smooth(OUTLINED)
-    if np.isfinite(run.work.cost):
-        outline = Trajectory(*copied(run.work.best), problem.dt)
-        problem = problem._refined(outline) or problem
-        rough = replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough
+    outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
     run.give_back()
-    return problem, rough, tuple(budget.log)
+    refined = problem._refined(outline) if np.isfinite(outline.states).all() else None
+    if refined is None:
+        return problem, settings, log
+    return refined, replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough, log
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
