@@ -121,7 +121,7 @@ def test_a_foot_kicks_a_ball(mass: float) -> None:
 
 
 @pytest.mark.usefixtures("no_further")
-@pytest.mark.parametrize("place", ["0 0", *rarely("-0.08 0", "0 0.06", "0.05 -0.05")])
+@pytest.mark.parametrize("place", rarely("0 0", "-0.08 0", "0 0.06", "0.05 -0.05"))
 @pytest.mark.parametrize("mass", [0.1, *rarely(0.05, 0.2)])
 def test_a_gripper_picks_up_a_cube(mass: float, place: str) -> None:
     robot = robot_of(GRIPPER, mass, place)
