@@ -7,7 +7,7 @@ kernel, and write `bind`.
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -117,7 +117,8 @@ class ConstraintTerm(Term):
 class Constraint(ProblemPart[ConstraintTerm]):
     """A constraint."""
 
-    _refines: ClassVar[bool] = False  # whether `_refined` may return another
+    # The largest violation, in its unit, of a plan along which it is refined; 0 if `_refined` returns no other.
+    _rough: float = 0.0
 
     def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
         """The final values that it requires of states, by their indices.

@@ -7,7 +7,6 @@ never clips, and both models are the same along it.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 
@@ -40,10 +39,10 @@ class ForceLimits(Constraint):
         at zero, and its slopes in state and control; None for the beginning of a period alone.
     """
 
-    _refines: ClassVar[bool] = True
-
     def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
         self.limits, self.later = tuple(limits), later
+        # Less than what is spared, so that forces of such a plan are within their limits.
+        self._rough = 0.5 * SPARED * min((one.high - one.low for one in self.limits), default=0.0)
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""

@@ -77,8 +77,7 @@ PUSHES = 2  # plans of pushes and approaches from which a descent begins
 SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
 APPROACH = 15  # iterations along an approach; without contacts most converge in three
 # Refinements of constraints along a plan, of which arms' force limits need two or three: along an outline, which takes
-# this number of iterations without them; then along a plan of this tolerance, also in the constraints' units; and then
-# along plans that have converged.
+# this number of iterations without them; then along a plan of this tolerance; and then along plans that have converged.
 REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-3
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 GIVEN = "the given start"  # name of the start that the caller gives
@@ -111,7 +110,7 @@ def solve(
         stop = Stop()
         stop.begin(settings.time_limit)
     before, asked = tuple[Iteration, ...](), settings
-    if refinements == REFINEMENTS and any(one._refines for one in problem.constraints):
+    if refinements == REFINEMENTS and any(one._rough for one in problem.constraints):
         problem, settings, before = outlined(problem, settings, attentive, threads, callback, stop)
     with stop.not_counting():  # compiling
         given = [(GIVEN, settings.start)] if settings.start is not None else guides(problem, settings.starts)
@@ -133,7 +132,8 @@ def solve(
     refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
     if before:
         solution = replace(solution, iterations=(*before, *solution.iterations))
-    if refined is not None or (settings is not asked and solution.status is Status.CONVERGED and not stop.due):
+    settled = solution.status is Status.COST_CONVERGED and solution.violation <= asked.violation_tolerance(problem)
+    if refined is not None or (settings is not asked and solution.success and not settled and not stop.due):
         before, again = solution.iterations, replace(asked, start=solution, starts=None)
         solution = solve(
             refined or problem, again, attentive=attentive, threads=threads, callback=callback, stop=stop,
@@ -154,12 +154,11 @@ def outlined(
     rough = settings
     if settings.second_order(problem):
         tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
-        rough = replace(
-            settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=max(missed, PRELIMINARY)
-        )  # fmt: skip
+        missed = max(missed, min(one._rough for one in problem.constraints))
+        rough = replace(settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=missed)
     if settings.start is not None:
         return problem, rough, ()
-    free = problem.with_constraints([one for one in problem.constraints if not one._refines])
+    free = problem.with_constraints([one for one in problem.constraints if not one._rough])
     with stop.not_counting():  # compiling
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop, attentive=attentive)
         start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
