@@ -4,7 +4,8 @@
     python experiments/mjcf_postures.py --models panda.xml iiwa14.xml  # any robots
     python experiments/mjcf_postures.py --quick
 
-A plan starts in the first keyframe of the file that has a name, else at rest. Each goal is drawn: every joint that an
+A plan starts in the first keyframe of the file that has a name, else at rest, with the joints that actuators drive off
+their limits: a finger that rests against a limit chatters there. Each goal is drawn: every joint that an
 actuator turns or shifts, within a share of its range about the start. It is then brought nearer to the start until a
 smooth ramp to it, in the time of the plan and with controls that are held for a period, needs only forces and controls
 within their limits, by MuJoCo's inverse dynamics, and touches nothing that the start does not touch. So a way to it is
@@ -30,6 +31,7 @@ from lqrsim.scenes.scene import scene_from_xml
 
 OWN = {"arm of six hinges": ARM, "reacher": REACHER, "two links": TWO_LINKS}
 SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # hinges come after it
+TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 NEARER, NEARINGS = 0.8, 8  # factor by which a goal is brought nearer, and how often
 DRAWS = 100  # of a goal, until a ramp to it is possible
 REACHED = 0.05  # of the range of a joint, or of a turn or of 1 m where it has none
@@ -95,7 +97,7 @@ def beginning(robot: ls.MjcfRobot) -> Array:
     names = [model.key(i).name for i in range(model.nkey)]
     state = next((robot.at(name) for name in names if name), robot.at())
     state[model.nv : 2 * model.nv] = 0.0
-    for joint in driven(model):
+    for joint in [*driven(model), *on_tendons(model)]:
         if model.jnt_limited[joint]:
             (low, high), dof = model.jnt_range[joint], model.jnt_dofadr[joint]
             state[dof] = np.clip(state[dof], low + LEFT * (high - low), high - LEFT * (high - low))
@@ -143,6 +145,13 @@ def driving(model: mujoco.MjModel) -> list[int]:
 def driven(model: mujoco.MjModel) -> list[int]:
     """The joints that these act on."""
     return sorted({int(model.actuator_trnid[i, 0]) for i in driving(model)})
+
+
+def on_tendons(model: mujoco.MjModel) -> list[int]:
+    """The joints that fixed tendons of actuators turn or shift, such as those of a gripper's fingers."""
+    tendons = [model.actuator_trnid[i, 0] for i in range(model.nu) if model.actuator_trntype[i] == TENDON]
+    wraps = [j for i in tendons for j in range(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])]
+    return sorted({int(model.wrap_objid[j]) for j in wraps if model.wrap_type[j] == mujoco.mjtWrap.mjWRAP_JOINT})
 
 
 def ramp_is_possible(robot: ls.MjcfRobot, start: Array, goal: Array, steps: int, dt: float) -> bool:

@@ -236,17 +236,38 @@ def test_the_unit_of_a_state_does_not_change_whether_its_goal_is_reached(data: s
         goal[weighed[0]] = start[weighed[0]] + 1.0
     names = tuple(f"s{i}" for i in range(size))
     factor = {unit: 10.0 ** data.draw(st.integers(-3, 3)) for unit in units if unit}
+    factor["m/s"] = factor.get("m", factor.get("m/s", 1.0))
     by = np.array([factor[unit] if unit else 10.0 ** data.draw(st.integers(-3, 3)) for unit in units])
     end = np.where(np.isnan(goal), end, goal)
     plan, run = np.stack([start, middle, end + 0.1 * off]), end + 0.03 * off
+    ends = [data.draw(st.sampled_from([np.inf, 0.04, 3.0])) for _ in range(size)]  # limits of a state, where it has any
     found = []
     for scale in (1.0, by):
-        space = ls.types.Coordinates(names=names, units=tuple(units))
+        low, high = (tuple((scale * np.array(side)).tolist()) for side in (np.negative(ends), ends))
+        space = ls.types.Coordinates(names=names, units=tuple(units), low=low, high=high)
         target = Target(space, scale * goal, scale * plan)
         radius = target.radius(None, None, None)
         assert not target.distance(scale * start) <= radius  # the start has not reached it
         found.append([radius, target.distance(scale * plan[-1]), target.distance(scale * run)])
     np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("left", [0.0, 1e-5])
+def test_a_held_finger_misses_its_goal_by_a_tenth_of_its_own_range(left: float) -> None:
+    """An arm turns, and its finger of 40 mm stays where it is but for rounding: also to 1e-5 m from its goal."""
+    space = ls.types.Coordinates(
+        names=("hinge", "finger", "hinge_velocity", "finger_velocity"), units=("rad", "m", "rad/s", "m/s"),
+        low=(-2.0, 0.0, -np.inf, -np.inf), high=(2.0, 0.04, np.inf, np.inf),
+    )  # fmt: skip
+    along = np.linspace(0.0, 1.0, 9)
+    plan = np.stack([along, 0.038 + 1e-5 * np.sin(9 * along), along * (1 - along), 1e-3 * np.sin(7 * along)], axis=1)
+    target = Target(space, np.array([1.0, 0.038 + left, 0.0, 0.0]), plan)
+    radius = target.radius(None, None, None)
+    for name, allowed in (("finger", 0.004), ("finger_velocity", 0.004), ("hinge", 0.1)):
+        end = target.state.copy()
+        for part, reached in ((0.99, True), (1.01, False)):
+            end[space.names.index(name)] = target.state[space.names.index(name)] + part * allowed
+            assert bool(target.distance(end) <= radius) == reached
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -136,18 +136,26 @@ class Target:
         """What the scaled error divides the difference of each state by, (n,).
 
         It is the state's way, from the start of the plan to the goal. A state whose way is within TOLERANCE of its
-        range along the plan, or ASIDE of the longest way in its unit, starts at its goal: it has its range, and at
-        least the longest way in its unit. If no state in that unit has a way, it has at least their largest range, and
-        1 rad. If all states start at their goals there is nothing to be relative to, and each has at least 1 unit.
+        range along the plan, or ASIDE of the longest way in its unit or of the distance between its own limits, starts
+        at its goal: it has its range, and at least the longest way in its unit. If no state in that unit has a way, it
+        has at least their largest range, and 1 rad, or the distance between its own limits, such as those of a
+        gripper's finger; and its rate as much in a second. If all states start at their goals there is nothing to be
+        relative to, and each has at least 1 unit.
         """
         counts, start, ranges = np.isfinite(self.state), self.plan[0], np.ptp(self.plan, axis=0)
         way = np.abs(self._off(start)) * (np.abs(self._off(start)) > NEGLIGIBLE)
         units = np.array(self.space.units)
         alike = (units[:, None] == units) & (units != "") & counts | np.eye(len(units), dtype=bool)
-        moves = counts & (way > np.maximum(TOLERANCE * ranges, ASIDE * (alike * way).max(axis=1)))
+        between = np.subtract(self.space.high, self.space.low)
+        between = np.where(np.isfinite(between), between, 0.0)
+        little = np.maximum(TOLERANCE * ranges, ASIDE * np.maximum(between, (alike * way).max(axis=1)))
+        moves = counts & (way > little)
         longest = (alike * np.where(moves, way, 0.0)).max(axis=1)
         least = np.where(longest > 0, longest, (alike * ranges).max(axis=1))
-        least = np.where((longest == 0) & (units == "rad"), np.maximum(least, 1.0), least)
+        held = np.where(longest == 0, np.where(units == "rad", 1.0, between), 0.0)
+        rates = units[:, None] == np.char.add(units, "/s")
+        rested = np.where((rates & (longest > 0)).any(axis=1) | (longest > 0), 0.0, (rates * held).max(axis=1))
+        least = np.maximum(least, np.maximum(held, rested))
         if (way <= STAYS * ranges).all():
             least = np.maximum(least, 1.0)
         scale = np.where(moves, way, np.maximum(ranges, least))

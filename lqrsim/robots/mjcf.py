@@ -142,8 +142,10 @@ class MjcfRobot(Robot):
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
         self._axes = position_of(mjcf, number)
         place, plane = self._position(position, names, who)
+        ends = {one.dof: one.limits for one in mjcf.joints if one.limits is not None}
+        low, high = zip(*(ends.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
         states = Coordinates(
-            names=names, units=units, position=place, plane=plane,
+            names=names, units=units, position=place, plane=plane, low=low, high=high,
             rotation_vectors=tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned),
             angles=tuple(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None),
         )  # fmt: skip
