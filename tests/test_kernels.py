@@ -431,7 +431,7 @@ class TestSolvers:
             ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState(x=1.4),
             ls.StateBounds(heading=(-0.2, np.inf), y=(-np.inf, 0.6)),
         ]  # fmt: skip
-        smoothed(problem(constraints=kept, steps=4), task="damped", penalty=30.0)
+        smoothed(problem(constraints=kept, steps=2), task="damped", penalty=30.0)
 
     # The same problems in each run: how much a problem amplifies what is rounded has no bound that holds for all of
     # them, and what is found here of a kernel is found with any numbers.
