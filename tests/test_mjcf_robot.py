@@ -558,6 +558,40 @@ def test_a_free_body_does_not_tumble_on_its_way() -> None:
     np.testing.assert_array_equal(calm.about, np.where(np.array(names) == "rov_rz", 0.5, 0.0))
 
 
+def over_floor(rng: np.random.Generator) -> str:
+    """An arm of three hinges, lengths drawn, that can strike the floor and itself."""
+    upper, fore, hand = rng.uniform(0.25, 0.45, 3)
+    return f"""<mujoco model="arm"><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
+      <default><joint axis="0 -1 0" damping="0.3" armature="0.02"/></default><worldbody>
+      <geom name="floor" type="plane" size="3 3 0.1"/><body name="upper" pos="0 0 0.3"><joint name="a"/>
+      <geom type="capsule" fromto="0.08 0 0 {upper} 0 0" size="0.04" mass="3"/><body name="fore" pos="{upper} 0 0">
+      <joint name="b"/><geom type="capsule" fromto="0.1 0 0 {fore} 0 0" size="0.035" mass="2"/>
+      <body name="hand" pos="{fore} 0 0"><joint name="c"/>
+      <geom type="capsule" fromto="0.1 0 0 {hand} 0 0" size="0.03" mass="1"/></body></body></body></worldbody>
+      <actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", [3, 8, 11, 13])
+def test_an_arm_that_swings_onto_the_floor_at_first_follows_a_line_of_states(seed: int) -> None:
+    """Smoothing fails from the controls that hold it: its first plan strikes the floor, or the arm itself."""
+    rng = np.random.default_rng(seed)
+    robot = ls.MjcfRobot(scene_from_xml(over_floor(rng), "arm"), obstacles=False)
+
+    def free() -> Array:
+        while True:
+            drawn = dict(zip("abc", rng.uniform([0.0, -2.2, -2.2], [np.pi, 2.2, 2.2]), strict=True))
+            if not robot.dynamics.touches(robot.at(**drawn)[None]):
+                return robot.at(**drawn)
+
+    start, goal = free(), free()
+    problem = robot.problem(start, goal, steps=50, dt=0.02)
+    solution = ls.smooth(problem, threads=1)
+    assert solution.status is ls.Status.CONVERGED
+    assert solution.cost < ls.ilqr(problem, max_iterations=100).cost  # which stays on the floor
+    assert [one.start for one in solution.candidates] == ["nominal control", "a line of states"]
+    assert not robot.dynamics.touches(solution.trajectory.states)
+
+
 @settings(max_examples=examples(8), deadline=None)
 @given(seed=SEEDS)
 def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:

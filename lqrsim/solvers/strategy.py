@@ -294,6 +294,8 @@ class Search:
     def run(self) -> None:
         """Choose a run and finish it; with constraints, also finish other runs, as long as they may cost less."""
         chosen, *others = choose([run for _, run in self._named], self._threads)
+        if self._may_follow_a_line:
+            chosen = self._smooth_or_follow_a_line(chosen)
         self._offer(chosen, self._finish(chosen))
         if not chosen.problem.constraints:
             return
@@ -304,6 +306,33 @@ class Search:
             if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
             self._offer(run, self._finish(run))
+
+    @property
+    def _may_follow_a_line(self) -> bool:
+        """Whether a line of states is another start: an arm, say, whose every joint has a motor.
+
+        Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
+        """
+        problem = self._problem
+        driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
+        known = problem.start is not None and problem.goal is not None
+        plain = not problem.constraints and self._default and not self._named[0][1].second_order
+        return driven and known and plain and self._settings.safeguard
+
+    def _smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
+        """Smooth; if this fails, which damped steps would follow, also from a line of states; the cheaper of both.
+
+        From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
+        """
+        run.budget.report_to(self._callback)
+        run.smooth(self._settings.max_iterations)
+        unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
+        if run.ending.success or run.ending.status in unfinished or self._budget.stop.due:
+            return run
+        line = self._add(resolve(line_of_states(self._problem), self._problem), "a line of states")
+        line.budget.report_to(self._callback)
+        line.smooth(self._settings.max_iterations)
+        return line if line.ending.success or line.work.cost < run.work.cost else run
 
     @property
     def is_lost(self) -> bool:
@@ -333,10 +362,7 @@ class Search:
                 return
         if np.isfinite(self.best[1].cost) or not exact:
             return
-        end = problem.start if problem.goal is None else np.where(np.isnan(problem.goal), problem.start, problem.goal)
-        states = np.linspace(problem.start, end, problem.steps + 1)
-        controls = np.broadcast_to(problem.nominal_controls, (problem.steps, len(problem.control_coordinates)))
-        run = self._add(resolve(Trajectory(states, controls.copy(), problem.dt), problem), "a line of states")
+        run = self._add(resolve(line_of_states(problem), problem), "a line of states")
         self._offer(run, self._finish(run, from_states))
 
     def try_reweighted(self) -> None:
@@ -982,6 +1008,14 @@ def left_domain(problem: Problem, found: RunResult) -> str:
     ]
     place = f"at {step * problem.dt:.2f} s (step {step} of {problem.steps}) {' and '.join(left)}"
     return "; ".join(part for part in (place, found.detail if "nan" not in found.detail else "") if part)
+
+
+def line_of_states(problem: Problem) -> Trajectory:
+    """The line of states from start to goal, with the nominal controls."""
+    assert problem.start is not None
+    end = problem.start if problem.goal is None else np.where(np.isnan(problem.goal), problem.start, problem.goal)
+    controls = np.broadcast_to(problem.nominal_controls, (problem.steps, len(problem.control_coordinates)))
+    return Trajectory(np.linspace(problem.start, end, problem.steps + 1), controls.copy(), problem.dt)
 
 
 def policy_of(found: RunResult, summary: str) -> InitialGuess:
