@@ -40,4 +40,37 @@ TWO_LINKS = """<mujoco model="two_links"><option timestep="0.01" integrator="imp
   </body></worldbody><actuator><motor name="shoulder" joint="shoulder" ctrlrange="-20 20"/>
   <motor name="elbow" joint="elbow" ctrlrange="-8 8"/></actuator></mujoco>"""
 
+# On a floor, each with something that it can push, kick or pick up, whose name is "body".
+_FLOOR = """<mujoco model="contacts"><compiler autolimits="true"/>
+  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/><worldbody>
+  <geom type="plane" size="3 3 0.1"/>"""
+DISC = f"""{_FLOOR}<body pos="-0.3 0 0.05"><joint name="x" type="slide" axis="1 0 0" damping="2"/>
+  <joint name="y" type="slide" axis="0 1 0" damping="2"/><geom name="disc" type="cylinder" size="0.05 0.03" mass="1"/>
+  </body><body name="body" pos="0 0 0.06"><freejoint name="body"/><geom type="box" size="0.06 0.06 0.06" mass="0.5"/>
+  </body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/></actuator>
+  </mujoco>"""
+FOREARM = f"""{_FLOOR}<body pos="0 0 0.05"><joint name="a" axis="0 0 1" damping="0.2"/><geom type="capsule"
+  fromto="0 0 0 0.3 0 0" size="0.025" mass="0.5"/><body pos="0.3 0 0"><joint name="b" axis="0 0 1" damping="0.2"
+  range="-150 150"/><geom name="forearm" type="capsule" fromto="0.03 0 0 0.3 0 0" size="0.025" mass="0.4"/></body>
+  </body><body name="body" pos="0.35 0.2 0.03"><joint name="body_x" type="slide" axis="1 0 0" damping="1"/>
+  <joint name="body_y" type="slide" axis="0 1 0" damping="1"/><geom type="cylinder" size="0.04 0.03" mass="0.2"/>
+  </body></worldbody><actuator><motor joint="a" ctrlrange="-10 10"/><motor joint="b" ctrlrange="-5 5"/></actuator>
+  </mujoco>"""
+LEG = f"""{_FLOOR}<body pos="0 0 0.75"><joint name="hip" axis="0 1 0" damping="0.5" range="-90 90"/><geom type="capsule"
+  fromto="0 0 0 0 0 -0.35" size="0.04" mass="2"/><body pos="0 0 -0.35"><joint name="knee" axis="0 1 0" damping="0.5"
+  range="0 120"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="1"/><geom name="foot" type="box"
+  pos="0.05 0 -0.32" size="0.08 0.04 0.02" mass="0.3"/></body></body><body name="body" pos="0.25 0 0.1">
+  <freejoint name="body"/><geom type="sphere" size="0.1" mass="0.4"/></body></worldbody><actuator>
+  <motor joint="hip" ctrlrange="-60 60"/><motor joint="knee" ctrlrange="-60 60"/></actuator></mujoco>"""
+GRIPPER = f"""{_FLOOR}<body pos="0 0 0.35"><joint name="x" type="slide" axis="1 0 0" damping="5"/><joint name="y"
+  type="slide" axis="0 1 0" damping="5"/><joint name="z" type="slide" axis="0 0 1" damping="5"/><geom type="box"
+  size="0.06 0.03 0.015" mass="0.5"/><body pos="0.05 0 -0.06"><joint name="left" type="slide" axis="-1 0 0"
+  range="0 0.04" damping="2"/><geom name="left" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body>
+  <body pos="-0.05 0 -0.06"><joint name="right" type="slide" axis="1 0 0" range="0 0.04" damping="2"/><geom
+  name="right" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body></body><body name="body"
+  pos="0 0 0.025"><freejoint name="body"/><geom type="box" size="0.025 0.025 0.025" mass="0.1" friction="1.5"/></body>
+  </worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/><motor joint="z"
+  ctrlrange="-30 30"/><motor joint="left" ctrlrange="-10 10"/><motor joint="right" ctrlrange="-10 10"/></actuator>
+  </mujoco>"""
+
 FILES = {"cart-pole": CART_POLE, "box on the floor": BOX, "arm of six hinges": ARM}
