@@ -42,7 +42,7 @@ CASES = (
     Case(name="towards itself, round it", xml=FOREARM, way=(0.0, -0.15, 0.0), at=(("a", -0.6), ("b", 0.8))),
     Case(name="a foot kicks a ball", xml=LEG, way=(1.0, 0.0, 0.0), at=(("hip", 0.3), ("knee", 0.3)), effort=1e-4),
     Case(name="a gripper lifts a cube", xml=GRIPPER, way=(0.0, 0.0, 0.15), steps=60),
-    Case(name="from 8 cm aside", xml=GRIPPER, way=(0.0, 0.0, 0.15), at=(("x", -0.08),), steps=60),
+    Case(name="from 8 cm aside", xml=GRIPPER.replace("0 0 0.35", "-0.08 0 0.35"), way=(0.0, 0.0, 0.15), steps=60),
 )
 
 

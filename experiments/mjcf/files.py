@@ -11,12 +11,13 @@ BOX = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 
   <actuator><motor site="middle" gear="1 0 0 0 0 0"/><motor site="middle" gear="0 0 0 0 0 1"/></actuator></mujoco>"""
 
 ARM = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
-  <default><joint damping="0.2" armature="0.01"/><geom contype="0" conaffinity="0"/></default><worldbody><body>
+  <default><joint damping="0.2" armature="0.01"/><geom contype="0"/></default><worldbody><body>
   <joint name="a" axis="0 0 1"/><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/>
   <body pos="0.4 0 0"><joint name="c" axis="0 1 0"/><joint name="d" axis="1 0 0"/>
   <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/><body pos="0.4 0 0"><joint name="e" axis="0 1 0"/>
-  <joint name="f" axis="1 0 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02"/></body></body></body>
-  </worldbody><actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/><motor joint="d"/><motor joint="e"/>
+  <joint name="f" axis="1 0 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02"/>
+  <site name="hand" pos="0.22 0 0"/></body></body></body></worldbody><actuator>
+  <motor joint="a"/><motor joint="b"/><motor joint="c"/><motor joint="d"/><motor joint="e"/>
   <motor joint="f"/></actuator></mujoco>"""
 
 REACHER = """<mujoco model="reacher"><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
@@ -39,6 +40,43 @@ TWO_LINKS = """<mujoco model="two_links"><option timestep="0.01" integrator="imp
   <joint name="elbow" range="-150 150"/><geom type="capsule" fromto="0.08 0 0 0.35 0 0" mass="0.5"/></body></body>
   </body></worldbody><actuator><motor name="shoulder" joint="shoulder" ctrlrange="-20 20"/>
   <motor name="elbow" joint="elbow" ctrlrange="-8 8"/></actuator></mujoco>"""
+
+# A body with eight thrusters in water, neutrally buoyant, and what is in its way. The guard is what collides.
+PILLARS = """
+  <geom name="pillar_a" type="cylinder" size=".35 2" pos="1.6 .15 2"/>
+  <geom name="pillar_b" type="cylinder" size=".35 2" pos="3.4 -.35 2"/>
+  <geom name="dock" type="box" size=".1 .5 .4" pos="-.7 0 1"/>"""
+THRUSTERS = f"""<mujoco model="thrusters"><compiler autolimits="true"/>
+  <option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/>
+  <default><general ctrlrange="-35 35"/><geom rgba=".55 .55 .5 1"/></default><worldbody>
+  <light pos="0 -4 8" dir="0 .4 -1"/><geom name="seabed" type="plane" size="12 12 .1"/>{PILLARS}
+  <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/>
+  <geom name="guard" type="sphere" size=".25" mass="0" rgba="0 0 0 0"/>
+  <geom name="hull" type="ellipsoid" size=".25 .18 .13" mass="11.5" contype="0" conaffinity="0" rgba=".1 .3 .9 1"/>
+  <site name="t1" pos=".15 -.11 0"/><site name="t2" pos=".15 .11 0"/><site name="t3" pos="-.15 -.11 0"/>
+  <site name="t4" pos="-.15 .11 0"/><site name="v1" pos=".12 -.2 0"/><site name="v2" pos=".12 .2 0"/>
+  <site name="v3" pos="-.12 -.2 0"/><site name="v4" pos="-.12 .2 0"/></body></worldbody><actuator>
+  <general name="t1" site="t1" gear=".7071 .7071 0 0 0 0"/><general name="t2" site="t2" gear=".7071 -.7071 0 0 0 0"/>
+  <general name="t3" site="t3" gear=".7071 -.7071 0 0 0 0"/><general name="t4" site="t4" gear=".7071 .7071 0 0 0 0"/>
+  <general name="v1" site="v1" gear="0 0 1 0 0 0"/><general name="v2" site="v2" gear="0 0 1 0 0 0"/>
+  <general name="v3" site="v3" gear="0 0 1 0 0 0"/><general name="v4" site="v4" gear="0 0 1 0 0 0"/>
+  </actuator></mujoco>"""
+
+# A quadrotor with a load on a rod, which hangs from its centre of mass, whatever its attitude.
+SLUNG_LOAD = """<mujoco model="slung_load"><compiler autolimits="true" angle="radian"/>
+  <option timestep="0.005" integrator="implicitfast" gravity="0 0 -9.8"/><default><geom contype="0" conaffinity="0"/>
+  <general ctrlrange="0 3.71"/></default><worldbody><light pos="0 -4 8" dir="0 .4 -1"/><body name="middle" pos="0 0 2">
+  <joint name="x" type="slide" axis="1 0 0" damping="0.15"/><joint name="y" type="slide" axis="0 1 0" damping="0.15"/>
+  <joint name="z" type="slide" axis="0 0 1" damping="0.15" ref="2"/><inertial pos="0 0 0" mass="0.1"
+  diaginertia="1e-9 1e-9 1e-9"/><body name="quadrotor"><joint name="turn" type="ball"/><inertial pos="0 0 0" mass="0.4"
+  diaginertia="0.05 0.05 0.05"/><geom type="capsule" size="0.02" fromto="-0.17 0 0 0.17 0 0"/><geom type="capsule"
+  size="0.02" fromto="0 -0.17 0 0 0.17 0"/><site name="a" pos="0.17 0 0"/><site name="b" pos="0 0.17 0"/>
+  <site name="c" pos="-0.17 0 0"/><site name="d" pos="0 -0.17 0"/></body><body name="load">
+  <joint name="roll" axis="1 0 0" range="-1.2 1.2"/><joint name="pitch" axis="0 1 0" range="-1.2 1.2"/>
+  <inertial pos="0 0 -0.8" mass="0.2" diaginertia="1e-9 1e-9 1e-9"/><geom type="capsule" size="0.005"
+  fromto="0 0 0 0 0 -0.8"/><geom type="sphere" size="0.06" pos="0 0 -0.8"/></body></body></worldbody><actuator>
+  <general site="a" gear="0 0 1 0 0 0.025"/><general site="b" gear="0 0 1 0 0 -0.025"/>
+  <general site="c" gear="0 0 1 0 0 0.025"/><general site="d" gear="0 0 1 0 0 -0.025"/></actuator></mujoco>"""
 
 # On a floor, each with something that it can push, kick or pick up, whose name is "body".
 _FLOOR = """<mujoco model="contacts"><compiler autolimits="true"/>
