@@ -19,6 +19,8 @@ step. Solves by both alternate in this process, on one thread, in processor time
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -29,6 +31,7 @@ from runner import Result, Settings, at_most, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.problem.costs import terms_of
 from lqrsim.scenes.scene import scene_from_xml
 
 WIDE = 1e-6  # of the central differences: wider ones would often reach across a kink, as of a clamped force
@@ -150,26 +153,24 @@ def against_formulas() -> Iterator[tuple[str, ls.Problem, ls.Problem]]:
     files = THRUSTERS, THRUSTERS.replace(PILLARS, "")
     body, free = (ls.MjcfRobot(scene_from_xml(xml, "thrusters")) for xml in files)
     goal, formula = {"rov_x": 5.0, "rov_y": 0.3, "rov_z": 1.4}, thrusters()
-    bare = free.problem(free.at(), free.at(**goal), steps=80, dt=0.1)
+    bare = free.problem(free.at(), free.at(None, **goal), steps=80, dt=0.1)
     yield "eight thrusters, no obstacles", bare, replace(bare, dynamics=formula)
     for clearance in CLEARANCES:
-        problem = body.problem(body.at(), body.at(**goal), steps=80, dt=0.1, clearance=clearance)
-        yield f"among pillars, clearance {clearance:g} m", problem, with_guard(problem, formula)
+        problem = body.problem(body.at(), body.at(None, **goal), steps=80, dt=0.1, clearance=clearance)
+        guarded = ls.Clearance(body.scene.world, radius=GUARD, margin=clearance)
+        cost = reduce(add, map(with_guard, terms_of(problem.stage_cost)))
+        by_formula = replace(problem, dynamics=formula, stage_cost=cost, constraints=[guarded])
+        yield f"among pillars, clearance {clearance:g} m", problem, by_formula
     load = ls.MjcfRobot(scene_from_xml(SLUNG_LOAD, "slung load"))
     carried = load.problem(load.at(), load.at(x=2.0, y=1.0, z=2.5), steps=100, dt=0.02)
     yield "quadrotor with a slung load", carried, replace(carried, dynamics=slung_load())
 
 
-def with_guard(problem: ls.Problem, formula: ls.Dynamics) -> ls.Problem:
-    """The same by formula: distances are those of a ball."""
-    cost: ls.Cost | None = None
-    for one in problem.stage_cost.terms:
-        if isinstance(one, ls.ObstacleCost):
-            one = ls.ObstacleCost(one.world, radius=GUARD, sharpness=one.sharpness, weight=one.weight)
-        cost = one if cost is None else cost + one
-    (kept,) = problem.constraints
-    clear = ls.Clearance(kept.world, radius=GUARD, margin=kept.margin)
-    return replace(problem, dynamics=formula, stage_cost=cost, constraints=[clear])
+def with_guard(term: ls.Cost) -> ls.Cost:
+    """The same by formula: a cost of distances has those of a ball."""
+    if not isinstance(term, ls.ObstacleCost):
+        return term
+    return ls.ObstacleCost(term.world, radius=GUARD, sharpness=term.sharpness, weight=term.weight)
 
 
 def by_both(config: Config, name: str, by_mjcf: ls.Problem, by_formula: ls.Problem) -> Result:

@@ -58,18 +58,23 @@ def main(config: Config) -> Result:
     return result
 
 
-def solved(case: Case, config: Config) -> dict[str, Any]:
-    """A plan from nothing, and how far MuJoCo's steps from its controls take the body."""
+def stated(case: Case) -> tuple[ls.MjcfRobot, ls.Problem]:
+    """The robot, and the problem that weighs the place of the body alone."""
     robot = ls.MjcfRobot(scene_from_xml(case.xml, "contacts"))
     start, space = robot.settled(robot.at(None, **dict(case.at))), robot.dynamics.control_coordinates
     names = robot.dynamics.state_coordinates.names
     weighed = {f"body_{axis}": way for axis, way in zip("xyz", case.way, strict=True) if way}
     ends = {name: start[names.index(name)] + way for name, way in weighed.items()}
-    problem = ls.Problem(
+    return robot, ls.Problem(
         dynamics=robot.dynamics, dt=DT, steps=case.steps, initial=ls.FixedState(start),
         stage_cost=ls.ControlCost([case.effort] * len(space)), control_limits=(space.low, space.high),
         final_cost=ls.QuadraticCost(dict.fromkeys(ends, WEIGHT), about=ends),
     )  # fmt: skip
+
+
+def solved(case: Case, config: Config) -> dict[str, Any]:
+    """A plan from nothing, and how far MuJoCo's steps from its controls take the body."""
+    robot, problem = stated(case)
     limits: dict[str, Any] = {"max_iterations": 4} if config.quick else {"time_limit": config.time_limit}
     solution = ls.smooth(problem, **limits)
     rest = 0.5 * WEIGHT * float(np.dot(case.way, case.way))

@@ -19,11 +19,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mjcf.common import least_distance, pose_error, without_friction
+from mjcf.common import least_distance, pose_error, sheet, without_friction
 from mjcf.family import FAMILY, FamilyTask, ShelfTask
 from mjcf.tasks import TASKS, Task
 from paper.common import render_still
-from PIL import Image
 from runner import FIGURES, FolderSettings, Result, kept, opening, progress, run, table
 from tqdm import tqdm
 
@@ -31,7 +30,6 @@ import lqrsim as ls
 from lqrsim.errors import Array
 
 OUT = Path("runs/mjcf_robots")
-TILE = 400, 225  # pixels of a picture on the sheet of all
 WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and below what it is better
 ROUNDING = 1e-12  # standard deviation of a change of controls
 EXACT = 1e-14  # tolerance of MuJoCo's constraint solver in plans
@@ -81,7 +79,9 @@ def main(config: Config) -> Result:
         if not config.json:
             tqdm.write(line(row))
     if result["figures"]:
-        sheet(config, result)
+        names = [config.out / FIGURES / name for name in result["figures"]]
+        result["figures"].append("mjcf_family.png" if config.family else "mjcf_robots.png")
+        sheet(names, config.out / FIGURES / result["figures"][-1])
     return result
 
 
@@ -91,19 +91,6 @@ def row_of(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> d
         return of_task(config, task, limits)
     settings = limits | {"task": repr(replace(task, folder=None) if isinstance(task, FamilyTask) else task)}
     return kept(config.out / "rows", task.name, settings, lambda: of_task(config, task, limits))
-
-
-def sheet(config: Config, result: Result) -> None:
-    """One sheet with all pictures."""
-    folder, names, across = config.out / FIGURES, list(result["figures"]), 3
-    together = "mjcf_family.png" if config.family else "mjcf_robots.png"
-    pictures = [Image.open(folder / name).convert("RGB").resize(TILE, Image.Resampling.LANCZOS) for name in names]
-    rows = -(-len(pictures) // across)
-    whole = Image.new("RGB", (across * TILE[0], rows * TILE[1]), "white")
-    for number, picture in enumerate(pictures):
-        whole.paste(picture, (number % across * TILE[0], number // across * TILE[1]))
-    whole.save(folder / together, optimize=True)
-    result["figures"].append(together)
 
 
 def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> dict[str, Any]:

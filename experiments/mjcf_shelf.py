@@ -31,9 +31,6 @@ BENT = {"b": -0.8, "c": 1.6, "e": 0.8}  # rad, of this repository's arm: its han
 BELOW, ABOVE = 0.2, 0.06  # m from the hand down to the floor of the shelf, and up to the top of its divider
 DEEP, THIN, ASIDE = 0.15, 0.01, 0.12  # m, half of its depth and of its boards' thickness; its floor beyond the hand
 BOARDS = "floor of the shelf", "divider"
-# Of the velocities of joints. A servo's control is a place, which costs as good as nothing: without this, limits of
-# forces alone make a plan slow, and a Panda's is not found.
-DAMPING = 0.1
 WEIGHTS = 1e3, 1e2  # of the hand's error, 1/m^2 and 1/rad^2, to come near; velocities at the end have the second
 
 
@@ -47,6 +44,9 @@ class Config(Settings):
     """In m, from all boards."""
     steps: int = 100
     """Control periods of a plan, of about 20 ms each."""
+    damping: float = 0.1
+    """Weight of the velocities of joints. A servo's control is a place, which costs next to nothing: with a small
+    weight, only limits of forces keep a plan slow."""
     time_limit: float = 60.0
     """Seconds for each plan."""
     frictionless: bool = False
@@ -62,15 +62,8 @@ def main(config: Config) -> Result:
 
 def reached(config: Config, name: str, xml: str, site: str) -> Result:
     """A plan to the pose, the clearance that it keeps, and those of its run."""
-    bare = ls.MjcfRobot(scene_from_xml(xml, name, obstacles=False))
-    model, nv = bare.scene.model, bare.scene.model.nv
-    keyframe = next((model.key(i).name for i in range(model.nkey) if model.key(i).name), None)
-    start = bare.at(keyframe) if config.models else bare.at(**BENT)
-    start[nv : 2 * nv] = 0.0
-    turned = start + WAY * np.linspace(0, 1, config.steps + 1)[:, None] * np.eye(len(start))[0]
-    goal = pose(bare, turned[-1], site)
-    whole = xml.replace("</mujoco>", shelf(pose(bare, start, site)[0]) + "</mujoco>")
-    robot = ls.MjcfRobot(scene_from_xml(whole, name, obstacles=BOARDS))
+    robot, turned, goal = by_a_shelf(name, xml, site, config.steps)
+    start, nv = turned[0], robot.scene.model.nv
     limits: dict[str, Any] = {"max_iterations": 3} if config.quick else {"time_limit": config.time_limit}
     ls.smooth(to_pose(config, robot, start, site, goal), max_iterations=1, threads=1)  # which compiles
     clock = time.process_time()
@@ -86,6 +79,19 @@ def reached(config: Config, name: str, xml: str, site: str) -> Result:
         "run": least_distance(robot, states), "missed": pose_error(robot, states[-1], site, goal),
         "off": float(np.abs(states - solution.trajectory.states)[:, :nv].max()),
     }  # fmt: skip
+
+
+def by_a_shelf(name: str, xml: str, site: str, steps: int) -> tuple[ls.MjcfRobot, Array, tuple[Array, Array]]:
+    """The arm by its shelf, states (steps+1, n) of its first joint's way alone, and the pose at their end."""
+    bare = ls.MjcfRobot(scene_from_xml(xml, name, obstacles=False))
+    model = bare.scene.model
+    keyframe = next((model.key(i).name for i in range(model.nkey) if model.key(i).name), None)
+    start = bare.at(None, **BENT) if xml == ARM else bare.at(keyframe)
+    start[model.nv : 2 * model.nv] = 0.0
+    turned = start + WAY * np.linspace(0, 1, steps + 1)[:, None] * np.eye(len(start))[0]
+    whole = xml.replace("</mujoco>", shelf(pose(bare, start, site)[0]) + "</mujoco>")
+    robot = ls.MjcfRobot(scene_from_xml(whole, name, obstacles=BOARDS))
+    return robot, turned, pose(bare, turned[-1], site)
 
 
 def shelf(hand: Array) -> str:
@@ -107,7 +113,7 @@ def to_pose(config: Config, robot: ls.MjcfRobot, start: Array, site: str, goal: 
     nv, (place, turn), weights = robot.scene.model.nv, goal, np.zeros(len(start))
     weights[nv : 2 * nv] = WEIGHTS[1]
     problem = robot.problem(
-        start, start, steps=config.steps, dt=robot.dynamics.period_near(0.02), weights=weights, damping=DAMPING,
+        start, start, steps=config.steps, dt=robot.dynamics.period_near(0.02), weights=weights, damping=config.damping,
         clearance=config.clearance,
     )  # fmt: skip
     drawn = ls.SiteCost(site, position=place, orientation=turn, weight=WEIGHTS[0], turn_weight=WEIGHTS[1])

@@ -19,6 +19,7 @@ from sampling import rarely
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency, MotorLag
 from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.view import gl
 
 FOLDER, TOOLS = Path(__file__).parent.parent / "experiments", Path(__file__).parent / "tools"
 FILES = sorted([*FOLDER.glob("*.py"), *TOOLS.glob("*.py")])
@@ -458,6 +459,16 @@ def test_a_body_that_nothing_touches_is_moved() -> None:
     assert found["off"] < 0.3 * found["way"]
     assert found["cost"] < found["rest"]
     assert "a disc pushes a box ahead" in script.report({"rows": [found]})
+
+
+@pytest.mark.long
+def test_pictures_of_own_robots_are_drawn(tmp_path: Path) -> None:
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    script: Any = import_module("mjcf_pictures")
+    result = script.main(script.Config(quick=True, out=tmp_path))
+    assert len(result["figures"]) == 5  # four, and the sheet
+    assert all((tmp_path / "figures" / name).stat().st_size > 1000 for name in result["figures"])
 
 
 @pytest.mark.long

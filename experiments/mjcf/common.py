@@ -1,14 +1,18 @@
-"""What scripts about MJCFs share: measures of states by MuJoCo's bindings alone, and plans without dry friction."""
+"""What scripts about MJCFs share: measures by MuJoCo's bindings alone, plans without dry friction, sheets."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+
+TILE = 400, 225  # pixels of a picture on a sheet
 
 
 def least_distance(robot: ls.MjcfRobot, states: Array) -> float:
@@ -48,3 +52,12 @@ def without_friction(problem: ls.Problem) -> ls.Problem:
     assert isinstance(dynamics, MjcfDynamics)
     losses = {name: 0.0 for name in dynamics.numbers if name.endswith("_frictionloss")}
     return replace(problem, dynamics=dynamics.with_parameters(**losses))
+
+
+def sheet(pictures: Sequence[Path], to: Path, across: int = 3) -> None:
+    """One picture of all, so many beside each other."""
+    whole = Image.new("RGB", (across * TILE[0], -(-len(pictures) // across) * TILE[1]), "white")
+    for number, path in enumerate(pictures):
+        tile = Image.open(path).convert("RGB").resize(TILE, Image.Resampling.LANCZOS)
+        whole.paste(tile, (number % across * TILE[0], number // across * TILE[1]))
+    whole.save(to, optimize=True)

@@ -11,7 +11,7 @@ BOX = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 
   <actuator><motor site="middle" gear="1 0 0 0 0 0"/><motor site="middle" gear="0 0 0 0 0 1"/></actuator></mujoco>"""
 
 ARM = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
-  <default><joint damping="0.2" armature="0.01"/><geom contype="0"/></default><worldbody><body>
+  <default><joint damping="0.2" armature="0.01"/><geom contype="0" rgba=".8 .8 .82 1"/></default><worldbody><body>
   <joint name="a" axis="0 0 1"/><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/>
   <body pos="0.4 0 0"><joint name="c" axis="0 1 0"/><joint name="d" axis="1 0 0"/>
   <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/><body pos="0.4 0 0"><joint name="e" axis="0 1 0"/>
@@ -49,7 +49,8 @@ PILLARS = """
 THRUSTERS = f"""<mujoco model="thrusters"><compiler autolimits="true"/>
   <option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/>
   <default><general ctrlrange="-35 35"/><geom rgba=".55 .55 .5 1"/></default><worldbody>
-  <light pos="0 -4 8" dir="0 .4 -1"/><geom name="seabed" type="plane" size="12 12 .1"/>{PILLARS}
+  <light pos="0 -4 8" dir="0 .4 -1" directional="true"/><camera name="overview" pos="2.2 -5.5 3.7"
+  xyaxes="1 0 0 0 .45 .9"/><geom name="seabed" type="plane" size="12 12 .1" rgba=".75 .7 .55 1"/>{PILLARS}
   <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/>
   <geom name="guard" type="sphere" size=".25" mass="0" rgba="0 0 0 0"/>
   <geom name="hull" type="ellipsoid" size=".25 .18 .13" mass="11.5" contype="0" conaffinity="0" rgba=".1 .3 .9 1"/>
@@ -80,25 +81,28 @@ SLUNG_LOAD = """<mujoco model="slung_load"><compiler autolimits="true" angle="ra
 
 # On a floor, each with something that it can push, kick or pick up, whose name is "body".
 _FLOOR = """<mujoco model="contacts"><compiler autolimits="true"/>
-  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/><worldbody>
-  <geom type="plane" size="3 3 0.1"/>"""
+  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <default><geom rgba=".25 .4 .6 1"/></default><worldbody><geom type="plane" size="3 3 0.1" rgba=".85 .85 .8 1"/>
+  <light pos="0 -1 3" dir="0 .3 -1" directional="true"/>
+  <camera name="overview" pos="0 -1 .55" xyaxes="1 0 0 0 .4 .92" fovy="27"/>"""
 DISC = f"""{_FLOOR}<body pos="-0.3 0 0.05"><joint name="x" type="slide" axis="1 0 0" damping="2"/>
   <joint name="y" type="slide" axis="0 1 0" damping="2"/><geom name="disc" type="cylinder" size="0.05 0.03" mass="1"/>
-  </body><body name="body" pos="0 0 0.06"><freejoint name="body"/><geom type="box" size="0.06 0.06 0.06" mass="0.5"/>
-  </body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/></actuator>
-  </mujoco>"""
+  </body><body name="body" pos="0 0 0.06"><freejoint name="body"/><geom type="box" size="0.06 0.06 0.06"
+  mass="0.5" rgba=".9 .4 .1 1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/>
+  <motor joint="y" ctrlrange="-20 20"/></actuator></mujoco>"""
 FOREARM = f"""{_FLOOR}<body pos="0 0 0.05"><joint name="a" axis="0 0 1" damping="0.2"/><geom type="capsule"
   fromto="0 0 0 0.3 0 0" size="0.025" mass="0.5"/><body pos="0.3 0 0"><joint name="b" axis="0 0 1" damping="0.2"
   range="-150 150"/><geom name="forearm" type="capsule" fromto="0.03 0 0 0.3 0 0" size="0.025" mass="0.4"/></body>
   </body><body name="body" pos="0.35 0.2 0.03"><joint name="body_x" type="slide" axis="1 0 0" damping="1"/>
-  <joint name="body_y" type="slide" axis="0 1 0" damping="1"/><geom type="cylinder" size="0.04 0.03" mass="0.2"/>
+  <joint name="body_y" type="slide" axis="0 1 0" damping="1"/><geom type="cylinder" size="0.04 0.03" mass="0.2"
+  rgba=".9 .4 .1 1"/>
   </body></worldbody><actuator><motor joint="a" ctrlrange="-10 10"/><motor joint="b" ctrlrange="-5 5"/></actuator>
   </mujoco>"""
 LEG = f"""{_FLOOR}<body pos="0 0 0.75"><joint name="hip" axis="0 1 0" damping="0.5" range="-90 90"/><geom type="capsule"
   fromto="0 0 0 0 0 -0.35" size="0.04" mass="2"/><body pos="0 0 -0.35"><joint name="knee" axis="0 1 0" damping="0.5"
   range="0 120"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="1"/><geom name="foot" type="box"
   pos="0.05 0 -0.32" size="0.08 0.04 0.02" mass="0.3"/></body></body><body name="body" pos="0.25 0 0.1">
-  <freejoint name="body"/><geom type="sphere" size="0.1" mass="0.4"/></body></worldbody><actuator>
+  <freejoint name="body"/><geom type="sphere" size="0.1" mass="0.4" rgba=".9 .4 .1 1"/></body></worldbody><actuator>
   <motor joint="hip" ctrlrange="-60 60"/><motor joint="knee" ctrlrange="-60 60"/></actuator></mujoco>"""
 GRIPPER = f"""{_FLOOR}<body pos="0 0 0.35"><joint name="x" type="slide" axis="1 0 0" damping="5"/><joint name="y"
   type="slide" axis="0 1 0" damping="5"/><joint name="z" type="slide" axis="0 0 1" damping="5"/><geom type="box"
@@ -106,9 +110,9 @@ GRIPPER = f"""{_FLOOR}<body pos="0 0 0.35"><joint name="x" type="slide" axis="1 
   range="0 0.04" damping="2"/><geom name="left" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body>
   <body pos="-0.05 0 -0.06"><joint name="right" type="slide" axis="1 0 0" range="0 0.04" damping="2"/><geom
   name="right" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body></body><body name="body"
-  pos="0 0 0.025"><freejoint name="body"/><geom type="box" size="0.025 0.025 0.025" mass="0.1" friction="1.5"/></body>
-  </worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/><motor joint="z"
-  ctrlrange="-30 30"/><motor joint="left" ctrlrange="-10 10"/><motor joint="right" ctrlrange="-10 10"/></actuator>
-  </mujoco>"""
+  pos="0 0 0.025"><freejoint name="body"/><geom type="box" size="0.025 0.025 0.025" mass="0.1" friction="1.5"
+  rgba=".9 .4 .1 1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/>
+  <motor joint="y" ctrlrange="-20 20"/><motor joint="z" ctrlrange="-30 30"/>
+  <motor joint="left" ctrlrange="-10 10"/><motor joint="right" ctrlrange="-10 10"/></actuator></mujoco>"""
 
 FILES = {"cart-pole": CART_POLE, "box on the floor": BOX, "arm of six hinges": ARM}
