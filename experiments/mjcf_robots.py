@@ -79,9 +79,9 @@ def main(config: Config) -> Result:
         if not config.json:
             tqdm.write(line(row))
     if result["figures"]:
-        names = [config.out / FIGURES / name for name in result["figures"]]
+        pictures = [config.out / FIGURES / name for name in result["figures"]]
         result["figures"].append("mjcf_family.png" if config.family else "mjcf_robots.png")
-        sheet(names, config.out / FIGURES / result["figures"][-1])
+        sheet(pictures, config.out / FIGURES / result["figures"][-1])
     return result
 
 
