@@ -12,43 +12,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mjcf.files import DISC, FOREARM, GRIPPER, LEG
 from runner import FolderSettings, Result, opening, run, table
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
 
 DT, WEIGHT = 0.02, 1000.0  # s; 1/m^2
-HEAD = """<mujoco model="contacts"><compiler autolimits="true"/>
-  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/><worldbody>
-  <geom type="plane" size="3 3 0.1"/>"""
-DISC = f"""{HEAD}<body pos="-0.3 0 0.05"><joint name="x" type="slide" axis="1 0 0" damping="2"/>
-  <joint name="y" type="slide" axis="0 1 0" damping="2"/><geom name="disc" type="cylinder" size="0.05 0.03" mass="1"/>
-  </body><body name="body" pos="0 0 0.06"><freejoint name="body"/><geom type="box" size="0.06 0.06 0.06" mass="0.5"/>
-  </body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/></actuator>
-  </mujoco>"""
-ARM = f"""{HEAD}<body pos="0 0 0.05"><joint name="a" axis="0 0 1" damping="0.2"/><geom type="capsule"
-  fromto="0 0 0 0.3 0 0" size="0.025" mass="0.5"/><body pos="0.3 0 0"><joint name="b" axis="0 0 1" damping="0.2"
-  range="-150 150"/><geom name="forearm" type="capsule" fromto="0.03 0 0 0.3 0 0" size="0.025" mass="0.4"/></body>
-  </body><body name="body" pos="0.35 0.2 0.03"><joint name="body_x" type="slide" axis="1 0 0" damping="1"/>
-  <joint name="body_y" type="slide" axis="0 1 0" damping="1"/><geom type="cylinder" size="0.04 0.03" mass="0.2"/>
-  </body></worldbody><actuator><motor joint="a" ctrlrange="-10 10"/><motor joint="b" ctrlrange="-5 5"/></actuator>
-  </mujoco>"""
-LEG = f"""{HEAD}<body pos="0 0 0.75"><joint name="hip" axis="0 1 0" damping="0.5" range="-90 90"/><geom type="capsule"
-  fromto="0 0 0 0 0 -0.35" size="0.04" mass="2"/><body pos="0 0 -0.35"><joint name="knee" axis="0 1 0" damping="0.5"
-  range="0 120"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="1"/><geom name="foot" type="box"
-  pos="0.05 0 -0.32" size="0.08 0.04 0.02" mass="0.3"/></body></body><body name="body" pos="0.25 0 0.1">
-  <freejoint name="body"/><geom type="sphere" size="0.1" mass="0.4"/></body></worldbody><actuator>
-  <motor joint="hip" ctrlrange="-60 60"/><motor joint="knee" ctrlrange="-60 60"/></actuator></mujoco>"""
-GRIPPER = f"""{HEAD}<body pos="PLACE 0.35"><joint name="x" type="slide" axis="1 0 0" damping="5"/><joint name="y"
-  type="slide" axis="0 1 0" damping="5"/><joint name="z" type="slide" axis="0 0 1" damping="5"/><geom type="box"
-  size="0.06 0.03 0.015" mass="0.5"/><body pos="0.05 0 -0.06"><joint name="left" type="slide" axis="-1 0 0"
-  range="0 0.04" damping="2"/><geom name="left" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body>
-  <body pos="-0.05 0 -0.06"><joint name="right" type="slide" axis="1 0 0" range="0 0.04" damping="2"/><geom
-  name="right" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body></body><body name="body"
-  pos="0 0 0.025"><freejoint name="body"/><geom type="box" size="0.025 0.025 0.025" mass="0.1" friction="1.5"/></body>
-  </worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/><motor joint="z"
-  ctrlrange="-30 30"/><motor joint="left" ctrlrange="-10 10"/><motor joint="right" ctrlrange="-10 10"/></actuator>
-  </mujoco>"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +38,11 @@ CASES = (
     Case(name="aside", xml=DISC, way=(0.0, 0.2, 0.0)),
     Case(name="towards itself", xml=DISC, way=(-0.2, 0.0, 0.0)),
     Case(name="at an angle", xml=DISC, way=(0.15, 0.15, 0.0)),
-    Case(name="an arm pushes a puck away", xml=ARM, way=(0.0, 0.15, 0.0), at=(("b", 0.8),)),
-    Case(name="towards itself, round it", xml=ARM, way=(0.0, -0.15, 0.0), at=(("a", -0.6), ("b", 0.8))),
+    Case(name="an arm pushes a puck away", xml=FOREARM, way=(0.0, 0.15, 0.0), at=(("b", 0.8),)),
+    Case(name="towards itself, round it", xml=FOREARM, way=(0.0, -0.15, 0.0), at=(("a", -0.6), ("b", 0.8))),
     Case(name="a foot kicks a ball", xml=LEG, way=(1.0, 0.0, 0.0), at=(("hip", 0.3), ("knee", 0.3)), effort=1e-4),
-    Case(name="a gripper lifts a cube", xml=GRIPPER.replace("PLACE", "0 0"), way=(0.0, 0.0, 0.15), steps=60),
-    Case(name="from 8 cm aside", xml=GRIPPER.replace("PLACE", "-0.08 0"), way=(0.0, 0.0, 0.15), steps=60),
+    Case(name="a gripper lifts a cube", xml=GRIPPER, way=(0.0, 0.0, 0.15), steps=60),
+    Case(name="from 8 cm aside", xml=GRIPPER.replace("0 0 0.35", "-0.08 0 0.35"), way=(0.0, 0.0, 0.15), steps=60),
 )
 
 
@@ -88,18 +58,23 @@ def main(config: Config) -> Result:
     return result
 
 
-def solved(case: Case, config: Config) -> dict[str, Any]:
-    """A plan from nothing, and how far MuJoCo's steps from its controls take the body."""
+def stated(case: Case) -> tuple[ls.MjcfRobot, ls.Problem]:
+    """The robot, and the problem that weighs the place of the body alone."""
     robot = ls.MjcfRobot(scene_from_xml(case.xml, "contacts"))
     start, space = robot.settled(robot.at(None, **dict(case.at))), robot.dynamics.control_coordinates
     names = robot.dynamics.state_coordinates.names
     weighed = {f"body_{axis}": way for axis, way in zip("xyz", case.way, strict=True) if way}
     ends = {name: start[names.index(name)] + way for name, way in weighed.items()}
-    problem = ls.Problem(
+    return robot, ls.Problem(
         dynamics=robot.dynamics, dt=DT, steps=case.steps, initial=ls.FixedState(start),
         stage_cost=ls.ControlCost([case.effort] * len(space)), control_limits=(space.low, space.high),
         final_cost=ls.QuadraticCost(dict.fromkeys(ends, WEIGHT), about=ends),
     )  # fmt: skip
+
+
+def solved(case: Case, config: Config) -> dict[str, Any]:
+    """A plan from nothing, and how far MuJoCo's steps from its controls take the body."""
+    robot, problem = stated(case)
     limits: dict[str, Any] = {"max_iterations": 4} if config.quick else {"time_limit": config.time_limit}
     solution = ls.smooth(problem, **limits)
     rest = 0.5 * WEIGHT * float(np.dot(case.way, case.way))

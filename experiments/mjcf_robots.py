@@ -19,19 +19,17 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mjcf.common import least_distance, pose_error, sheet, without_friction
 from mjcf.family import FAMILY, FamilyTask, ShelfTask
 from mjcf.tasks import TASKS, Task
 from paper.common import render_still
-from PIL import Image
 from runner import FIGURES, FolderSettings, Result, kept, opening, progress, run, table
 from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 
 OUT = Path("runs/mjcf_robots")
-TILE = 400, 225  # pixels of a picture on the sheet of all
 WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and below what it is better
 ROUNDING = 1e-12  # standard deviation of a change of controls
 EXACT = 1e-14  # tolerance of MuJoCo's constraint solver in plans
@@ -81,7 +79,9 @@ def main(config: Config) -> Result:
         if not config.json:
             tqdm.write(line(row))
     if result["figures"]:
-        sheet(config, result)
+        pictures = [config.out / FIGURES / name for name in result["figures"]]
+        result["figures"].append("mjcf_family.png" if config.family else "mjcf_robots.png")
+        sheet(pictures, config.out / FIGURES / result["figures"][-1])
     return result
 
 
@@ -91,19 +91,6 @@ def row_of(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> d
         return of_task(config, task, limits)
     settings = limits | {"task": repr(replace(task, folder=None) if isinstance(task, FamilyTask) else task)}
     return kept(config.out / "rows", task.name, settings, lambda: of_task(config, task, limits))
-
-
-def sheet(config: Config, result: Result) -> None:
-    """One sheet with all pictures."""
-    folder, names, across = config.out / FIGURES, list(result["figures"]), 3
-    together = "mjcf_family.png" if config.family else "mjcf_robots.png"
-    pictures = [Image.open(folder / name).convert("RGB").resize(TILE, Image.Resampling.LANCZOS) for name in names]
-    rows = -(-len(pictures) // across)
-    whole = Image.new("RGB", (across * TILE[0], rows * TILE[1]), "white")
-    for number, picture in enumerate(pictures):
-        whole.paste(picture, (number % across * TILE[0], number // across * TILE[1]))
-    whole.save(folder / together, optimize=True)
-    result["figures"].append(together)
 
 
 def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> dict[str, Any]:
@@ -138,7 +125,7 @@ def of_task(config: Config, task: Task | FamilyTask, limits: dict[str, Any]) -> 
         "off": float(outcome.worst[0]), "replayed": replayed(robot, solution),
         "exact": replayed(robot, solution, EXACT), "unit": rollout.tracking_unit,
         "clearance": None if solution.clearance is None else float(solution.clearance[1:].min()),
-        "bindings": clearance_by_bindings(robot, solution),
+        "bindings": None if solution.clearance is None else least_distance(robot, solution.trajectory.states[1:]),
         "close": min([CLOSE, *(0.1 * abs(way) for way in ways)]),
         "missed": missed(task, robot, problem, solution.trajectory.states[-1]),
     }  # fmt: skip
@@ -163,23 +150,10 @@ def costs_by_rounding(task: Task | FamilyTask, most: int) -> list[float]:
     return costs
 
 
-def without_friction(problem: ls.Problem) -> ls.Problem:
-    """The same without dry friction in any joint."""
-    dynamics = problem.dynamics
-    assert isinstance(dynamics, MjcfDynamics)
-    losses = {name: 0.0 for name in dynamics.numbers if name.endswith("_frictionloss")}
-    return replace(problem, dynamics=dynamics.with_parameters(**losses))
-
-
 def missed(task: Task | FamilyTask, robot: ls.MjcfRobot, problem: ls.Problem, last: Array) -> dict[str, float]:
     """How far each joint that is wanted somewhere ends from there; of a tool its place (m) and turn (rad)."""
     if isinstance(task, ShelfTask):
-        data, turn = mujoco.MjData(robot.scene.model), np.zeros(4)
-        data.qpos[:] = robot.configuration(last)[0]
-        mujoco.mj_kinematics(robot.scene.model, data)
-        mujoco.mju_mat2Quat(turn, data.site("tool").xmat)
-        angle = 2 * np.arccos(min(1.0, abs(float(turn @ task.turn))))
-        return {"tool": float(np.linalg.norm(data.site("tool").xpos - task.place)), "tool's turn": angle}
+        return dict(zip(("tool", "tool's turn"), pose_error(robot, last, "tool", (task.place, task.turn)), strict=True))
     assert problem.goal is not None
     return {
         name: float(last[i] - problem.goal[i])
@@ -212,23 +186,6 @@ def replayed(robot: ls.MjcfRobot, solution: ls.Solution, tolerance: float | None
 def robot_steps(robot: ls.MjcfRobot, dt: float) -> int:
     """Physics steps of a control period."""
     return round(dt / float(robot.scene.model.opt.timestep))
-
-
-def clearance_by_bindings(robot: ls.MjcfRobot, solution: ls.Solution) -> float | None:
-    """The least distance along the plan by `mujoco.mj_geomDistance`; None without obstacles."""
-    model, obstacles = robot.scene.model, robot.scene.geoms
-    if solution.clearance is None:
-        return None
-    data, least = mujoco.MjData(model), np.inf
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    moving = np.flatnonzero(collides & (model.body_weldid[model.geom_bodyid] != 0)).tolist()
-    for state in solution.trajectory.states[1:]:
-        data.qpos[:] = robot.configuration(state)[0]
-        mujoco.mj_kinematics(model, data)
-        for obstacle in obstacles:
-            for geom in moving:
-                least = min(least, mujoco.mj_geomDistance(model, data, geom, obstacle, 10.0, None))
-    return float(least)
 
 
 def camera_of(robot: ls.MjcfRobot) -> str:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mjcf.files import DISC, FOREARM, GRIPPER, LEG
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -14,42 +15,12 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import strategy
 
 DT = 0.02
-HEAD = """<mujoco><compiler autolimits="true"/>
-  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/><worldbody>
-  <geom type="plane" size="3 3 0.1"/>"""
-DISC = f"""{HEAD}<body pos="PLACE 0.05"><joint name="x" type="slide" axis="1 0 0" damping="2"/>
-  <joint name="y" type="slide" axis="0 1 0" damping="2"/><geom name="disc" type="cylinder" size="0.05 0.03" mass="1"
-  CONTACT/></body><body name="box" pos="0 0 0.06"><freejoint name="box"/><geom name="box" type="box"
-  size="0.06 0.06 0.06" mass="MASS"/></body></worldbody><actuator><motor joint="x" ctrlrange="-20 20"/>
-  <motor joint="y" ctrlrange="-20 20"/></actuator></mujoco>"""
-ARM = f"""{HEAD}<body pos="0 0 0.05"><joint name="a" axis="0 0 1" damping="0.2"/><geom type="capsule"
-  fromto="0 0 0 0.3 0 0" size="0.025" mass="0.5"/><body pos="0.3 0 0"><joint name="b" axis="0 0 1" damping="0.2"
-  range="-150 150"/><geom type="capsule" fromto="0.03 0 0 0.3 0 0" size="0.025" mass="0.4"/></body></body>
-  <body name="puck" pos="0.35 0.2 0.03"><joint name="puck_x" type="slide" axis="1 0 0" damping="1"/>
-  <joint name="puck_y" type="slide" axis="0 1 0" damping="1"/><geom type="cylinder" size="0.04 0.03" mass="MASS"/>
-  </body></worldbody><actuator><motor joint="a" ctrlrange="-10 10"/><motor joint="b" ctrlrange="-5 5"/></actuator>
-  </mujoco>"""
-LEG = f"""{HEAD}<body pos="0 0 0.75"><joint name="hip" axis="0 1 0" damping="0.5" range="-90 90"/><geom type="capsule"
-  fromto="0 0 0 0 0 -0.35" size="0.04" mass="2"/><body pos="0 0 -0.35"><joint name="knee" axis="0 1 0" damping="0.5"
-  range="0 120"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="1"/><geom name="foot" type="box"
-  pos="0.05 0 -0.32" size="0.08 0.04 0.02" mass="0.3"/></body></body><body name="ball" pos="0.25 0 0.1">
-  <freejoint name="ball"/><geom type="sphere" size="0.1" mass="MASS"/></body></worldbody><actuator>
-  <motor joint="hip" ctrlrange="-60 60"/><motor joint="knee" ctrlrange="-60 60"/></actuator></mujoco>"""
-GRIPPER = f"""{HEAD}<body pos="PLACE 0.35"><joint name="x" type="slide" axis="1 0 0" damping="5"/><joint name="y"
-  type="slide" axis="0 1 0" damping="5"/><joint name="z" type="slide" axis="0 0 1" damping="5"/><geom type="box"
-  size="0.06 0.03 0.015" mass="0.5"/><body pos="0.05 0 -0.06"><joint name="left" type="slide" axis="-1 0 0"
-  range="0 0.04" damping="2"/><geom name="left" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body>
-  <body pos="-0.05 0 -0.06"><joint name="right" type="slide" axis="1 0 0" range="0 0.04" damping="2"/><geom
-  name="right" type="box" size="0.006 0.02 0.04" mass="0.05" friction="1.5"/></body></body><body name="cube"
-  pos="0 0 0.025"><freejoint name="cube"/><geom type="box" size="0.025 0.025 0.025" mass="MASS" friction="1.5"/></body>
-  </worldbody><actuator><motor joint="x" ctrlrange="-20 20"/><motor joint="y" ctrlrange="-20 20"/><motor joint="z"
-  ctrlrange="-30 30"/><motor joint="left" ctrlrange="-10 10"/><motor joint="right" ctrlrange="-10 10"/></actuator>
-  </mujoco>"""
 
 
-def robot_of(text: str, mass: float = 0.5, place: str = "-0.3 0", contact: str = "") -> ls.MjcfRobot:
-    xml = text.replace("MASS", repr(mass)).replace("PLACE", place).replace("CONTACT", contact)
-    return ls.MjcfRobot(scene_from_xml(xml, "touch"))
+def robot_of(xml: str, mass: float | None = None) -> ls.MjcfRobot:
+    """With another mass of what is to be moved, if one is given."""
+    robot = ls.MjcfRobot(scene_from_xml(xml, "touch"))
+    return robot if mass is None else robot.with_parameters(body_mass=mass)
 
 
 def stated(robot: ls.MjcfRobot, state: Array, steps: int, effort: float = 1 / 400, **moves: float) -> ls.Problem:
@@ -63,17 +34,17 @@ def stated(robot: ls.MjcfRobot, state: Array, steps: int, effort: float = 1 / 40
     )  # fmt: skip
 
 
-def moved(robot: ls.MjcfRobot, solution: ls.Solution, body: str) -> Array:
-    """How far MuJoCo's own steps from the plan's controls, on the file as it is, take a body."""
+def moved(robot: ls.MjcfRobot, solution: ls.Solution) -> Array:
+    """How far MuJoCo's own steps from the plan's controls, on the file as it is, take the body."""
     model = mujoco.MjModel.from_xml_string(robot.scene.xml)
     data, plan = mujoco.MjData(model), solution.trajectory
     data.qpos[:], data.qvel[:] = robot.configuration(plan.states[0])
     mujoco.mj_forward(model, data)
-    before = data.body(body).xpos.copy()
+    before = data.body("body").xpos.copy()
     for control in plan.controls:
         data.ctrl[:] = control
         mujoco.mj_step(model, data, round(DT / model.opt.timestep))
-    return data.body(body).xpos - before
+    return data.body("body").xpos - before
 
 
 @pytest.fixture
@@ -83,11 +54,9 @@ def no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strategy, "ATTEMPTS", strategy.ATTEMPTS[: last + 1])
 
 
-def check_moved(
-    robot: ls.MjcfRobot, problem: ls.Problem, body: str, way: tuple[float, float, float], most: int = 4
-) -> None:
+def check_moved(robot: ls.MjcfRobot, problem: ls.Problem, way: tuple[float, float, float], most: int = 4) -> None:
     """The body misses at most 0.3 of its way, the part that `smooth` asks of a start, after so many iterations."""
-    there, wanted = moved(robot, ls.smooth(problem, max_iterations=most), body), np.array(way)
+    there, wanted = moved(robot, ls.smooth(problem, max_iterations=most)), np.array(way)
     assert np.linalg.norm((there - wanted)[wanted != 0]) < 0.3 * np.linalg.norm(wanted)
 
 
@@ -99,43 +68,45 @@ SIDES = [(0.0, 0.2), (-0.2, 0.0), *rarely((0.2, 0.0), (0.15, 0.15), (-0.1, 0.15)
 @pytest.mark.parametrize("mass", [0.5, *rarely(0.2, 1.0)])
 def test_a_disc_pushes_a_box_to_any_side(x: float, y: float, mass: float) -> None:
     robot = robot_of(DISC, mass)
-    problem = stated(robot, robot.settled(robot.at()), 50, box_x=x, box_y=y)
-    check_moved(robot, problem, "box", (x, y, 0.0))
+    problem = stated(robot, robot.settled(robot.at()), 50, body_x=x, body_y=y)
+    check_moved(robot, problem, (x, y, 0.0))
 
 
 @pytest.mark.usefixtures("no_further")
 @pytest.mark.parametrize("mass", [0.2, *rarely(0.1, 0.5)])
 def test_an_arm_pushes_a_puck_away_and_back(mass: float) -> None:
-    robot = robot_of(ARM, mass)
+    robot = robot_of(FOREARM, mass)
     for state, way in ((robot.at(b=0.8), 0.15), (robot.at(a=-0.6, b=0.8), -0.15)):
-        problem = stated(robot, state, 40, puck_y=way)
-        check_moved(robot, problem, "puck", (0.0, way, 0.0))
+        problem = stated(robot, state, 40, body_y=way)
+        check_moved(robot, problem, (0.0, way, 0.0))
 
 
 @pytest.mark.usefixtures("no_further")
 @pytest.mark.parametrize("mass", [0.4, *rarely(0.2, 0.8)])
 def test_a_foot_kicks_a_ball(mass: float) -> None:
     robot = robot_of(LEG, mass)
-    problem = stated(robot, robot.settled(robot.at(hip=0.3, knee=0.3)), 40, 1e-4, ball_x=1.0)
-    check_moved(robot, problem, "ball", (1.0, 0.0, 0.0), 30)
+    problem = stated(robot, robot.settled(robot.at(hip=0.3, knee=0.3)), 40, 1e-4, body_x=1.0)
+    check_moved(robot, problem, (1.0, 0.0, 0.0), 30)
 
 
 @pytest.mark.usefixtures("no_further")
 @pytest.mark.parametrize("place", rarely("0 0", "-0.08 0", "0 0.06", "0.05 -0.05"))
 @pytest.mark.parametrize("mass", [0.1, *rarely(0.05, 0.2)])
 def test_a_gripper_picks_up_a_cube(mass: float, place: str) -> None:
-    robot = robot_of(GRIPPER, mass, place)
-    problem = stated(robot, robot.settled(robot.at()), 60, cube_z=0.15)
-    check_moved(robot, problem, "cube", (0.0, 0.0, 0.15))
+    robot = robot_of(GRIPPER.replace("0 0 0.35", f"{place} 0.35"), mass)
+    problem = stated(robot, robot.settled(robot.at()), 60, body_z=0.15)
+    check_moved(robot, problem, (0.0, 0.0, 0.15))
 
 
 @settings(max_examples=examples(40))
 @given(start=st.floats(-np.pi, np.pi), goal=st.floats(-np.pi, np.pi), far=st.floats(0.2, 0.5))
 def test_a_push_goes_round_the_body_to_its_far_side(start: float, goal: float, far: float) -> None:
-    robot = robot_of(DISC, place=f"{far * np.cos(start)} {far * np.sin(start)}")
+    robot = robot_of(DISC)
     model = mujoco.MjModel.from_xml_string(robot.scene.xml)
-    data, disc, box = mujoco.MjData(model), model.geom("disc").id, model.geom("box").id
-    state, way = robot.at(), np.array([np.cos(goal), np.sin(goal)])
+    data, disc, box = mujoco.MjData(model), model.geom("disc").id, model.body("body").geomadr[0]
+    there, way = (np.array([np.cos(angle), np.sin(angle)]) for angle in (start, goal))
+    x, y = far * there - model.body_pos[model.geom_bodyid[disc], :2]  # joints are 0 where the file has the disc
+    state = robot.at(x=x, y=y)
     moves = np.zeros(model.nv)
     moves[2:4] = 0.2 * way
     found = [positions for _, positions in Approaches(robot.mjcf, np.tile(state, (51, 1)), moves)]
@@ -159,11 +130,11 @@ def test_a_push_goes_round_the_body_to_its_far_side(start: float, goal: float, f
 
 @pytest.mark.usefixtures("no_further")
 def test_what_is_missing_is_said() -> None:
-    robot = robot_of(DISC, contact='contype="0" conaffinity="0"')
+    robot = robot_of(DISC.replace('name="disc"', 'name="disc" contype="0" conaffinity="0"'))
     state = robot.settled(robot.at())
-    solution = ls.smooth(stated(robot, state, 30, box_x=0.2), max_iterations=10)
+    solution = ls.smooth(stated(robot, state, 30, body_x=0.2), max_iterations=10)
     assert solution.status is ls.Status.STALLED
-    assert "nothing that moves touches box" in solution.detail
+    assert "nothing that moves touches body" in solution.detail
     assert "nothing that is driven can collide with it" in solution.detail
 
 
@@ -171,11 +142,11 @@ def test_what_is_missing_is_said() -> None:
 def test_a_push_that_does_not_pay_is_named() -> None:
     robot = robot_of(DISC)
     # With ten times the weight, relative to the controls', it pays: that is the first case of the disc above.
-    problem = stated(robot, robot.settled(robot.at()), 50, 1 / 40, box_y=0.2)
+    problem = stated(robot, robot.settled(robot.at()), 50, 1 / 40, body_y=0.2)
     solution = ls.smooth(problem, max_iterations=4)
     assert solution.status is ls.Status.STALLED
     assert "a push by disc" in solution.detail
-    assert solution.remedy.startswith("raise the weight of box_y")
+    assert solution.remedy.startswith("raise the weight of body_y")
 
 
 def test_dynamics_without_bodies_have_no_approaches() -> None:

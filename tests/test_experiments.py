@@ -11,12 +11,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from sampling import rarely
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency, MotorLag
+from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.view import gl
 
 FOLDER, TOOLS = Path(__file__).parent.parent / "experiments", Path(__file__).parent / "tools"
 FILES = sorted([*FOLDER.glob("*.py"), *TOOLS.glob("*.py")])
@@ -399,6 +402,39 @@ def test_an_arm_is_fitted_to_a_run_that_failed() -> None:
     assert max(fitted["off"], true["off"]) < 0.05 * on_paper["off"]
 
 
+def test_an_arm_reaches_past_a_shelf() -> None:
+    """The first joint alone would hit the divider; plan and run keep the clearance, to the tolerance of constraints."""
+    script: Any = import_module("mjcf_shelf")
+    found = script.main(script.Config())
+    (row,) = found["rows"]
+    assert row["status"] == "CONVERGED"
+    assert row["straight"] < 0
+    assert min(row["planned"], row["run"]) > 0.02 - 1e-6
+    assert max(row["missed"]) < 1e-5  # m, rad
+    assert "arm of six hinges" in script.report(found)
+
+
+@pytest.mark.parametrize(("file", "formula"), [("THRUSTERS", "thrusters"), ("SLUNG_LOAD", "slung_load")])
+def test_formulas_are_those_of_their_files(file: str, formula: str) -> None:
+    """Accelerations by `mj_forward`, and rates of positions by differences of MuJoCo's own way along velocities."""
+    robot = ls.MjcfRobot(scene_from_xml(getattr(import_module("mjcf.files"), file), formula))
+    dynamics, model = getattr(import_module("mjcf.formulas"), formula)(), robot.scene.model
+    data, rng, nv = mujoco.MjData(model), np.random.default_rng(0), model.nv
+    for _ in range(20):
+        state = rng.normal(scale=0.3, size=2 * nv)
+        state[2] += 3.0  # above the floor
+        control = rng.uniform(0.0, 3.0, model.nu)
+        data.qpos[:], data.qvel[:] = robot.configuration(state)
+        data.ctrl[:] = control
+        mujoco.mj_forward(model, data)
+        rate = dynamics.rate(state, control)
+        # MuJoCo keeps the load's inertia about its own axes above 0: 1e-9 kg m^2 of the 0.13 about the quadrotor.
+        np.testing.assert_allclose(rate[nv:], data.qacc, rtol=0, atol=1e-7 * np.abs(data.qacc).max())
+        mujoco.mj_integratePos(model, data.qpos, data.qvel, 1e-6)
+        moved = robot.state(data.qpos, data.qvel, near=state)[:nv]
+        np.testing.assert_allclose((moved - state[:nv]) / 1e-6, rate[:nv], rtol=0, atol=1e-4)  # a one-sided difference
+
+
 @pytest.mark.parametrize(
     ("winch", "load", "lifted"),
     [("a motor, -60 to 0 N", "in the plane", 0.4), *rarely(
@@ -423,6 +459,16 @@ def test_a_body_that_nothing_touches_is_moved() -> None:
     assert found["off"] < 0.3 * found["way"]
     assert found["cost"] < found["rest"]
     assert "a disc pushes a box ahead" in script.report({"rows": [found]})
+
+
+@pytest.mark.long
+def test_pictures_of_own_robots_are_drawn(tmp_path: Path) -> None:
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    script: Any = import_module("mjcf_pictures")
+    result = script.main(script.Config(quick=True, out=tmp_path))
+    assert len(result["figures"]) == 5  # four, and the sheet
+    assert all((tmp_path / "figures" / name).stat().st_size > 1000 for name in result["figures"])
 
 
 @pytest.mark.long

@@ -128,7 +128,7 @@ class ShelfTask(FamilyTask):
         place, turn, (heavy, light) = self.place, self.turn, self.weights
         drawn = ls.SiteCost("tool", position=place, orientation=turn, weight=heavy, turn_weight=light)
         exact = ls.SiteConstraint("tool", position=place, orientation=turn)
-        return replace(problem, final_cost=problem.final_cost + drawn, constraints=[exact])
+        return replace(problem, final_cost=problem.final_cost + drawn, constraints=[*problem.constraints, exact])
 
 
 FAMILY: tuple[FamilyTask, ...] = (
