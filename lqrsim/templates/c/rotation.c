@@ -1,4 +1,5 @@
-/* The one of the equal rotations (angle + 2 pi k) axis that is nearest to another; without entry `turn`, if that is 0 to 2. */
+/* The one of the equal rotations (angle + 2 pi k) axis that is nearest to another. Entry `turn`, if it is 0 to 2, is an
+ * angle and no part of it. */
 static void nearest_rotation(real *x, const real *near, int turn)
 {
     real axis[3] = {0}, other[3] = {0}, square = 0, length = 0, along = 0;
