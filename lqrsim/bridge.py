@@ -19,7 +19,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Self
@@ -116,7 +116,7 @@ def run(
       commands: topic, such as "/rotors/commands".
       safe: (m,), within the limits: the command for the robot when it is no longer controlled.
       odometry: topic. It has the states x, y, z, vx, vy, vz (along the world's axes), the rotation vector rx, ry, rz,
-        the rates wx, wy, wz (along the body's), and heading, the yaw.
+        or its turn and tilt as with `turns_about`, the rates wx, wy, wz (along the body's), and heading, the yaw.
       joints: topic. It has the states NAME and NAME_velocity of each joint, as in a robot from an MJCF.
       names: state -> its name in messages, for states with other names.
       seconds: how long to run; by default the horizon.
@@ -225,6 +225,7 @@ class SimulatedRobot:
         self._controls = policy.control_coordinates
         self._patience = check_number("patience", patience, above=0.0, at_most=1e6)
         self._names, node, topics = _renamed(policy.state_coordinates, names), _Node(domain), _topics(odometry, joints)
+        self._turns_about = _turns_about(policy.state_coordinates, self._names)
         self._outlets = {kind: node.writer(topic, kind) for kind, topic in topics.items()}
         self._inlet: _Reader | None = node.reader(commands, "Float64MultiArray")
         self._node: _Node | None = node
@@ -247,9 +248,8 @@ class SimulatedRobot:
             _wait(lambda: all(one() for one in everyone), self._patience, lambda: "got no controller")
             self._met = True
         values = dict(zip(self._names, vectors_of("state", state, len(self._names)).tolist(), strict=True))
-        messages = [
-            (out, (node.odometry if kind == "Odometry" else node.joints)) for kind, out in self._outlets.items()
-        ]
+        pose = functools.partial(node.odometry, turns_about=self._turns_about)
+        messages = [(out, (pose if kind == "Odometry" else node.joints)) for kind, out in self._outlets.items()]
         begun = time.monotonic()
         for outlet, made in messages:
             outlet.write(made(values, t))
@@ -319,6 +319,13 @@ def _renamed(states: Coordinates, names: Mapping[str, str] | None) -> tuple[str,
     return tuple(given.get(name, name) for name in states.names)
 
 
+def _turns_about(states: Coordinates, names: Sequence[str]) -> str | None:
+    """The axis about which rx, ry, rz, by their names in messages, have a turn; None for a rotation vector."""
+    first = names.index("rx") if "rx" in names else -1
+    turn = dict(zip(states.rotation_vectors, states.turns, strict=True)).get(first, -1)
+    return AXES[turn] if turn >= 0 else None
+
+
 class _Inlet:
     """The newest state from the topics.
 
@@ -331,7 +338,9 @@ class _Inlet:
         self, node: "_Node", topics: Mapping[str, str], states: Coordinates, needed: tuple[str, ...],
         names: Mapping[str, str] | None, *, reliable: bool,
     ) -> None:  # fmt: skip
-        self._wanted = dict(zip(_renamed(states, names), range(len(states)), strict=True))
+        renamed = _renamed(states, names)
+        self._wanted = dict(zip(renamed, range(len(states)), strict=True))
+        self._of_odometry = functools.partial(_of_odometry, turns_about=_turns_about(states, renamed))
         self._topics, self._lacking = topics, {name for name, i in self._wanted.items() if states.names[i] in needed}
         known = set(ODOMETRY) if set(topics) == {"Odometry"} else self._lacking
         if self._lacking - known:
@@ -373,7 +382,7 @@ class _Inlet:
         for kind, reader in self._readers.items():
             for message in reader.take():
                 try:
-                    values = (_of_odometry if kind == "Odometry" else _of_joints)(message)
+                    values = (self._of_odometry if kind == "Odometry" else _of_joints)(message)
                     used = values.keys() & self._wanted.keys()
                     self._known[kind] |= used
                     if missing := self._known[kind] - used:
@@ -390,7 +399,7 @@ class _Inlet:
         return self.arrived == now
 
 
-def _of_odometry(message: Any) -> dict[str, float]:
+def _of_odometry(message: Any, turns_about: str | None = None) -> dict[str, float]:
     """The states in the message. Raises ValueError if they are invalid."""
     pose, twist = message.pose.pose, message.twist.twist
     place, turned = pose.position, pose.orientation
@@ -399,8 +408,8 @@ def _of_odometry(message: Any) -> dict[str, float]:
     if not abs(length - 1) < 1e-2:
         raise ValueError(f"an orientation that is no unit quaternion but of length {length:.3g}")
     w, x, y, z = quaternion / length
-    rotation = rotations.rotation_vector(quaternion / length)
-    velocity = rotations.rotate(rotation, [getattr(twist.linear, axis) for axis in AXES])
+    rotation = rotations.rotation_vector(quaternion, turns_about=turns_about)
+    velocity = rotations.rotate(rotations.rotation_vector(quaternion), [getattr(twist.linear, axis) for axis in AXES])
     rates = [getattr(twist.angular, axis) for axis in AXES]
     heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     numbers = [place.x, place.y, place.z, *velocity, *rotation, *rates, heading]
@@ -456,11 +465,12 @@ class _Node:
         layout = make["MultiArrayLayout"](dim=[], data_offset=0)
         return make["Float64MultiArray"](layout=layout, data=[float(one) for one in numbers])
 
-    def odometry(self, values: Mapping[str, float], t: float) -> Any:
+    def odometry(self, values: Mapping[str, float], t: float, turns_about: str | None = None) -> Any:
         make, of = self._ros.messages, {name: values.get(name, 0.0) for name in ODOMETRY}
         rotation = np.array([of["rx"], of["ry"], of["rz"] + of["heading"]])
-        w, x, y, z = rotations.quaternion(rotation).tolist()
-        linear = map(float, rotations.rotate(-rotation, [of["vx"], of["vy"], of["vz"]]))
+        turned = rotations.quaternion(rotation, turns_about=turns_about)
+        w, x, y, z = turned.tolist()
+        linear = map(float, rotations.rotate(-rotations.rotation_vector(turned), [of["vx"], of["vy"], of["vz"]]))
         place = make["Point"](x=of["x"], y=of["y"], z=of["z"])
         pose = make["Pose"](position=place, orientation=make["Quaternion"](x=x, y=y, z=z, w=w))
         moving = make["Twist"](

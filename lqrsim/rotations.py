@@ -10,6 +10,10 @@ although they are 0/0 at the identity when written with |r|:
 Each is a SymPy function with derivatives `<name>_d1` and `<name>_d2` in s. Compiled code evaluates them by the
 functions of the same names in `kernels/rotation_ratios.py`, with a power series near zero. Rotation vectors of length 2
 pi are singular.
+
+What turns about an axis on and on has other coordinates, without such places: three numbers whose entry along this axis
+is the angle of a turn about it, and whose other two are the rotation vector of a tilt, perpendicular to it, that comes
+first. They are a rotation vector where one of the two is zero, and singular where the tilt is half a turn.
 """
 
 import sys
@@ -20,12 +24,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, excerpt, vectors_of
+from lqrsim.errors import Array, InputError, check_items, check_name, excerpt, vectors_of
 from lqrsim.kernels.rotation_ratios import cosine_ratio, cotangent_ratio, sine_ratio
 
 Vector = Sequence[Any] | npt.NDArray[Any]
 
 RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
+AXES = "x", "y", "z"
 
 
 def rotate(r: Vector, v: Vector) -> list[Any]:
@@ -64,31 +69,46 @@ def vector_rate(r: Vector, w: Vector) -> list[Any]:
     return [w[i] + once[i] / 2 + cotangent * twice[i] for i in range(3)]
 
 
-def quaternion(rotation_vector: npt.ArrayLike) -> Array:
+def quaternion(rotation_vector: npt.ArrayLike, *, turns_about: str | None = None) -> Array:
     """The unit quaternions (..., 4), scalar first as in MuJoCo, of rotation vectors (..., 3).
 
     Args:
       rotation_vector: (..., 3), in radians.
+      turns_about: "x", "y" or "z", if the entry along this axis is a turn about it, after a tilt by the vector of the
+        other two.
 
     Raises:
-      InputError: the argument is not numbers of this shape.
+      InputError: the argument is not numbers of this shape, or there is no such axis.
     """
     rotation = vectors_of("rotation_vector", rotation_vector, 3)
+    if turns_about is not None:
+        along = _index(turns_about)
+        tilt = rotation * (np.arange(3) != along)
+        return _turned(quaternion(tilt), along, 0.5 * rotation[..., along])
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
     # np.sinc(t) is sin(pi t) / (pi t), and 1 at 0: here sin(angle / 2) / angle.
     return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], axis=-1)
 
 
-def rotation_vector(quaternion: npt.ArrayLike) -> Array:
+def rotation_vector(quaternion: npt.ArrayLike, *, turns_about: str | None = None) -> Array:
     """The rotation vectors (..., 3), at most half a turn in radians, of quaternions (..., 4), scalar first, any size.
 
     Args:
       quaternion: (..., 4), scalar first.
+      turns_about: "x", "y" or "z", for a turn about this axis in the entry along it, after a tilt by the vector of the
+        other two; both are at most half a turn.
 
     Raises:
-      InputError: the argument is not numbers of this shape.
+      InputError: the argument is not numbers of this shape, or there is no such axis.
     """
     rows = vectors_of("quaternion", quaternion, 4)
+    if turns_about is not None:
+        along = _index(turns_about)
+        sign = np.copysign(1.0, rows[..., 0])
+        half = np.arctan2(sign * rows[..., 1 + along], sign * rows[..., 0])
+        found = rotation_vector(_turned(rows, along, -half))
+        found[..., along] = 2 * half
+        return found
     # q and -q are the same rotation; with a scalar part >= 0 it is at most half a turn.
     scalar, x, y, z = (rows[..., i] for i in range(4))
     sine = np.sqrt(x * x + y * y + z * z)
@@ -99,6 +119,26 @@ def rotation_vector(quaternion: npt.ArrayLike) -> Array:
     limit = np.asarray(2.0 / np.abs(scalar)) if small.any() else None
     ratio = angle / sine if limit is None else np.divide(angle, sine, out=limit, where=~small)
     return np.copysign(ratio, scalar)[..., None] * rows[..., 1:]
+
+
+def _index(turns_about: str) -> int:
+    """The entry along an axis, 0 to 2. Raises InputError if there is no such axis."""
+    return AXES.index(check_name("turns_about", turns_about, AXES))
+
+
+def _turned(quaternion: Array, along: int, half: Array) -> Array:
+    """Quaternions (..., 4), then turned about an axis, 0 to 2, by twice the angles (...)."""
+    turn = np.zeros(3)
+    turn[along] = 1.0
+    cosine, sine = np.cos(half)[..., None], np.sin(half)[..., None]
+    scalar, vector = quaternion[..., :1], quaternion[..., 1:]
+    return np.concatenate(
+        [
+            cosine * scalar - sine * vector[..., along : along + 1],
+            cosine * vector + sine * (scalar * turn + np.cross(turn, vector)),
+        ],
+        axis=-1,
+    )
 
 
 def _three(field: str, vector: Vector) -> tuple[Any, ...]:

@@ -26,7 +26,7 @@ import lqrsim as ls
 
 pytest.importorskip("cyclonedds", reason="needs the `ros` extra")
 
-from lqrsim import bridge
+from lqrsim import bridge, rotations
 
 LOOPBACK = """<CycloneDDS><Domain>
   <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces></General>
@@ -106,6 +106,26 @@ def test_messages_have_the_bytes_of_ros_2(kind: str) -> None:
             assert theirs.velocity.tolist() == [0.5, 0.25]
         case _:
             assert theirs.data.tolist() == ours.data
+
+
+@pytest.mark.parametrize("axis", rotations.AXES)
+def test_odometry_of_turns_and_tilts(axis: str) -> None:
+    """As a robot from an MJCF with `turns_about` has them, whose states name the axis; there and back, to rounding."""
+    names = ("rx", "ry", "rz")
+    space = ls.types.Coordinates(
+        names=names, units=("rad",) * 3, rotation_vectors=(0,), angles=(rotations.AXES.index(axis),)
+    )
+    assert bridge._turns_about(space, names) == axis
+    assert bridge._turns_about(replace(space, angles=()), names) is None
+    values = dict(zip(ODOMETRY, np.random.default_rng(0).normal(size=12).tolist(), strict=True))
+    message = bridge._Node(None).odometry(values, 0.0, turns_about=axis)
+    turn, tilt = ({name: values[name] * (name[1] == axis) for name in names}, dict.fromkeys(names, 0.0))
+    tilt |= {name: values[name] for name in names if name[1] != axis}
+    turned = Rotation.from_rotvec(list(turn.values())) * Rotation.from_rotvec(list(tilt.values()))
+    found = [getattr(message.pose.pose.orientation, name) for name in "xyzw"]
+    np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), turned.as_matrix(), atol=1e-14)
+    again = bridge._of_odometry(message, turns_about=axis)
+    np.testing.assert_allclose([again[name] for name in values], list(values.values()), atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -1,5 +1,6 @@
 """Representatives of angles and rotation vectors, against SciPy's rotations."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
+from lqrsim.control.controllers import turn_to_nearest
+from lqrsim.errors import Array
 
 SPACE = ls.types.Coordinates(
     names=("x", "heading", "rx", "ry", "rz"), units=("m", *("rad",) * 4), angles=(1,), rotation_vectors=(2,)
@@ -33,6 +36,30 @@ def test_nearest_is_the_same_pose_and_the_nearest_of_all(seed: int) -> None:
     best = min(np.linalg.norm(other - near[2:]) for other in others)
     assert np.linalg.norm(found[2:] - near[2:]) <= best + 1e-12
     assert abs(found[1] - near[1]) <= np.pi + 1e-12
+
+
+@pytest.mark.parametrize("turn", range(3))
+@settings(max_examples=examples(100))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_turn_and_a_tilt_are_each_the_nearest(turn: int, seed: int) -> None:
+    rng, axis = np.random.default_rng(seed), np.eye(3)[turn]
+    space = ls.types.Coordinates(names=("rx", "ry", "rz"), units=("rad",) * 3, angles=(turn,), rotation_vectors=(0,))
+    vector, near = rng.normal(size=(2, 3)) * np.where(axis, 10, 3)
+    found = space.nearest(vector, near)
+
+    def attitude(one: Array) -> Rotation:
+        return Rotation.from_rotvec(one[turn] * axis) * Rotation.from_rotvec(np.where(axis, 0, one))
+
+    # 1e-7, as the arc cosine of an angle near zero has half the digits.
+    assert (attitude(found) * attitude(vector).inv()).magnitude() < 1e-7
+    tilt = np.where(axis, 0, vector)
+    others = [tilt * (1 + 2 * np.pi * k / np.linalg.norm(tilt)) for k in range(-5, 6)]
+    turns = [vector[turn] + 2 * np.pi * k for k in range(-9, 10)]
+    best = min(np.linalg.norm(one + other * axis - near) for one in others for other in turns)
+    assert np.linalg.norm(found - near) <= best + 1e-12
+    compiled = vector[None, None].copy()
+    turn_to_nearest(space, compiled, near[None])
+    np.testing.assert_allclose(compiled[0, 0], found, rtol=0, atol=1e-12)  # rounding of a few turns
 
 
 def test_the_identity_takes_the_axis_of_its_neighbour() -> None:
@@ -68,6 +95,13 @@ def test_a_vector_near_enough_is_returned_to_the_bit() -> None:
 def test_what_does_not_fit_is_refused(fields: dict, message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
         ls.types.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})
+
+
+def test_of_a_rotation_vector_one_entry_at_most_is_an_angle() -> None:
+    with pytest.raises(
+        ls.InputError, match=r"^angles: got rx, rz of one rotation vector, want at most one of the three"
+    ):
+        dataclasses.replace(SPACE, angles=(2, 4))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,9 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sampling import examples
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -175,6 +178,32 @@ def test_quaternions_and_rotation_vectors_are_scipys() -> None:
     ):
         with pytest.raises(ls.InputError, match=r"(quaternion|rotation_vector): got .*, want .*\(\.\.\., [34]\)"):
             function(bad)
+
+
+@pytest.mark.parametrize("axis", rotations.AXES)
+@settings(max_examples=examples(100))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_turns_after_tilts_are_scipys(axis: str, seed: int) -> None:
+    """Any number of turns, and tilts of up to 170 degrees, where errors are some ten times as large as elsewhere."""
+    rng, along = np.random.default_rng(seed), np.eye(3)[rotations.AXES.index(axis)]
+    tilt = np.where(along, 0.0, rng.normal(size=(20, 3)))
+    tilt *= np.deg2rad(rng.uniform(0, 170, (20, 1))) / np.linalg.norm(tilt, axis=1, keepdims=True)
+    turn = rng.choice([1.0, 30.0]) * rng.normal(size=(20, 1))
+    found = Rotation.from_rotvec(turn * along) * Rotation.from_rotvec(tilt)
+    there = rotations.quaternion(turn * along + tilt, turns_about=axis)
+    np.testing.assert_allclose(np.abs(np.sum(there * found.as_quat(scalar_first=True), axis=1)), 1, rtol=0, atol=1e-12)
+    for factor in (1.0, -3.0):
+        back = rotations.rotation_vector(factor * there, turns_about=axis)
+        np.testing.assert_allclose(np.where(along, 0.0, back), tilt, rtol=0, atol=1e-12)
+        turned = back @ along
+        np.testing.assert_allclose(np.exp(1j * turned), np.exp(1j * turn[:, 0]), rtol=0, atol=1e-12)
+        assert (np.abs(turned) <= np.pi).all()
+
+
+def test_axes_have_names() -> None:
+    for function, numbers in ((rotations.quaternion, np.zeros(3)), (rotations.rotation_vector, np.ones(4))):
+        with pytest.raises(ls.InputError, match="turns_about: got 'w', want one of: x, y, z"):
+            function(numbers, turns_about="w")
 
 
 @pytest.mark.parametrize("level", ["symbolic", "compiled", "plain"])

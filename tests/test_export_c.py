@@ -76,6 +76,7 @@ def coordinates(draw: st.DrawFn, sizes: st.SearchStrategy[int], *, turning: bool
         return ls.types.Coordinates(names=tuple(names), units=tuple(units), low=tuple(low), high=tuple(high))
     vector = (size - 3,) if size >= 3 and draw(st.booleans()) else ()
     angles = tuple(i for i in range(size - 3 * len(vector)) if draw(st.booleans()))
+    angles += tuple(first + draw(st.integers(0, 2)) for first in vector if draw(st.booleans()))
     for i in (*angles, *(first + k for first in vector for k in range(3))):
         units[i] = "rad"
     return ls.types.Coordinates(names=tuple(names), units=tuple(units), angles=angles, rotation_vectors=vector)
@@ -124,9 +125,9 @@ def turned(space: ls.types.Coordinates, near: Array, rng: np.random.Generator, s
     for i in space.angles:
         state[i] = near[i] + rng.uniform(-3, 3) + 2 * np.pi * rng.integers(-3, 4)
     for i in space.rotation_vectors:
-        beside = near[i : i + 3] + rng.uniform(-0.5, 0.5, size=3)
-        length = np.linalg.norm(beside)
-        state[i : i + 3] = beside * (1 + 2 * np.pi * rng.integers(-2, 3) / length)
+        own = [j for j in range(i, i + 3) if j not in space.angles]
+        beside = near[own] + rng.uniform(-0.5, 0.5, size=len(own))
+        state[own] = beside * (1 + 2 * np.pi * rng.integers(-2, 3) / np.linalg.norm(beside))
     return state
 
 

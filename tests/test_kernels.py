@@ -815,10 +815,11 @@ class TestRareEnds:
         sizes = {"N": 4, "M": 1, "W": 5}  # the state that is read is gone then, and cannot be read again
         replay(dynamics.step_source, sizes, "advance", *given, but=("read_from",))
         assert np.isnan(given[-1]).all()
-        for near in ([0.0, 0.0, 0.0], [0.0, 0.0, 6.0], [0.0, -13.0, 0.0]):
-            for turned in ([1.0, 0.0, 0.0, 0.0], [0.8, 0.6, 0.0, 0.0]):
-                given = np.array(turned), 0, np.array(near), 0, np.zeros(3)
-                replay(source_of(mjcf_dynamics), {"N": 6, "M": 1, "W": 7}, "rotation_vector_near", *given)
+        nears = [0.0, 0.0, 0.0], [0.0, 0.0, 6.0], [0.0, -13.0, 0.0]
+        turns = [1.0, 0.0, 0.0, 0.0], [0.8, 0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0]
+        for near, turned, axis in itertools.product(nears, turns, ([0, 0, 0], [0, 0, 1])):
+            given = np.array(turned), 0, np.array([0.0] * mjcf_dynamics.AXIS + axis), np.array(near), 0, np.zeros(3)
+            replay(source_of(mjcf_dynamics), {"N": 6, "M": 1, "W": 7}, "rotation_near", *given)
 
     def test_after_the_last_step_and_in_the_middle(self) -> None:
         data = np.array([2.0, 1.0, -1.0, 2.0, 0.5, np.inf, 0.0, 1.0, np.inf, -np.inf, 0.1])  # two rows, of two knots
@@ -1032,7 +1033,7 @@ class TestParts:
     def test_mujoco(self, kind: str) -> None:
         """MuJoCo's own steps, called from plain Python and from compiled code; it starts each from nothing."""
         drawn = mjcf_files.draw(kind, 3, "Euler")  # whose steps can be had in parts
-        robot = ls.MjcfRobot(scene_from_xml(drawn.xml, kind))
+        robot = ls.MjcfRobot(scene_from_xml(drawn.xml, kind), turns_about="z" if kind == "box" else None)
         dynamics = robot.dynamics
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = robot.at() + 0.1 * np.random.default_rng(0).normal(size=n)
@@ -1043,7 +1044,8 @@ class TestParts:
     @pytest.mark.parametrize("touching", [True, *rarely(False)])
     def test_distances_and_sites_of_mujoco(self, touching: bool) -> None:
         """Of a robot with a free, a ball and a hinge joint, clear of a mesh and a plane or within them."""
-        robot = ls.MjcfRobot(scene_from_xml(FLOATING, "floating", obstacles=False), obstacles=("rock", "plane"))
+        scene, axis = scene_from_xml(FLOATING, "floating", obstacles=False), "y" if touching else None
+        robot = ls.MjcfRobot(scene, obstacles=("rock", "plane"), turns_about=axis)
         n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
         x, u, world = 0.3 * np.random.default_rng(0).normal(size=n), np.ones(m), robot.scene.world
         x[:3] = (0.8, 0.1, 0.1) if touching else (0.3, 0.1, 0.2)
@@ -1104,9 +1106,10 @@ class TestParts:
 
 
 class TestControl:
-    @pytest.mark.parametrize("kind", ["angles", "rotations"])
+    @pytest.mark.parametrize("kind", ["angles", "rotations", "turns"])
     def test_laws_of_many_states(self, kind: str) -> None:
-        turns: dict[str, Any] = {"angles": ("a", "c")} if kind == "angles" else {"rotation_vectors": [("b", "c", "d")]}
+        turns: dict[str, Any] = {} if kind == "rotations" else {"angles": ("a", "c")}
+        turns |= {} if kind == "angles" else {"rotation_vectors": [("b", "c", "d")]}
         dynamics = ls.Dynamics(
             lambda x, u, p: [u[0]] * 4, states=dict.fromkeys("abcd", ""), controls={"u": ""}, **turns
         )

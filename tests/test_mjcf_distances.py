@@ -48,7 +48,8 @@ def arm(own: str, other: str, seed: int) -> ls.MjcfRobot:
             <geom name="tip" type="{own}" {SHAPES[own]} pos="0.1 0 0" euler="10 20 30"/></body></body></body>
       </worldbody>
       <actuator><motor joint="elbow"/></actuator></mujoco>"""
-    return ls.MjcfRobot(scene_from_xml(xml, "arm", obstacles=False), obstacles=("other", "ball"))
+    axis = (None, "x", "y", "z")[seed % 4]
+    return ls.MjcfRobot(scene_from_xml(xml, "arm", obstacles=False), obstacles=("other", "ball"), turns_about=axis)
 
 
 def by_bindings(robot: ls.MjcfRobot, state: Array, displaced: Array | None = None) -> Array:
@@ -269,7 +270,7 @@ SITES = '<site name="tool" pos="0.25 0.01 0.02" euler="10 20 30"/>'
 def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     xml = arm("capsule", "sphere", seed % 7).scene.xml.replace('<geom name="tip"', f'{SITES}<geom name="tip"')
-    robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
+    robot = ls.MjcfRobot(scene_from_xml(xml, "arm"), turns_about=(None, "x", "y", "z")[seed % 4])
     n = len(robot.dynamics.state_coordinates)
     state, orientation = robot.at() + rng.normal(0, 0.4, n), rng.normal(size=4)
     model, data = robot.scene.model, mujoco.MjData(robot.scene.model)

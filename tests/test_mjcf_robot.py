@@ -33,7 +33,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 @cache
 def robot_of(kind: str, seed: int, integrator: str | None = None) -> tuple[ls.MjcfRobot, mjcf_files.Drawn]:
     drawn = mjcf_files.draw(kind, seed, integrator)
-    return ls.MjcfRobot(scene_from_xml(drawn.xml, kind)), drawn
+    axis = (None, "x", "y", "z")[seed % 4] if kind in ("arm", "box") else None  # those with a ball or free joint
+    return ls.MjcfRobot(scene_from_xml(drawn.xml, kind), turns_about=axis), drawn
 
 
 def near_rest(robot: ls.MjcfRobot, seed: int, size: float = 0.4) -> tuple[Array, Array]:

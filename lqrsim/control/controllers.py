@@ -54,8 +54,8 @@ def _laws(n: int, m: int) -> CompiledModule:
 
 def turning_of(space: Coordinates) -> AngularStates:
     """The states that are to be turned to the nearest, in the form that `kernels/policy_evaluation.py` takes."""
-    angles, rotations = (np.array(one, dtype=np.float64) for one in (space.angles, space.rotation_vectors))
-    return AngularStates(angles, len(angles), rotations, len(rotations))
+    angles, rotations = np.array(space.angles, dtype=np.float64), np.array([space.rotation_vectors, space.turns]).T
+    return AngularStates(angles, len(angles), in_c_order(rotations), len(rotations))
 
 
 ControlFunction = Callable[[Array, float], npt.ArrayLike]

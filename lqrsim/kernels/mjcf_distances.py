@@ -11,6 +11,7 @@ from math import sqrt
 
 from lqrsim.kernels.declarations import N, at, call, call_for_value, int32, outline, stack, store
 from lqrsim.kernels.mjcf_dynamics import (
+    AXIS,
     BALL,
     COMPOS,
     DATA,
@@ -32,7 +33,7 @@ from lqrsim.kernels.mjcf_dynamics import (
     take_slot,
     write_positions,
 )
-from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio
+from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio, sine_ratio
 
 ROWS = 1  # number of rows
 LARGEST, PAIRS, PAIR = 3, 4, 7  # indices of the largest distance and the pairs in data, and count of numbers per pair
@@ -170,24 +171,30 @@ def write_normal(one, own, other, distance, segment, normal):
 
 
 def turn_to_states(x, p, slope):
-    """Convert a derivative in angular velocities, in place, to a derivative in the states' rotation vectors.
+    """Convert a derivative in angular velocities, in place, to a derivative in the states' rotations.
 
-    A rotation vector r that changes by dr turns the body by dr - cosine r x dr + cubic r x (r x dr), in its own axes.
+    A tilt t that changes by dt turns the body by dt - cosine t x dt + cubic t x (t x dt), in its own axes; a turn about
+    an axis n that changes by ds, by n - sine t x n + cosine t x (t x n) times ds. Without an axis all is tilt.
     """
-    once, twice = stack(3), stack(3)
+    tilt, once, twice = stack(3), stack(3), stack(3)
     for k in range(int(p[JOINTS])):
         kind, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 2])
         if kind <= BALL:
             d = d + 3 if kind == FREE else d
-            square = x[d] * x[d] + x[d + 1] * x[d + 1] + x[d + 2] * x[d + 2]
-            cross(x, d, slope[d], slope[d + 1], slope[d + 2], once)
-            cross(x, d, once[0], once[1], once[2], twice)
             for i in range(3):
-                slope[d + i] += cosine_ratio(square) * once[i] + cubic_ratio(square) * twice[i]
+                tilt[i] = (1.0 - p[AXIS + i]) * x[d + i]
+            square = tilt[0] * tilt[0] + tilt[1] * tilt[1] + tilt[2] * tilt[2]
+            cross(tilt, slope[d], slope[d + 1], slope[d + 2], once)
+            cross(tilt, once[0], once[1], once[2], twice)
+            for i in range(3):
+                if p[AXIS + i] == 1:
+                    slope[d + i] += sine_ratio(square) * once[i] + cosine_ratio(square) * twice[i]
+                else:
+                    slope[d + i] += cosine_ratio(square) * once[i] + cubic_ratio(square) * twice[i]
 
 
-def cross(x, d, a, b, c, out):
-    """Write x[d:d+3] x (a, b, c)."""
-    out[0] = x[d + 1] * c - x[d + 2] * b
-    out[1] = x[d + 2] * a - x[d] * c
-    out[2] = x[d] * b - x[d + 1] * a
+def cross(tilt, a, b, c, out):
+    """Write tilt x (a, b, c)."""
+    out[0] = tilt[1] * c - tilt[2] * b
+    out[1] = tilt[2] * a - tilt[0] * c
+    out[2] = tilt[0] * b - tilt[1] * a

@@ -1,16 +1,16 @@
 """MuJoCo's own steps as dynamics: a control period by `mj_step` and its parts, called at their addresses.
 
 States are tangent coordinates: a position for each degree of freedom, then the velocities, then the actuators' own
-states. The rotation of a ball or free joint is three numbers, a rotation vector. `p` has the wrench on the body, then
-addresses and sizes, at the indices named below; `scenes/mjcf_physics.py` writes it. Several threads may run these
-functions at once. Each takes a slot, an `MjData` that it owns for as long as it needs it. If bodies carry loads, a slot
-also has its own model.
+states. The rotation of a ball or free joint is three numbers: a rotation vector, or a turn about an axis after a tilt,
+see `rotations.py`. `p` has the wrench on the body, then addresses and sizes, at the indices named below;
+`scenes/mjcf_physics.py` writes it. Several threads may run these functions at once. Each takes a slot, an `MjData` that
+it owns for as long as it needs it. If bodies carry loads, a slot also has its own model.
 
 A step and its helper functions are compiled separately. Functions that do arithmetic here are therefore `outline` and
 `exact`. Otherwise LLVM would reorder sums depending on where they are inlined, and bits would depend on the thread.
 """
 
-from math import atan2, cos, nan, pi, sqrt
+from math import atan2, cos, nan, pi, sin, sqrt
 
 from lqrsim.kernels.declarations import (
     M,
@@ -40,11 +40,12 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # helpers; YIELD: the address of the function that yields to other threads; KINEMATICS, RESET, COMPOS, JAC, DISTANCE:
 # the addresses of mj_kinematics, mj_resetData, mj_comPos, mj_jac and mj_geomDistance; DISTANCE_MODEL: the model for
 # distances. LOADED, LOADS: number of bodies that may carry a load, and address of the loads, in kg; the numbers of
-# these bodies and their own masses follow. CONSTANTS: the address of mj_setConst. TABLE: the joints' kind and places in
-# qpos and qvel, three numbers each.
+# these bodies and their own masses follow. CONSTANTS: the address of mj_setConst. AXIS: the axis of turns, a one and
+# two zeros; three zeros for rotation vectors. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, STEP_SKIP, KEEPS = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS, TABLE = 22, 23, 24, 25, 26, 27, 28, 29, 30
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, LOADED, LOADS, CONSTANTS = 22, 23, 24, 25, 26, 27, 28, 29
+AXIS, TABLE = 30, 33
 
 # Addresses that a slot has for its MjData, and their number.
 DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
@@ -316,9 +317,9 @@ def write_positions(x, p, qpos):
         if kind == FREE:
             for i in range(3):
                 qpos[q + i] = x[d + i]
-            write_quaternion(x, d + 3, qpos, q + 3)
+            write_quaternion(x, d + 3, p, qpos, q + 3)
         elif kind == BALL:
-            write_quaternion(x, d, qpos, q)
+            write_quaternion(x, d, p, qpos, q)
         else:
             qpos[q] = x[d]
 
@@ -362,7 +363,7 @@ def step_from(z, near, p, one, guess, kept, out):
 
 
 def read_from(near, p, one, out):
-    """Write the state of an MjData, with the rotation vectors nearest to the vectors in `near`; NaN if invalid."""
+    """Write the state of an MjData, with the rotations nearest to those in `near`; NaN if invalid."""
     nv, na = int(p[NV]), int(p[NA])
     qpos, qvel, act = at(one[QPOS]), at(one[QVEL]), at(one[ACT])
     for k in range(int(p[JOINTS])):
@@ -370,9 +371,9 @@ def read_from(near, p, one, out):
         if kind == FREE:
             for i in range(3):
                 out[d + i] = qpos[q + i]
-            rotation_vector_near(qpos, q + 3, near, d + 3, out)
+            rotation_near(qpos, q + 3, p, near, d + 3, out)
         elif kind == BALL:
-            rotation_vector_near(qpos, q, near, d, out)
+            rotation_near(qpos, q, p, near, d, out)
         else:
             out[d] = qpos[q]
     for i in range(nv):
@@ -390,38 +391,56 @@ def read_from(near, p, one, out):
 
 @outline
 @exact
-def write_quaternion(x, first, qpos, q):
-    """Write the quaternion of the rotation vector that begins at x[first]."""
-    square = 0.0
+def write_quaternion(x, first, p, qpos, q):
+    """Write the quaternion of the rotation that begins at x[first]: its tilt, then its turn about the axis."""
+    tilt, turn, square = stack(3), 0.0, 0.0
     for i in range(3):
-        square += x[first + i] * x[first + i]
-    ratio = 0.5 * sine_ratio(0.25 * square)
-    qpos[q] = cos(0.5 * sqrt(square))
+        turn += p[AXIS + i] * x[first + i]
+        tilt[i] = (1.0 - p[AXIS + i]) * x[first + i]
+        square += tilt[i] * tilt[i]
+    scalar, ratio = cos(0.5 * sqrt(square)), 0.5 * sine_ratio(0.25 * square)
+    cosine, sine = cos(0.5 * turn), sin(0.5 * turn)
+    qpos[q] = cosine * scalar
     for i in range(3):
-        qpos[q + 1 + i] = ratio * x[first + i]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        across = p[AXIS + j] * tilt[k] - p[AXIS + k] * tilt[j]
+        qpos[q + 1 + i] = ratio * (cosine * tilt[i] + sine * across) + sine * scalar * p[AXIS + i]
 
 
 @outline
 @exact
-def rotation_vector_near(qpos, q, near, first, out):
-    """Write a quaternion's rotation vector to out[first], the vector nearest to the vector in `near`."""
-    sine, along, length = 0.0, 0.0, 0.0
+def rotation_near(qpos, q, p, near, first, out):
+    """Write a quaternion's rotation to out[first], that nearest to the rotation in `near`: in its turn and its tilt."""
+    along, turn = 0.0, 0.0
     for i in range(3):
-        sine += qpos[q + 1 + i] * qpos[q + 1 + i]
-        along += qpos[q + 1 + i] * near[first + i]
-        length += near[first + i] * near[first + i]
-    sine = sqrt(sine)
-    if sine < 1e-150:
+        along += p[AXIS + i] * qpos[q + 1 + i]
+        turn += p[AXIS + i] * near[first + i]
+    turned = 2 * atan2(along, qpos[q])
+    turned += 2 * pi * nearest_whole((turn - turned) / (2 * pi))
+    # The quaternion without its turn is (scalar, tilt); the sign is such that the scalar is not negative.
+    scalar = sqrt(qpos[q] * qpos[q] + along * along)
+    cosine, sine = (qpos[q] / scalar, along / scalar) if scalar > 0 else (1.0, 0.0)
+    tilt, goal, square, inner, length = stack(3), stack(3), 0.0, 0.0, 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        across = p[AXIS + j] * qpos[q + 1 + k] - p[AXIS + k] * qpos[q + 1 + j]
+        tilt[i] = (1.0 - p[AXIS + i]) * (cosine * qpos[q + 1 + i] - sine * across)
+        goal[i] = (1.0 - p[AXIS + i]) * near[first + i]
+        square += tilt[i] * tilt[i]
+        inner += tilt[i] * goal[i]
+        length += goal[i] * goal[i]
+    size, length = sqrt(square), sqrt(length)
+    if size < 1e-150:
         # The identity has any axis; use the axis of `near`.
-        turns = 2 * pi * nearest_whole(sqrt(length) / (2 * pi))
-        scale = turns / sqrt(length) if turns > 0 else 0.0
+        turns = 2 * pi * nearest_whole(length / (2 * pi))
+        scale = turns / length if turns > 0 else 0.0
         for i in range(3):
-            out[first + i] = scale * near[first + i]
+            out[first + i] = scale * goal[i] + turned * p[AXIS + i]
         return
-    angle = 2 * atan2(sine, qpos[q])
-    angle += 2 * pi * nearest_whole((along / sine - angle) / (2 * pi))
+    angle = 2 * atan2(size, scalar)
+    angle += 2 * pi * nearest_whole((inner / size - angle) / (2 * pi))
     for i in range(3):
-        out[first + i] = angle / sine * qpos[q + 1 + i]
+        out[first + i] = angle / size * tilt[i] + turned * p[AXIS + i]
 
 
 def nearest_whole(number):

@@ -3,7 +3,7 @@
 from math import floor, pi, sqrt
 
 from lqrsim.kernels.control_limits import limited_control
-from lqrsim.kernels.declarations import outline
+from lqrsim.kernels.declarations import outline, stack
 
 
 def apply_policy(count, states, policy, nominal, angular, limits, out):
@@ -35,7 +35,7 @@ def to_nearest(x, nominal, angular):
     for k in range(angular.angle_count):
         nearest_angle(x, nominal, int(angular.angles[k]))
     for k in range(angular.rotation_count):
-        nearest_rotation(x, nominal, int(angular.rotations[k]))
+        nearest_rotation(x, nominal, int(angular.rotations[k, 0]), int(angular.rotations[k, 1]))
 
 
 def nearest_angle(x, nominal, i):
@@ -43,19 +43,26 @@ def nearest_angle(x, nominal, i):
     x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)
 
 
-def nearest_rotation(x, nominal, first):
+def nearest_rotation(x, nominal, first, turn):
     """Replace the rotation vector at x[first] by the nearest to the nominal among (angle + 2 pi k) axis, which are all
-    the same rotation; see coordinates.py.
+    the same rotation; without its entry `turn`, 0 to 2, if that is an angle. See coordinates.py.
     """
-    a, b, c = x[first], x[first + 1], x[first + 2]
-    u, v, w = nominal[first], nominal[first + 1], nominal[first + 2]
-    angle, distance = sqrt(a * a + b * b + c * c), sqrt(u * u + v * v + w * w)
-    if angle < 1e-12:  # the identity has every axis
-        scale = 1.0 / distance if distance > 0.0 else 0.0
-        a, b, c = u * scale, v * scale, w * scale
-    else:
-        a, b, c = a / angle, b / angle, c / angle
-    turns = floor((a * u + b * v + c * w - angle) / (2.0 * pi) + 0.5)
+    axis, near, square, length, along = stack(3), stack(3), 0.0, 0.0, 0.0
+    for i in range(3):
+        axis[i], near[i] = 0.0, 0.0
+        if i != turn:
+            axis[i], near[i] = x[first + i], nominal[first + i]
+        square += axis[i] * axis[i]
+        length += near[i] * near[i]
+    angle, distance = sqrt(square), sqrt(length)
+    for i in range(3):
+        if angle < 1e-12:  # the identity has every axis
+            axis[i] = near[i] / distance if distance > 0.0 else 0.0
+        else:
+            axis[i] /= angle
+        along += axis[i] * near[i]
+    turns = floor((along - angle) / (2.0 * pi) + 0.5)
     if turns != 0:
-        turned = angle + 2.0 * pi * turns
-        x[first], x[first + 1], x[first + 2] = turned * a, turned * b, turned * c
+        for i in range(3):
+            if i != turn:
+                x[first + i] = (angle + 2.0 * pi * turns) * axis[i]

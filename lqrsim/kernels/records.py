@@ -755,7 +755,9 @@ class Measurements(NamedTuple):
 
 
 class AngularStates(NamedTuple):
-    """Indices (any,) of the angles, and of the first entries of rotation vectors, with their numbers."""
+    """Indices (any,) of the angles; of rotation vectors (any, 2) the index, and which entry is an angle, or -1; and
+    their numbers.
+    """
 
     angles: Arrays
     angle_count: int

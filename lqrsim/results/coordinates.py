@@ -56,7 +56,8 @@ class Coordinates:
       offset: coordinate of the plane along the third axis, in metres: the y of "xz". A vertical plane has an offset, 0
         by default. A horizontal plane has none by default: the world is then seen from above. See `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
-      rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
+      rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad. If
+        one of the three is also an angle, it is a turn about its axis, after a tilt by the vector of the other two.
       low: lower limit of each entry, (len(names),); -inf where there is none.
       high: upper limit of each entry, (len(names),); inf where there is none.
     """
@@ -104,6 +105,11 @@ class Coordinates:
                 if self.units[entry] not in ("", unit):
                     name = self.names[entry]
                     raise InputError(f"units: {name}: got {excerpt(self.units[entry])}, want {unit!r} {why}")
+        for first in self.rotation_vectors:
+            if len(turns := [self.names[i] for i in range(first, first + 3) if i in self.angles]) > 1:
+                raise InputError(
+                    f"angles: got {', '.join(turns)} of one rotation vector, want at most one of the three"
+                )
         plane = self._plane()
         if len(plane) != 2 and self.offset is not None:
             raise InputError(
@@ -130,6 +136,11 @@ class Coordinates:
     def rules(self) -> str:
         """Limits, and which entries wrap, as text: what controls depend on, for hashes."""
         return f"{self.low} {self.high} {self.angles} {self.rotation_vectors}"
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """Which entry of each rotation vector, 0 to 2, is an angle, a turn about its axis; -1 if none is."""
+        return tuple(next((i for i in range(3) if first + i in self.angles), -1) for first in self.rotation_vectors)
 
     def _plane(self) -> str:
         """The plane: as given, from the names, or the default. Raises InputError if these contradict each other."""
@@ -226,8 +237,9 @@ class Coordinates:
         out = out.copy()
         for i in self.angles:
             out[..., i] -= 2 * np.pi * np.round((out[..., i] - near[..., i]) / (2 * np.pi))
-        for i in self.rotation_vectors:
-            out[..., i : i + 3] = _nearest_rotation_vector(out[..., i : i + 3], near[..., i : i + 3])
+        for first, turn in zip(self.rotation_vectors, self.turns, strict=True):
+            own = slice(first, first + 3) if turn < 0 else [first + i for i in range(3) if i != turn]
+            out[..., own] = _nearest_rotation_vector(out[..., own], near[..., own])
         return out
 
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
@@ -390,7 +402,7 @@ def _letter(name: str) -> str:
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:
-    """The rotation nearest to `near` among the equal rotations `(angle + 2 pi k) axis`; both (..., 3)."""
+    """The rotation nearest to `near` among the equal rotations `(angle + 2 pi k) axis`; (..., 3), of tilts (..., 2)."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     distance = np.linalg.norm(near, axis=-1, keepdims=True)
     # The identity has every axis; take the axis that `near` points along.

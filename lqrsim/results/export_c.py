@@ -300,7 +300,8 @@ def _nearest(law: AffinePolicy | OutputFeedbackPolicy, number: str) -> str:
     for name, space in spaces.items():
         lines = ["(void)x;", "(void)near;"] if not (space.angles or space.rotation_vectors) else []
         lines += [f"x[{i}] -= TURN * RINT((x[{i}] - near[{i}]) / TURN);" for i in space.angles]
-        lines += [f"nearest_rotation(x + {i}, near + {i});" for i in space.rotation_vectors]
+        rotations = zip(space.rotation_vectors, space.turns, strict=True)
+        lines += [f"nearest_rotation(x + {i}, near + {i}, {turn});" for i, turn in rotations]
         inside = "".join(f"    {line}\n" for line in lines)
         text += "/* Replace angles and rotation vectors by their representatives nearest to others. */\n"
         text += f"static void {name}(real *x, const real *near)\n{{\n{inside}}}\n\n"
@@ -315,8 +316,8 @@ def _comment(text: str) -> str:
 def _entries(measured: Coordinates, start: Array, controls: Coordinates) -> str:
     """The lines of a comment that name measured numbers, with their values (Y,) at the start, and commands."""
     lines = ["measured, with what the plan expects at its start:"]
-    turning = dict.fromkeys(measured.angles, ", an angle")
-    turning |= {i + j: ", of a rotation vector" for i in measured.rotation_vectors for j in range(3)}
+    turning = {i + j: ", of a rotation vector" for i in measured.rotation_vectors for j in range(3)}
+    turning |= dict.fromkeys(measured.angles, ", an angle")
     for i, (label, value) in enumerate(zip(measured.labels, start.tolist(), strict=True)):
         lines.append(f"  {i}: {label}{turning.get(i, '')}, {value:.6g}")
     lines.append("command, with its limits:")

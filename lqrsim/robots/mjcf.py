@@ -37,6 +37,7 @@ from lqrsim.robots.force_limits import ForceLimits
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_shapes import MjcfBalls, MjcfGeoms
 from lqrsim.robots.self_clearance import SelfClearance
+from lqrsim.rotations import AXES
 from lqrsim.scenes.mjcf_holding import ForceLimit, Holding, efforts, holding, limited_forces, settled
 from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
@@ -44,7 +45,6 @@ from lqrsim.scenes.mjcf_obstacles import in_the_way, mounting_pairs, outline_of
 from lqrsim.scenes.scene import Choice, Scene, chosen_geoms, obstacle_geoms, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, World
 
-_AXES = "xyz"
 _SHARPNESS, _SHYNESS = 20.0, 0.1  # of ObstacleCost, in 1/m; weight: cost of a contact, 20 % of it at 8 cm
 _ROOM = 0.1, 0.05  # rad or m, and fraction of the range: plans keep from limits the smaller of both
 _PAST = 1e-3  # fraction of a joint's range that a goal may be past its limits
@@ -97,6 +97,10 @@ class MjcfRobot(Robot):
         them, and all geoms on which it stands and that a free joint or a slide moves it over.
       obstacles: the obstacles, if not the default ones: names of geoms or bodies, a function of a geom, or False for
         none, as for `load_scene`. Other geoms collide through MuJoCo's contacts, in the plan, too.
+      turns_about: "x", "y" or "z", if free and ball joints turn about this axis on and on: of the world, or of a ball's
+        parent body. The entry along it, such as `<name>_rz`, is then a turn about it, however many times, after a tilt,
+        the rotation vector of the other two. Only a tilt of half a turn is singular, as upside down. By default all
+        three are a rotation vector, which is singular at whole turns.
       mocap: the keyframe whose mpos and mquat place the mocap bodies, in plans and runs; by default they stay where the
         MJCF has them. In a plan they do not move.
 
@@ -120,10 +124,14 @@ class MjcfRobot(Robot):
         outline: bool | None = None,
         floors: bool = True,
         obstacles: Choice = True,
+        turns_about: str | None = None,
         mocap: str | None = None,
     ) -> None:
         given = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
         self.name, who = given.name, f"MjcfRobot {given.name}"
+        axis = None if turns_about is None else check_name(f"{who}: turns_about", turns_about, AXES)
+        if given.turns_about != axis:
+            given = replace(given, turns_about=axis)
         mjcf = given.complete() if mocap is None else given.complete().with_mocap(mocap, who)
         model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
@@ -132,6 +140,7 @@ class MjcfRobot(Robot):
         self.scene, self.mjcf = scene_of(mjcf, geoms, (*KINDS, *OTHER_KINDS)), mjcf
         self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
+            "turns_about": axis,
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
         self.body = model.body(number).name
@@ -140,14 +149,17 @@ class MjcfRobot(Robot):
         self.activations = len(mjcf.activations)
         names, units = zip(*mjcf.states, strict=True)
         turned = {"free": 3, "ball": 0}  # index among a joint's coordinates at which its rotation vector begins
+        rotations = tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned)
+        if axis is not None and not rotations:
+            raise InputError(f"{who}: turns_about: got {axis!r} without a free or ball joint, want None")
+        turns = [] if axis is None else [first + AXES.index(axis) for first in rotations]
         self._axes = position_of(mjcf, number)
         place, plane = self._position(position, names, who)
         ends = {one.dof: one.limits for one in mjcf.joints if one.limits is not None}
         low, high = zip(*(ends.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
         states = Coordinates(
-            names=names, units=units, position=place, plane=plane, low=low, high=high,
-            rotation_vectors=tuple(one.dof + turned[one.kind] for one in mjcf.joints if one.kind in turned),
-            angles=tuple(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None),
+            names=names, units=units, position=place, plane=plane, low=low, high=high, rotation_vectors=rotations,
+            angles=(*(one.dof for one in mjcf.joints if one.kind == "hinge" and one.limits is None), *turns),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
             mjcf, who, body=number, obstacles=tuple(geoms), states=states, actuators=tuple(range(model.nu)),
@@ -198,7 +210,7 @@ class MjcfRobot(Robot):
         else:
             listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
             found = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
-        plane = "".join(_AXES[axes.of[dof]] for dof in found if dof in axes.of)
+        plane = "".join(AXES[axes.of[dof]] for dof in found if dof in axes.of)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes.of) or "none"
             raise InputError(
@@ -210,7 +222,7 @@ class MjcfRobot(Robot):
     def _shifted(self, names: tuple[str, ...]) -> list[str]:
         """Of each slide that moves the body along an axis, but from another zero: what makes it part of a position."""
         return [
-            f"{names[dof]} is the body's {_AXES[axis]} minus {away:.6g} m, and would be its {_AXES[axis]}"
+            f"{names[dof]} is the body's {AXES[axis]} minus {away:.6g} m, and would be its {AXES[axis]}"
             f' with ref="{away:.6g}" in the <joint>'
             for dof, (axis, away) in self._axes.shifted.items()
         ]

@@ -47,10 +47,10 @@ class MjcfDynamics(Dynamics):
     """`x' = g(x, u)`, by MuJoCo's steps of a whole control period; `MjcfRobot` makes it.
 
     The state is the position of each joint, in MuJoCo's order of degrees of freedom and with rotations of ball and free
-    joints as rotation vectors; then the velocities; then the states of actuators that have states. The control is
-    MuJoCo's `ctrl`. Derivatives are products of those of the physics steps, differences that are each good to 1e-5 of
-    the largest entry; those of an arm's period are good to some 1e-7. There is no rate: solvers in continuous time, and
-    solvers that need an inverse, do not accept these dynamics.
+    joints as rotation vectors, or with `turns_about` as turns and tilts; then the velocities; then the states of
+    actuators that have states. The control is MuJoCo's `ctrl`. Derivatives are products of those of the physics steps,
+    differences that are each good to 1e-5 of the largest entry; those of an arm's period are good to some 1e-7. There
+    is no rate: solvers in continuous time, and solvers that need an inverse, do not accept these dynamics.
 
     Attributes:
       mjcf: the MJCF.
@@ -70,7 +70,7 @@ class MjcfDynamics(Dynamics):
         self._set_mjcf(mjcf)
 
     def _set_mjcf(self, mjcf: MjcfModel) -> None:
-        self.mjcf, self.fixed, self._physics = mjcf, sha256(mjcf.xml, repr(self._stated)), None
+        self.mjcf, self.fixed, self._physics = mjcf, sha256(mjcf.xml, mjcf.turns_about or "", repr(self._stated)), None
         check_planned(mjcf.model, self._name, self._stated["obstacles"])
         loads = [f"{mjcf.model.body(number).name}_load" for number in carriers_of(mjcf.model)]
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
@@ -81,7 +81,7 @@ class MjcfDynamics(Dynamics):
         with _making:
             if self._physics is None:
                 loaded = bool(self.parameters)
-                self._physics = MjcfPhysics(self.mjcf.model, loaded=loaded, **self._stated)
+                self._physics = MjcfPhysics(self.mjcf, loaded=loaded, **self._stated)
             return self._physics
 
     def __getstate__(self) -> dict[str, Any]:
@@ -171,10 +171,13 @@ class MjcfDynamics(Dynamics):
         return None
 
     def touches(self, states: Array) -> bool:
-        return touches(self.physics.model, states[np.isfinite(states).all(axis=1)])
+        return touches(self.physics.model, self._qpos_of(states[np.isfinite(states).all(axis=1)]))
 
     def untouched_body(self, states: Array, state: int) -> str:
-        return untouched_body(self.physics.model, states, state)
+        return untouched_body(self.physics.model, self._qpos_of(states), state)
+
+    def _qpos_of(self, states: Array) -> Array:
+        return self.mjcf.qpos_of(states[:, : self.mjcf.model.nv])
 
     def _cause_of_failure(self, state: Array) -> str | None:
         found = (one.past_limits(float(state[one.dof]), FAR_PAST) for one in self.mjcf.joints)
@@ -217,7 +220,7 @@ class MjcfDynamics(Dynamics):
         model, nv = self.physics.model, self.mjcf.model.nv
         if model.opt.integrator != RK4:
             return None
-        places, actuators = self.mjcf.qpos_of(states[:, :nv]), self._stated["actuators"]
+        places, actuators = self._qpos_of(states), self._stated["actuators"]
         return self.period, state_jacobians(model, places, states[:, nv:], controls, actuators)
 
     def _with_finer_steps(self, dt: float, most: float) -> str:

@@ -29,6 +29,7 @@ def mjcf(
     steps: int = 150,
     body: str | None = None,
     floors: bool = True,
+    turns_about: str | None = None,
     obstacles: bool | Sequence[str] = True,
     clearance: float | None = None,
     parameters: Mapping[str, float] | None = None,
@@ -49,6 +50,7 @@ def mjcf(
       steps: number of control periods.
       body: as in `MjcfRobot`.
       floors: as in `MjcfRobot`.
+      turns_about: as in `MjcfRobot`.
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       clearance: least distance to obstacles in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
@@ -58,7 +60,7 @@ def mjcf(
     """
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
-    robot = MjcfRobot(path, body=body, floors=floors, obstacles=obstacles, mocap=mocap)
+    robot = MjcfRobot(path, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
     if given:
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")

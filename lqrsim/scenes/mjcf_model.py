@@ -9,8 +9,8 @@ import threading
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -124,10 +124,12 @@ class MjcfModel:
     Attributes:
       name: name of the packaged scene, or the stem of the file.
       xml: the whole MJCF as text, with includes resolved. The model can be made from it alone.
+      turns_about: the axis about which a robot's free and ball joints turn on and on, see `MjcfRobot`; or None.
     """
 
     name: str
     xml: str
+    turns_about: str | None = None
 
     @classmethod
     def of_file(cls, name_or_path: str | os.PathLike[str]) -> "MjcfModel":
@@ -136,7 +138,7 @@ class MjcfModel:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The text: another process compiles it."""
-        return MjcfModel, (self.name, self.xml)
+        return MjcfModel, (self.name, self.xml, self.turns_about)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -208,19 +210,19 @@ class MjcfModel:
 
     def positions_of(self, qpos: Array) -> Array:
         """A robot's positions (..., nv), with rotation vectors, of MuJoCo's (..., nq), with quaternions."""
-        parts = list[Array]()
+        parts, rotation = list[Array](), partial(rotations.rotation_vector, turns_about=self.turns_about)
         for one in self.joints:
             own = qpos[..., one.qpos]
-            turned = [rotations.rotation_vector(own[..., -4:])] if one.kind in ("free", "ball") else [own]
+            turned = [rotation(own[..., -4:])] if one.kind in ("free", "ball") else [own]
             parts += [own[..., :3], *turned] if one.kind == "free" else turned
         return np.concatenate(parts, axis=-1)
 
     def qpos_of(self, positions: Array) -> Array:
         """MuJoCo's positions (..., nq) of a robot's (..., nv)."""
-        parts = list[Array]()
+        parts, quaternion = list[Array](), partial(rotations.quaternion, turns_about=self.turns_about)
         for one in self.joints:
             own = positions[..., one.dofs]
-            turned = [rotations.quaternion(own[..., -3:])] if one.kind in ("free", "ball") else [own]
+            turned = [quaternion(own[..., -3:])] if one.kind in ("free", "ball") else [own]
             parts += [own[..., :3], *turned] if one.kind == "free" else turned
         return np.concatenate(parts, axis=-1)
 
@@ -268,14 +270,14 @@ class MjcfModel:
     def complete(self) -> "MjcfModel":
         """The same with names for all bodies, joints, geoms and actuators, and with a light, if it has none."""
         xml, has_light = mjcf_text.named(self.xml)
-        named = self if xml == self.xml else MjcfModel(self.name, xml)
+        named = self if xml == self.xml else replace(self, xml=xml)
         if has_light or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
             return named
         # The size of the whole is known when it is compiled, and the light is to be in what is compiled.
-        lit = MjcfModel(self.name, mjcf_text.with_light(xml, np.zeros(3)))
+        lit = replace(self, xml=mjcf_text.with_light(xml, np.zeros(3)))
         model = lit.model
         place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
-        found = MjcfModel(self.name, mjcf_text.with_light(xml, place))
+        found = replace(self, xml=mjcf_text.with_light(xml, place))
         for field in (model.light_pos, model.light_pos0, model.light_poscom0):
             field[-1] += [float(f"{number:.6g}") for number in place]
         vars(found)["model"] = model
@@ -290,7 +292,7 @@ class MjcfModel:
         number = self._key(key, what)
         if not (poses := _mocap_poses(self.model, number)):
             return self
-        found = MjcfModel(self.name, mjcf_text.with_mocap(self.xml, self.model, poses, key))
+        found = replace(self, xml=mjcf_text.with_mocap(self.xml, self.model, poses, key))
         if not _same_forces(self.model, number, found.model):
             raise InputError(
                 f"{what}: mocap: got the keyframe {key!r}, whose mocap bodies cannot be placed by rewriting the MJCF,"
@@ -300,11 +302,11 @@ class MjcfModel:
 
     def with_numbers(self, values: Mapping[str, float], what: str) -> "MjcfModel":
         """The same with other `numbers`. Raises InputError as `mjcf_text.with_numbers` does."""
-        return MjcfModel(self.name, mjcf_text.with_numbers(self.xml, self.model, values, what))
+        return replace(self, xml=mjcf_text.with_numbers(self.xml, self.model, values, what))
 
     def with_obstacles(self, world: World) -> "MjcfModel":
         """The same with these obstacles as further geoms. Raises InputError as `mjcf_text.with_obstacles` does."""
-        return MjcfModel(self.name, mjcf_text.with_obstacles(self.xml, world))
+        return replace(self, xml=mjcf_text.with_obstacles(self.xml, world))
 
 
 def model_from_xml(xml: str, what: str) -> mujoco.MjModel:

@@ -13,7 +13,8 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.rotations import AXES
+from lqrsim.scenes.mjcf_model import MjcfModel, unlogged
 
 RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient
@@ -33,7 +34,7 @@ class MjcfPhysics:
     - an unstable simulation is not reset.
 
     Args:
-      model: the MJCF's model, which passes `check_planned`. body: id of the body that is pushed.
+      mjcf: the MJCF, whose model passes `check_planned`. body: id of the body that is pushed.
       actuators: ids of the controlled actuators, in order. obstacles: ids of the geoms that are obstacles.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
@@ -47,7 +48,7 @@ class MjcfPhysics:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        mjcf: MjcfModel,
         *,
         body: int,
         actuators: tuple[int, ...],
@@ -56,6 +57,7 @@ class MjcfPhysics:
         softness: float = 0.0,
         unlimited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ()),
     ) -> None:
+        model = mjcf.model
         self.model = copy.copy(model)
         _prepare(self.model, obstacles)
         self.model.actuator_forcelimited[list(unlimited[0])] = 0
@@ -79,7 +81,7 @@ class MjcfPhysics:
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
         addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
         self._table = np.array(addresses, dtype=np.float64)
-        self.numbers = self._numbers(actuators, self.carriers if loaded else ())
+        self.numbers = self._numbers(actuators, self.carriers if loaded else (), mjcf.turns_about)
 
     def address(self) -> int:
         """The address of the numbers, for kernels of places and distances.
@@ -115,7 +117,7 @@ class MjcfPhysics:
         row[kernel.DATA], row[kernel.OWN_MODEL] = data._address, model._address
         return row.tolist()
 
-    def _numbers(self, actuators: tuple[int, ...], carriers: tuple[int, ...]) -> Array:
+    def _numbers(self, actuators: tuple[int, ...], carriers: tuple[int, ...], turns_about: str | None) -> Array:
         model, functions = self.model, _functions()
         joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
         numbers = np.zeros(kernel.TABLE)
@@ -133,6 +135,8 @@ class MjcfPhysics:
         numbers[kernel.LOADED], numbers[kernel.LOADS] = len(carriers), kernel.TABLE + joints.size + len(actuators)
         loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
         numbers[kernel.CONSTANTS] = functions["mj_setConst"]
+        if turns_about is not None:
+            numbers[kernel.AXIS + AXES.index(turns_about)] = 1.0
         return np.concatenate([numbers, joints.ravel(), actuators, *loads])
 
 
@@ -178,21 +182,25 @@ def _soften(model: mujoco.MjModel, width: float) -> None:
     model.opt.o_solimp[0], model.opt.o_solimp[2] = 0.0, max(width, model.opt.o_solimp[2])
 
 
-def touches(model: mujoco.MjModel, states: Array) -> bool:
-    """Whether a contact or a limit acts at one of these states (k, n), in the form of `kernels/mjcf_dynamics.py`."""
+def touches(model: mujoco.MjModel, qpos: Array) -> bool:
+    """Whether a contact or a limit acts at one of these positions (k, nq)."""
     kinds = mujoco.mjtConstraint.__members__
     one_sided = [int(kind) for name, kind in kinds.items() if name.startswith(("mjCNSTR_LIMIT", "mjCNSTR_CONTACT"))]
-    return any(np.isin(data.efc_type, one_sided).any() for data in _placed(model, states))
+    return any(np.isin(data.efc_type, one_sided).any() for data in _placed(model, qpos))
 
 
-def untouched_body(model: mujoco.MjModel, states: Array, state: int) -> str:
-    """The body that a state (an index) moves, if nothing that moves touches it at any of states (k, n); else empty."""
+def untouched_body(model: mujoco.MjModel, qpos: Array, state: int) -> str:
+    """The body that a state (an index) moves, if nothing that moves touches it at any of these positions; else empty.
+
+    Args:
+      qpos: (k, nq).
+    """
     dof = state % model.nv if state < 2 * model.nv else -1
     if dof < 0:
         return ""
     body = int(model.dof_bodyid[dof])
     roots = model.body_weldid
-    for data in _placed(model, states):
+    for data in _placed(model, qpos):
         for pair in data.contact.geom:
             first, second = (int(roots[model.geom_bodyid[one]]) for one in pair)
             if int(roots[body]) in (first, second) and first and second:
@@ -226,15 +234,11 @@ def state_jacobians(
     return found
 
 
-def _placed(model: mujoco.MjModel, states: Array) -> Iterator[mujoco.MjData]:
-    """MuJoCo's data at the positions of each of these states (k, n)."""
-    data, unturned = mujoco.MjData(model), np.zeros(model.nq)
-    for joint, kind in enumerate(model.jnt_type):
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            unturned[model.jnt_qposadr[joint] + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 0)] = 1.0
-    for state in states:
-        data.qpos[:] = unturned
-        mujoco.mj_integratePos(model, data.qpos, state[: model.nv], 1.0)
+def _placed(model: mujoco.MjModel, qpos: Array) -> Iterator[mujoco.MjData]:
+    """MuJoCo's data at each of these positions (k, nq)."""
+    data = mujoco.MjData(model)
+    for positions in qpos:
+        data.qpos[:] = positions
         with unlogged():
             mujoco.mj_fwdPosition(model, data)
         yield data

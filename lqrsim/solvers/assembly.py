@@ -14,6 +14,7 @@ from lqrsim.results.goal import Target, departure
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
+from lqrsim.rotations import AXES, quaternion, rotation_vector
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult
@@ -26,6 +27,9 @@ BESIDE, LITTLE = 8, 1e-9
 # Distance of a rotation vector from a whole turn, in rad, below which the solution says so. With 0.01 rad of noise, a
 # quadrotor that hovers 0.35 rad from there stays level, and one at 0.17 rad tumbles.
 WHOLE = 0.3
+# That of a tilt from half a turn. An error of the attitude is 2 / HALF times as large in the turn, which is as much as
+# 2 pi / WHOLE times in a rotation vector.
+HALF = 0.1
 FAR = 0.01  # relative decrease of cost that is still predicted; a plan with more is far from an optimum
 
 
@@ -116,27 +120,42 @@ def _doubts(problem: Problem, found: RunResult) -> tuple[str, ...]:
     """Where feedback may fail although the plan is right, in words."""
     if not np.isfinite(found.states).all():
         return ()
-    return _near_whole_turn(problem, found), _fragile(problem, found)
+    return _near_singular(problem, found), _fragile(problem, found)
 
 
-def _near_whole_turn(problem: Problem, found: RunResult) -> str:
-    """Where a rotation vector of the plan is nearly a whole turn, in words; or empty.
+def _near_singular(problem: Problem, found: RunResult) -> str:
+    """Where a rotation of the plan is nearly singular, in words; or empty.
 
-    All rotation vectors of whole turns are the same attitude. Next to them a small error of the attitude is a large one
-    of the vector, or of the axis about which it turns.
+    All rotation vectors of whole turns are the same attitude; and a tilt of half a turn is the same attitude in each
+    direction, with another turn. Next to them a small error of the attitude is a large one of the states.
     """
-    space = problem.dynamics.state_coordinates
-    for first in space.rotation_vectors:
-        angles = np.linalg.norm(found.states[:, first : first + 3], axis=1)
-        turns = np.round(angles / (2 * np.pi))
-        apart = np.where(turns > 0, np.abs(angles - 2 * np.pi * turns), np.inf)
-        if apart.min() < WHOLE:
-            knot, names = int(apart.argmin()), ", ".join(space.names[first : first + 3])
+    space, states = problem.dynamics.state_coordinates, found.states
+    for first, turn in zip(space.rotation_vectors, space.turns, strict=True):
+        entries = [first + i for i in range(3) if i != turn]
+        period, close, what, where = 2 * np.pi, WHOLE, "a whole turn", "rotation vectors"
+        if turn >= 0:
+            period, close, what, where = np.pi, HALF, "half or whole turns", "tilts"
+        angles = np.linalg.norm(states[:, entries], axis=1)
+        turns = np.round(angles / period)
+        apart = np.where(turns > 0, np.abs(angles - period * turns), np.inf)
+        if apart.min() < close:
+            knot, names = int(apart.argmin()), ", ".join(space.names[i] for i in entries)
+            axis = _regular_axis(states[:, first : first + 3]) if problem.dynamics.discrete and turn < 0 else None
             return (
-                f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from a whole turn, where rotation"
-                " vectors are singular: the policy may take an attitude beside the plan's for another turn"
-            )
+                f"at {knot * problem.dt:.4g} s {names} are {apart[knot]:.2g} rad from {what}, where {where} are"
+                " singular: the policy may take an attitude beside the plan's for another turn"
+            ) + (f'; MjcfRobot(..., turns_about="{axis}") has no such place on this way' if axis else "")
     return ""
+
+
+def _regular_axis(vectors: Array) -> str | None:
+    """The axis about which rotation vectors (T+1, 3) are turns with the least tilts; None if a tilt is singular."""
+    tilts = {}
+    for i, axis in enumerate(AXES):
+        turned = rotation_vector(quaternion(vectors), turns_about=axis)
+        tilts[axis] = float(np.linalg.norm(np.delete(turned, i, axis=1), axis=1).max())
+    axis = min(AXES, key=lambda axis: tilts[axis])
+    return axis if tilts[axis] < np.pi - HALF else None
 
 
 def _fragile(problem: Problem, found: RunResult) -> str:

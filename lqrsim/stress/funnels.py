@@ -396,7 +396,8 @@ def _reach(plant: Plant, position: tuple[int, ...], chosen: list[int], shape: Ar
 def _half_turn(solution: Solution, chosen: list[int], shape: Array) -> float:
     """The level at which an angle deviates by half a turn; a larger ellipsoid contains some states twice."""
     space = solution.policy.state_coordinates
-    groups = [[i] for i in space.angles] + [[i, i + 1, i + 2] for i in space.rotation_vectors]
+    turning = [[i, i + 1, i + 2] for i in space.rotation_vectors]
+    groups = [[i] for i in space.angles] + [[i for i in one if i not in space.angles] for one in turning]
     end = np.inf
     for group in groups:
         rows = [chosen.index(i) for i in group if i in chosen]
