@@ -129,8 +129,7 @@ class Render:
             raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
         funnel = save_load.load(self.funnel[0], Funnel) if self.funnel else None
-        for name in rerun_file.write(save_load.load(paths[0], Rollout), out, trial=trials[0], funnel=funnel):
-            console.say(f"left out: {name}, for whose kind Rerun has no shape")
+        rerun_file.write(save_load.load(paths[0], Rollout), out, trial=trials[0], funnel=funnel)
         console.wrote(out)
         return 0
 
