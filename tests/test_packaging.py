@@ -34,7 +34,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_the_models_and_the_experiments(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
     inside = set(zipfile.ZipFile(wheel).namelist())
-    code = [path for ending in ("*.py", "*.j2") for path in (ROOT / "lqrsim").rglob(ending)]
+    code = [path for ending in ("*.py", "*.j2", "*.html") for path in (ROOT / "lqrsim").rglob(ending)]
     sources = {path.relative_to(ROOT).as_posix() for path in code}
     models = {f"lqrsim/models/{path.name}" for path in (ROOT / "models").glob("*.xml")}
     scripts = {f"lqrsim/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "experiments").rglob("*.py")}

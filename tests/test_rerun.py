@@ -75,7 +75,7 @@ def test_what_moves_is_where_mujoco_has_it(run: Path, tmp_path: Path, capsys: py
 def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
     rollout, path = ls.load(run, ls.Rollout), tmp_path / "run.rrd"
-    assert rerun_file.write(rollout, path) == []
+    rerun_file.write(rollout, path)
     found = read(path)
     assert rollout.tube is not None
     assert rollout.collision_chance is not None
@@ -124,8 +124,8 @@ def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "at most one --funnel" in capsys.readouterr().err
 
 
-def test_every_shape_is_drawn_or_named(run: Path, tmp_path: Path) -> None:
-    """A mesh by MuJoCo's own vertices, a capsule from its lower end; a height field, which Rerun has not, is named."""
+def test_every_shape_is_drawn(run: Path, tmp_path: Path) -> None:
+    """A mesh by MuJoCo's own vertices, a capsule from its lower end, a height field by its corners."""
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
     assets = """<asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 2 0  0 0 3"/>
       <hfield name="hills" nrow="2" ncol="2" size="1 1 1 1"/></asset>"""
@@ -135,13 +135,15 @@ def test_every_shape_is_drawn_or_named(run: Path, tmp_path: Path) -> None:
       <geom name="hills" type="hfield" hfield="hills" contype="0" conaffinity="0"/></worldbody>"""
     rollout, path = ls.load(run, ls.Rollout), tmp_path / "shapes.rrd"
     xml = rollout.model.replace("<worldbody>", f"{assets}<worldbody>", 1).replace("</worldbody>", geoms, 1)
-    assert rerun_file.write(replace(rollout, model=xml), path) == ["hills"]
+    rerun_file.write(replace(rollout, model=xml), path)
     model = model_from_xml(xml, "model")
     found = {name.rpartition(" ")[2]: one for name, one in read(path).items()}
     start = int(model.mesh("wedge").vertadr[0])
     vertices = np.array(found["wedge"]["vertex_positions"][0], dtype=float)
     np.testing.assert_allclose(vertices, model.mesh_vert[start : start + len(vertices)], atol=1e-6)
     np.testing.assert_array_equal(np.array(found["wedge"]["triangle_indices"][0]).shape[1], 3)
+    corners = np.array(found["hills"]["vertex_positions"][0], dtype=float)
+    np.testing.assert_array_equal(corners, [[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]])
     assert numbers(found["pill"], "lengths") == pytest.approx([0.6])
     np.testing.assert_allclose(numbers(found["pill"], "translations"), [[0, 0, -0.3]], atol=1e-6)
     np.testing.assert_allclose(numbers(found["pill"], "translation"), [[1, 2, 3]], atol=1e-6)

@@ -33,16 +33,18 @@ class Render:
       lqrsim render CALM.npz SEVERE.npz --title calm severe --out both.mp4
       lqrsim render RUN.npz --out RUN.gif --speed 2
       lqrsim render RUN.npz --out RUN.png --every 0.5 --quality publication
+      lqrsim render RUN.npz --out RUN.html            # one page with all trials, to send and to open in any browser
       lqrsim render RUN.npz --out RUN.rrd             # a recording for Rerun's viewer; needs lqrsim[rerun]
     """
 
     rollouts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROLLOUT ...", help_behavior_hint="")]
     """Files from `lqrsim simulate`."""
     out: Annotated[Path | None, optional("FILE")] = None
-    """Output: FILE.mp4 (h264), FILE.gif, FILE.png for a still, or FILE.rrd for Rerun. By default the rollout's path
-    with .mp4."""
-    trial: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,)
-    """Row of the rollout, from 0; several rows of one rollout, or one for each of several rollouts."""
+    """Output: FILE.mp4 (h264), FILE.gif, FILE.png for a still, FILE.html for a browser, or FILE.rrd for Rerun. By
+    default the rollout's path with .mp4."""
+    trial: Annotated[tuple[int, ...] | None, optional("N ...")] = None
+    """Row of the rollout, from 0; several rows of one rollout, or one for each of several rollouts. By default 0, and
+    all rows for FILE.html."""
     camera: Annotated[str, arg(metavar="NAME")] = "overview"
     """overview, chase, top or side, or another camera of the scene."""
     inset: Annotated[tuple[str, ...], optional("NAME ...")] = ()
@@ -82,11 +84,11 @@ class Render:
         if not self.rollouts:
             raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
-        if out.suffix.lower() == ".rrd":
-            return self._record(out)
+        if out.suffix.lower() in (".html", ".rrd"):
+            return self._for_viewer(out)
         is_still = out.suffix.lower() == ".png"
         if out.suffix.lower() not in (".mp4", ".gif", ".png"):
-            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png or .rrd")
+            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png, .html or .rrd")
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got {out.name}, want --out FILE.png: they belong to stills")
         console.check_output("--out", out.parent, out.name)
@@ -96,9 +98,9 @@ class Render:
                 console.say(f"no tube in {path}: none was predicted for it")
         solutions = [save_load.load(path, Solution) for path in self.solution]
         funnels = [save_load.load(path, Funnel) for path in self.funnel]
-        one_trial = len(self.trial) == 1
+        rows = (0,) if self.trial is None else self.trial
         options = {
-            "trial": self.trial[0] if one_trial else self.trial, "camera": self.camera, "insets": self.inset,
+            "trial": rows[0] if len(rows) == 1 else rows, "camera": self.camera, "insets": self.inset,
             "titles": self.title, "overlays": self.overlays, "quality": self.quality, "size": self.size,
             "solution": solutions[0] if len(solutions) == 1 else solutions or None,
             "funnel": funnels[0] if len(funnels) == 1 else funnels or None,
@@ -112,25 +114,36 @@ class Render:
         console.wrote(out)
         return 0
 
-    def _record(self, out: Path) -> int:
-        """Write one trial as a recording for Rerun's viewer."""
+    def _for_viewer(self, out: Path) -> int:
+        """Write one run for those who choose camera and time themselves: a page, or a recording for Rerun's viewer."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
         from lqrsim.results.funnel import Funnel
         from lqrsim.results.rollout import Rollout
-        from lqrsim.view import rerun_file
+        from lqrsim.results.solution import Solution
+        from lqrsim.view import html_file, rerun_file
 
-        own, paths, trials = ("rollouts", "out", "trial", "funnel"), list(self.rollouts), list(self.trial)
+        is_page, own, rows = out.suffix.lower() == ".html", ["rollouts", "out", "trial", "funnel"], self.trial
+        if is_page:
+            own += ["overlays", "solution"]
         given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
-        if given or len(paths) > 1 or len(trials) != 1 or len(self.funnel) > 1:
-            got = ", ".join(f"--{name}" for name in given) or "several runs, trials or funnels, or none"
-            want = "one run, one --trial, at most one --funnel, and no other options"
+        several = max(len(self.rollouts), len(self.solution), len(self.funnel)) > 1
+        if given or several or not (is_page or rows is None or len(rows) == 1):
+            what = "runs, solutions or funnels" if is_page else "runs, trials or funnels, or none"
+            got = ", ".join(f"--{name}" for name in given) or f"several {what}"
+            want = "one run, at most one --solution and --funnel, and of other options --trial and --overlays"
+            want = want if is_page else "one run, one --trial, at most one --funnel, and no other options"
             raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
+        rollout = save_load.load(self.rollouts[0], Rollout)
         funnel = save_load.load(self.funnel[0], Funnel) if self.funnel else None
-        for name in rerun_file.write(save_load.load(paths[0], Rollout), out, trial=trials[0], funnel=funnel):
-            console.say(f"left out: {name}, for whose kind Rerun has no shape")
+        if is_page:
+            solution = save_load.load(self.solution[0], Solution) if self.solution else None
+            options = {"overlays": self.overlays, "solution": solution, "funnel": funnel}
+            html_file.render_html(rollout, out, trial=rows, **options)
+        else:
+            rerun_file.write(rollout, out, trial=0 if rows is None else rows[0], funnel=funnel)
         console.wrote(out)
         return 0
 

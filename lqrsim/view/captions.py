@@ -40,8 +40,7 @@ class Caption:
         self.recorded, self.overlays, self.speed, self.over = recorded, overlays, speed, over
         self.letter_height = _letter_height(box.width, box.height)
         which = f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else ""
-        where = "" if run.scene == run.robot else f" in {run.scene}"  # an MJCF with a robot is both robot and scene
-        title = title or f"{run.robot}{where}{which}".replace("_", " ")
+        title = title or f"{recorded.name}{which}"
         self.width = box.width // 4 if over else box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
         # Readings keep their place: next to the title in a strip that is wide enough, otherwise in separate lines.
@@ -99,19 +98,40 @@ class Caption:
         return tuple("   ".join(readings[first:last]) for first, last in pairwise(cuts))
 
     def _readings(self, time: float) -> list[str]:
-        recorded, clearance = self.recorded, self.recorded.interpolate(self.recorded.clearance, time)
-        readings = [f"time {time:.1f} s" + (f" at {self.speed:g}x" if self.speed != 1 else "")]
-        error = recorded.interpolate(recorded.error, time)
-        if recorded.rollout.tracking_unit == OF_RANGE:
-            readings += [f"tracking error {100 * error:.1f} % of range"]
-        else:
-            readings += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
-        readings += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
-        if "forces" in self.overlays.show:
-            readings += [f"force {np.linalg.norm(recorded.force_at(time)):.2f} N"]
-        if (funnel := self.overlays.funnel) is not None:
-            readings += [funnel.said[recorded.step(time)]]
-        return readings + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
+        return readings(self.recorded, self.overlays, time, self.speed)
+
+
+def readings(recorded: RecordedTrial, overlays: Overlays, time: float, speed: float = 1.0) -> list[str]:
+    """Time, error, clearance and force at a time, and whether the run is in the funnel or has ended."""
+    clearance, error = (recorded.interpolate(values, time) for values in (recorded.clearance, recorded.error))
+    found = [f"time {time:.1f} s" + (f" at {speed:g}x" if speed != 1 else "")]
+    if recorded.rollout.tracking_unit == OF_RANGE:
+        found += [f"tracking error {100 * error:.1f} % of range"]
+    else:
+        found += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
+    found += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
+    if "forces" in overlays.show:
+        found += [f"force {np.linalg.norm(recorded.force_at(time)):.2f} N"]
+    if overlays.funnel is not None:
+        found += [overlays.funnel.said[recorded.step(time)]]
+    return found + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
+
+
+def legend_entries(overlays: Sequence[Overlays], scale: Scale) -> dict[str, Colour | None]:
+    """Labels and colours of a picture; the colour None is the map of the tracking error."""
+    named = dict(entry for one in overlays for entry in one.legend_entries())
+    # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
+    entries: dict[str, Colour | None] = {
+        text: colour
+        for text, colour in named.items()
+        if not any(other != text and other.startswith(text) for other in named)
+    }
+    if "trace" in overlays[0].show:
+        full = f"{1e3 * scale.error:g} mm" if scale.error < 1 else f"{scale.error:g} m"
+        if overlays[0].recorded.rollout.tracking_unit == OF_RANGE:
+            full = f"{100 * scale.error:g} % of range"
+        entries[f"driven, tracking error 0 to {full}"] = None
+    return entries
 
 
 class Legend:
@@ -122,18 +142,7 @@ class Legend:
     """
 
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
-        named = dict(entry for one in overlays for entry in one.legend_entries())
-        # If one of two labels begins with the other, as for tubes drawn in part and in full, the longer one stays.
-        entries: dict[str, Colour | None] = {
-            text: colour
-            for text, colour in named.items()
-            if not any(other != text and other.startswith(text) for other in named)
-        }
-        if "trace" in overlays[0].show:
-            full = f"{1e3 * scale.error:g} mm" if scale.error < 1 else f"{scale.error:g} m"
-            if overlays[0].recorded.rollout.tracking_unit == OF_RANGE:
-                full = f"{100 * scale.error:g} % of range"
-            entries[f"driven, tracking error 0 to {full}"] = None
+        entries = legend_entries(overlays, scale)
         letter_height = max(round(0.8 * _letter_height(*size)), 8)
         self.margin = letter_height if over else 0
         width = size[0] - 2 * self.margin

@@ -1,6 +1,6 @@
 """Overlays of pictures, drawn as MuJoCo geoms in addition to the model's: lines, forces, tubes, funnels, the mark."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -24,11 +24,12 @@ MARK_RGB = (0.0, 1.0, 0.0)
 RIM = 1.8  # radius of the black ball, in radii of the green one: a video then blurs one colour into the whole edge
 PLAN_RGB = (0.78, 0.08, 0.42)  # colour of the plan; neither the error map nor a robot has it
 
-# Opacities for planar robots and for robots in space: of a whole tube, of a funnel between its knots, and of a
-# certified ellipsoid.
+# Opacities for planar robots and for robots in space: of a whole tube, of a funnel between its knots, of a certified
+# ellipsoid, and of the planned position.
 OPACITY = {True: 0.43, False: 0.2}
 BETWEEN_OPACITY = {True: 0.4, False: 0.18}
 CERTIFIED_OPACITY = {True: 0.4, False: 0.16}
+GHOST_OPACITY = {True: 0.35, False: 0.10}
 MOST_ELLIPSOIDS = 80  # largest number of ellipsoids; more take too long to draw
 LIFT = 0.006  # m, height of lines above the floor
 
@@ -163,6 +164,7 @@ SLIM = 0.65  # relative width of lines within a tube, which is often hardly wide
 SEGMENTS = 120  # largest number of segments of a line
 MOVING = (0.20, 0.38, 0.62, 0.5)  # obstacles that move, as those of the packaged scenes
 DOTS = 30  # number of latest measured states that are drawn
+ARROW = 4.0  # length of the largest force's arrow, in radii of the robot: longer than the robot, and no path
 END_ON = 0.9  # cosine of the angle to the line of sight above which an arrow is not drawn
 
 
@@ -170,6 +172,25 @@ _DRAWN = {
     "sphere": Geom.mjGEOM_SPHERE, "capsule": Geom.mjGEOM_CAPSULE, "cylinder": Geom.mjGEOM_CYLINDER,
     "box": Geom.mjGEOM_BOX,
 }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnObstacle:
+    """An obstacle that moves.
+
+    Attributes:
+      kind: one of _DRAWN.
+      begin: (3,) its position at the beginning, in metres.
+      velocity: (3,) in m/s.
+      size: (3,) in metres, as of a geom.
+      rotation: (3, 3), its axes as columns.
+    """
+
+    kind: str
+    begin: Array
+    velocity: Array
+    size: Array
+    rotation: Array
 
 
 @dataclass(frozen=True)
@@ -185,10 +206,10 @@ class Scale:
     force: float
 
 
-def common_scale(recordings: Sequence[RecordedTrial]) -> Scale:
+def common_scale(recordings: Iterable[RecordedTrial]) -> Scale:
     """The scale for all of these runs, at all times."""
-    error = max(float(recorded.error.max()) for recorded in recordings)
-    force = max(float(np.linalg.norm(recorded.force, axis=1).max()) for recorded in recordings)
+    largest = [(recorded.error.max(), np.linalg.norm(recorded.force, axis=1).max()) for recorded in recordings]
+    error, force = (float(most) for most in np.max(largest, axis=0))
     return Scale(_round_up(max(error, 0.01)), force)
 
 
@@ -228,8 +249,10 @@ class Overlays:
         self.tube = predicted(recorded) if "tube" in self.show else None
         self.cost_tube = of_cost(recorded, solution) if "cost_tube" in self.show else None
         self.funnel = of_funnel(recorded, funnel) if "funnel" in self.show else None
+        self.moving = _moving(recorded)
         if self.tube is not None:
             self.width *= SLIM
+        self.plan_width, self.trace_width = 0.8 * self.width, (2.6 if recorded.planar else 1.1) * self.width
 
     def legend_entries(self) -> list[tuple[str, Colour]]:
         """Labels and colours, except for the trace."""
@@ -239,9 +262,9 @@ class Overlays:
             "measured": ("measured", MEASURED),
         }
         found = [entry for overlay, entry in entries.items() if overlay in self.show]
-        return found + [(tube.label, colour) for tube, colour, _ in reversed(self._tubes())]
+        return found + [(tube.label, colour) for tube, colour, _ in reversed(self.tubes())]
 
-    def _tubes(self) -> list[tuple[DrawnTube, Colour, float]]:
+    def tubes(self) -> list[tuple[DrawnTube, Colour, float]]:
         """The tubes with their colours, and their heights above a floor relative to LIFT."""
         certified, between = (None, None) if self.funnel is None else (self.funnel.certified, self.funnel.between)
         tubes = (
@@ -255,9 +278,10 @@ class Overlays:
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Append the geoms of a moment to the scene; `data` is posed at that time."""
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
-        self._draw_moving(pen, time)
+        for body in self.moving:
+            pen.add(_DRAWN[body.kind], body.begin + time * body.velocity, body.size, MOVING, body.rotation)
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
-        for tube, colour, height in self._tubes():
+        for tube, colour, height in self.tubes():
             for centre, sizes, rotation in zip(*tube.in_world, strict=True):
                 pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, (*colour, tube.opacity), rotation)
         if "trace" in self.show:
@@ -265,32 +289,31 @@ class Overlays:
             points = np.vstack([self.trace[:done], recorded.driven(time)])
             errors = np.append(self.errors[:done], recorded.interpolate(recorded.error, time))
             colours = error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
-            pen.ribbon(points + lift, (2.6 if recorded.planar else 1.1) * self.width, colours)
+            pen.ribbon(points + lift, self.trace_width, colours)
         if "plan" in self.show:
             colours = np.tile((*PLAN_RGB, 1.0), (len(self.plan) - 1, 1))
-            pen.ribbon(self.plan + 2 * lift, 0.8 * self.width, colours)
+            pen.ribbon(self.plan + 2 * lift, self.plan_width, colours)
         if "measured" in self.show:
             seen = int(np.searchsorted(recorded.times, time, side="right"))
             for place in self.measured[max(seen - DOTS, 0) : seen]:
                 height = 0.2 * LIFT if recorded.planar else self.width
                 pen.add(Geom.mjGEOM_BOX, place + 3 * lift, [self.width, self.width, height], (*MEASURED, 1.0))
         if "ghost" in self.show:
+            opacity = GHOST_OPACITY[recorded.planar]
             for wanted, radius in zip(*recorded.planned_balls(time), strict=True):
                 if recorded.planar:
                     wanted[2] = recorded.floor
-                    pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, 0.35))
+                    pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, opacity))
                 else:
-                    pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
+                    pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, opacity))
 
-    def _draw_moving(self, pen: "_Pen", time: float) -> None:
-        """Append the obstacles that move, except planes, which have no thickness."""
-        moving, longest = self.recorded.rollout.moving, 10 * self.recorded.model.stat.extent
-        if moving is None:
-            return
-        each = zip(moving.kinds, moving.at(time), moving.sizes, moving.rotations, strict=True)
-        for kind, position, size, rotation in each:
-            if kind in _DRAWN:
-                pen.add(_DRAWN[kind], position, np.minimum(size, longest), MOVING, rotation)
+    @property
+    def arrow(self) -> tuple[float, float, float]:
+        """Of the force's arrow: the distance of its start from the robot, its thickness, and its length for 1 N, in
+        metres."""
+        # The radius of an arm is its reach.
+        radius = min(self.recorded.rollout.radius, 0.1 * self.recorded.model.stat.extent)
+        return radius, max(0.1 * radius, 1.5 * self.width), ARROW * radius / self.scale.force
 
     def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Append the arrow of the disturbing force, for the camera that is set in the scene.
@@ -301,16 +324,28 @@ class Overlays:
         if "forces" not in self.show:
             return
         recorded, forward = self.recorded, np.array(scene.camera[0].forward, dtype=np.float64)
-        # The radius of an arm is its reach.
-        force, radius = recorded.force_at(time), min(recorded.rollout.radius, 0.1 * recorded.model.stat.extent)
-        strength, width = float(np.linalg.norm(force)), max(0.1 * radius, 1.5 * self.width)
-        length = 4 * radius * strength / self.scale.force
+        force, (apart, width, for_newton) = recorded.force_at(time), self.arrow
+        strength = float(np.linalg.norm(force))
+        length = for_newton * strength
         if length < 2 * width or abs(force @ forward) > END_ON * strength:
             return
         direction = force / strength
-        start = recorded.place_in(data) + radius * direction
+        start = recorded.place_in(data) + apart * direction
         arrow = _Pen(scene, flat=recorded.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
         mujoco.mjv_connector(arrow, Geom.mjGEOM_ARROW, width, start, start + length * direction)
+
+
+def _moving(recorded: RecordedTrial) -> list[DrawnObstacle]:
+    """The obstacles that move, except planes, which have no thickness; infinite ones reach far beyond the scene."""
+    moving, longest = recorded.rollout.moving, 10 * recorded.model.stat.extent
+    if moving is None:
+        return []
+    each = zip(moving.kinds, moving.positions, moving.velocities, moving.sizes, moving.rotations, strict=True)
+    return [
+        DrawnObstacle(kind, begin, velocity, np.minimum(size, longest), rotation)
+        for kind, begin, velocity, size, rotation in each
+        if kind in _DRAWN
+    ]
 
 
 class _Pen:

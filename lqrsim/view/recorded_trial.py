@@ -1,7 +1,12 @@
 """One trial of a rollout for pictures: the model at any time, and the places of robot and plan."""
 
+import copy
+import functools
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.results.rollout import BallRecord, Rollout
@@ -9,7 +14,32 @@ from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
 from lqrsim.scenes.mjcf_model import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
+UNCOLOURED = 0.5, 0.5, 0.5, 1.0  # the colour of a geom whose MJCF gives none
+SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FORCE_WINDOW = 0.2  # s over which forces are averaged: a push of one period would be invisible, and noise would flicker
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnGeom:
+    """A geom as pictures outside of MuJoCo draw it, in its own axes.
+
+    Attributes:
+      number: its number in the model.
+      kind: its type in the words of the MJCF, such as "capsule".
+      size: (3,) as in the MJCF, in metres; a plane without an end is twice as wide as the scene.
+      colour: (4,) red, green, blue and opacity; of a texture, the mean.
+      moves: whether its body is not fixed to the world.
+      triangles: vertices (v, 3) in metres and faces (f, 3) of a mesh, a height field or a signed distance function;
+        None for the other kinds.
+    """
+
+    number: int
+    name: str
+    kind: str
+    size: Array
+    colour: Array
+    moves: bool
+    triangles: tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]] | None
 
 
 class RecordedTrial:
@@ -48,6 +78,12 @@ class RecordedTrial:
         data = mujoco.MjData(self.model)
         self.pose(data, 0.0)
         self.floor = floor_below(self.model, data, self.robot)
+
+    @property
+    def name(self) -> str:
+        """Robot and scene; an MJCF with a robot is both."""
+        run = self.rollout
+        return (run.robot if run.scene == run.robot else f"{run.robot} in {run.scene}").replace("_", " ")
 
     def pose(self, data: mujoco.MjData, time: float) -> None:
         """Pose the model at `time`, between two recorded frames if necessary."""
@@ -138,7 +174,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         raise InputError(f"state_coordinates.position: got none, want {wanted}")
     if rollout.balls is not None and not rollout.state_coordinates.position:
         _ = rollout.balls.tracked  # raises an exception if no site is named
-    model = model_from_xml(with_sky(rollout.model), "rollout.model")
+    model = copy.copy(_compiled(rollout.model))
     hide_hulls(model)
     robot_body(model, rollout.body)
     if rollout.balls is not None and (rollout.balls.anchors[:, 0] >= model.nbody).any():
@@ -156,6 +192,11 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     return model
 
 
+@functools.lru_cache(maxsize=1)  # the trials of a run have one model, and its meshes take half a second
+def _compiled(xml: str) -> mujoco.MjModel:
+    return model_from_xml(with_sky(xml), "rollout.model")
+
+
 def with_sky(xml: str) -> str:
     """The MJCF, with a light sky if it has none: MuJoCo would draw a black one."""
     if "skybox" in xml or "</mujoco>" not in xml:
@@ -165,6 +206,55 @@ def with_sky(xml: str) -> str:
     )
     end = xml.rindex("</mujoco>")
     return f"{xml[:end]}<asset>{sky}</asset>{xml[end:]}"
+
+
+def drawn_geoms(model: mujoco.MjModel) -> list[DrawnGeom]:
+    """The geoms of a model that MuJoCo's own pictures show."""
+    found = []
+    for geom in range(model.ngeom):
+        colour, size = _colour(model, geom), model.geom_size[geom].copy()
+        if model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0:
+            continue
+        kind = mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+        if kind == "plane":
+            size[:2] = np.where(size[:2] > 0, size[:2], 2 * model.stat.extent)
+        shape, triangles = int(model.geom_dataid[geom]), None
+        if kind in ("mesh", "sdf"):
+            mesh = model.mesh(shape)
+            vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
+            triangles = vertices, model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
+        if kind == "hfield":
+            triangles = _surface(model, shape)
+        name, moves = model.geom(geom).name or f"geom {geom}", model.body_weldid[model.geom_bodyid[geom]] != 0
+        found.append(DrawnGeom(geom, name, kind, size, colour, bool(moves), triangles))
+    return found
+
+
+def _surface(model: mujoco.MjModel, field: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    """Vertices (v, 3) and faces (f, 3) of the upper side of a height field."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    x, y, height, _ = model.hfield_size[field]
+    heights = height * model.hfield_data[int(model.hfield_adr[field]) :][: rows * columns]
+    across = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+    vertices = np.stack([across[0].ravel(), across[1].ravel(), heights], axis=1).astype(np.float32)
+    corner = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    lower = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:]
+    upper = corner[:-1, :-1], corner[1:, 1:], corner[1:, :-1]
+    return vertices, np.vstack([np.stack([c.ravel() for c in half], axis=1) for half in (lower, upper)])
+
+
+def _colour(model: mujoco.MjModel, geom: int) -> Array:
+    """As in MuJoCo, the colour (4,) of the geom itself goes before that of its material."""
+    colour, material = model.geom_rgba[geom].astype(np.float64), int(model.geom_matid[geom])
+    if material >= 0 and np.array_equal(colour, UNCOLOURED):
+        colour = model.mat_rgba[material].astype(np.float64)
+    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value]) if material >= 0 else -1
+    if texture >= 0:
+        channels = int(model.tex_nchannel[texture])
+        count = int(model.tex_height[texture]) * int(model.tex_width[texture]) * channels
+        pixels = model.tex_data[int(model.tex_adr[texture]) :][:count].reshape(-1, channels)
+        colour[:3] *= pixels[:, :3].mean(axis=0) / 255
+    return colour
 
 
 def hide_hulls(model: mujoco.MjModel) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import replacing, sha256
@@ -18,16 +17,15 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, PLAN_RGB, TUBE, DrawnFunnel, of_funnel
-from lqrsim.view.recorded_trial import RecordedTrial
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms
 
 TIMELINE = "time"
 DRIVEN = (0.0, 0.45, 0.7)
-SHOWN_GROUPS = 3  # the first groups of geoms, which MuJoCo's own pictures show
 FLAT = 1e-4  # m, half thickness of flat shapes
 ARROW = 0.2  # length of the largest force's arrow, relative to the extent of the scene
 
 
-def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> list[str]:
+def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> None:
     """Write a trial as FILE.rrd.
 
     Args:
@@ -35,9 +33,6 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
       path: path of the file.
       trial: row of the rollout.
       funnel: a funnel about the plan of the run.
-
-    Returns:
-      The names of the geoms that are left out, because Rerun has no shape for them.
 
     Raises:
       InputError: there is no such trial, nothing of it can be drawn, the funnel has another plan or no position, the
@@ -51,13 +46,12 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, fun
         stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
         stream.save(unfinished)
         stream.send_recording_name(name)
-        left_out = _draw_model(rerun, stream, recorded)
+        _draw_model(rerun, stream, recorded)
         _draw_plan(rerun, stream, recorded)
         if drawn is not None:
             _draw_funnel(rerun, stream, drawn)
         _draw_numbers(rerun, stream, recorded)
         stream.disconnect()
-    return left_out
 
 
 def _package(path: Path) -> Any:
@@ -68,58 +62,44 @@ def _package(path: Path) -> Any:
         raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
 
 
-def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> list[str]:
+def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
     """Draw the geoms of the model: fixed ones once, moving ones at each recorded frame."""
-    model, left_out = recorded.model, []
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(recorded.model)
     frames, places, turns = recorded.frame_times, [], []
     for time in frames:
         recorded.pose(data, float(time))
         places.append(data.geom_xpos.copy())
         turns.append(np.array([_quaternion(matrix.reshape(3, 3)) for matrix in data.geom_xmat]))
-    for geom in range(model.ngeom):
-        colour = _colour(model, geom)
-        if model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0:
-            continue
-        name = model.geom(geom).name or f"geom {geom}"
-        shape = _shape(rerun, model, geom, colour)
-        if shape is None:
-            left_out.append(name)
-            continue
-        entity = ["world", "model", f"{geom} {name}"]
-        stream.log(entity, shape, static=True)
-        if model.body_weldid[model.geom_bodyid[geom]] == 0:
-            pose = rerun.Transform3D(translation=places[0][geom], quaternion=turns[0][geom])
-            stream.log(entity, pose, static=True)
-        else:
-            moved = [place[geom] for place in places], [turn[geom] for turn in turns]
+    for geom in drawn_geoms(recorded.model):
+        entity = ["world", "model", f"{geom.number} {geom.name}"]
+        stream.log(entity, _shape(rerun, geom), static=True)
+        if geom.moves:
+            moved = [place[geom.number] for place in places], [turn[geom.number] for turn in turns]
             columns = rerun.Transform3D.columns(translation=moved[0], quaternion=moved[1])
             _send(rerun, stream, entity, frames, columns)
-    return left_out
+        else:
+            pose = rerun.Transform3D(translation=places[0][geom.number], quaternion=turns[0][geom.number])
+            stream.log(entity, pose, static=True)
 
 
-def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
-    """Rerun's shape for a geom, in the geom's own axes; None if Rerun has no such shape."""
-    size, kind, colours = model.geom_size[geom], Geom(int(model.geom_type[geom])), [_bytes(colour)]
+def _shape(rerun: Any, geom: DrawnGeom) -> Any:
+    """Rerun's shape for a geom, in the geom's own axes."""
+    size, kind, colours = geom.size, geom.kind, [_bytes(geom.colour)]
     solid = {"colors": colours, "fill_mode": "solid"}
-    if kind == Geom.mjGEOM_PLANE:
-        wide = np.where(size[:2] > 0, size[:2], 2 * model.stat.extent)
-        return rerun.Boxes3D(half_sizes=[[*wide, FLAT]], centers=[[0, 0, -FLAT]], **solid)
-    if kind == Geom.mjGEOM_BOX:
+    if kind == "plane":
+        return rerun.Boxes3D(half_sizes=[[*size[:2], FLAT]], centers=[[0, 0, -FLAT]], **solid)
+    if kind == "box":
         return rerun.Boxes3D(half_sizes=[size], **solid)
-    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_ELLIPSOID):
-        return rerun.Ellipsoids3D(half_sizes=[size if kind == Geom.mjGEOM_ELLIPSOID else [size[0]] * 3], **solid)
-    if kind == Geom.mjGEOM_CYLINDER:
+    if kind in ("sphere", "ellipsoid"):
+        return rerun.Ellipsoids3D(half_sizes=[size if kind == "ellipsoid" else [size[0]] * 3], **solid)
+    if kind == "cylinder":
         return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
-    if kind == Geom.mjGEOM_CAPSULE:  # Rerun's capsule begins at its origin
+    if kind == "capsule":  # Rerun's capsule begins at its origin
         lower = [[0, 0, -size[1]]]
         return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
-    if kind == Geom.mjGEOM_MESH:
-        mesh = model.mesh(model.geom_dataid[geom])
-        vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
-        faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
-        return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
-    return None
+    assert geom.triangles is not None
+    vertices, faces = geom.triangles
+    return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
 
 
 def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
@@ -192,12 +172,6 @@ def _draw_numbers(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
 def _send(rerun: Any, stream: Any, entity: list[str], times: Array, columns: Any) -> None:
     path = rerun.new_entity_path(entity)
     rerun.send_columns(path, [rerun.TimeColumn(TIMELINE, duration=times.tolist())], columns, recording=stream)
-
-
-def _colour(model: mujoco.MjModel, geom: int) -> Array:
-    """The colour (4,) of a geom, or of its material if it has one."""
-    material = int(model.geom_matid[geom])
-    return np.array(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material], dtype=np.float64)
 
 
 def _bytes(colour: Array) -> list[int]:

@@ -302,6 +302,10 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
             "path": video.with_name("v.gif"), "fps": 5.0, "speed": 1.0, "progress": print_nothing
         }, 0.1),
         "render_still": (options | {"path": place.folder / "still.png", "time": 0.1, "every": 0.2}, 0.15),
+        "render_html": ({
+            "rollout": rollout, "path": place.folder / "run.html", "trial": 0, "overlays": ("plan",),
+            "solution": solution, "funnel": None,
+        }, 0.1),
         "verify_run": ({"rollout": rollout, "trial": 0, "solution": solution, "progress": print_nothing}, 0.15),
         "verify_video": ({
             "path": video, "rollout": rollout, "trial": 0, "solution": solution, "progress": print_nothing

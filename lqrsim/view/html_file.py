@@ -1,0 +1,296 @@
+"""Trials as one HTML file that any browser plays, without a network: scene, robot, plan, path, tubes and a time line.
+
+The page is `html_file.html`, which draws with WebGL 2 and loads nothing. Its data are JSON, and the arrays whose places
+the JSON has.
+"""
+
+import gzip
+import html
+import json
+import math
+import os
+from base64 import b64encode
+from collections.abc import Sequence
+from importlib.resources import files as packaged
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_path, excerpt
+from lqrsim.results.archive import replacing
+from lqrsim.results.funnel import Funnel
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.view.cameras import camera_view
+from lqrsim.view.captions import legend_entries, readings
+from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay
+from lqrsim.view.overlays import (
+    DOTS,
+    FORCE,
+    GHOST_OPACITY,
+    LIFT,
+    MEASURED,
+    MOVING,
+    PLAN_RGB,
+    Overlays,
+    common_scale,
+    error_colours,
+)
+from lqrsim.view.recorded_trial import DrawnGeom, RecordedTrial, drawn_geoms
+
+ASPECTS = 1.6, 0.6  # of a screen and of a telephone; the page begins with the overview for the nearer one
+LEVELS = np.iinfo(np.uint16).max
+SHADES = 9  # colours of the legend's map of errors, between which the browser interpolates
+
+
+def render_html(
+    rollout: Rollout,
+    path: str | os.PathLike[str],
+    *,
+    trial: int | Sequence[int] | None = None,
+    overlays: Sequence[Overlay] = OVERLAYS,
+    solution: Solution | None = None,
+    funnel: Funnel | None = None,
+) -> Path:
+    """Write a run as one HTML file, which any browser of 2023 or newer plays without a network.
+
+    The page shows the scene from all sides, the robot, and the overlays of `render`; it has a time line, and a list of
+    the trials with their outcomes. The file has 16 bits for the range of each coordinate, so that places in a run
+    across 6 m are exact to 0.05 mm. The same run gives the same bytes.
+
+    Args:
+      rollout: the result of `simulate`, with frames.
+      path: FILE.html.
+      trial: row of the rollout, or several rows; by default all trials that have a finite state.
+      overlays: as in `render`, except that there is always a caption.
+      solution: the solution that was run, for `cost_tube`.
+      funnel: a funnel about the plan of the run, for the overlay `funnel`.
+
+    Returns:
+      The path.
+
+    Raises:
+      InputError: there is no such trial, nothing of it can be drawn, an overlay lacks its solution or funnel, or the
+        file cannot be written.
+    """
+    path = check_path("path", path)
+    if path.suffix.lower() != ".html":
+        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in .html")
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
+    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
+    check_kind("funnel", funnel, (Funnel, type(None)), "a Funnel about the plan of the run, or None")
+    shown = check_items("overlays", overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
+    for overlay in shown:
+        check_name("overlays", overlay, ALL_OVERLAYS)
+    rows, arrays = _rows(rollout, trial), _Arrays()
+    scale = common_scale(RecordedTrial(rollout, row) for row in rows)
+
+    def overlays_of(row: int) -> Overlays:  # one at a time, as each has a model of its own, which may be large
+        return Overlays(RecordedTrial(rollout, row), solution, shown, scale, funnel)
+
+    first = overlays_of(rows[0])
+    geoms = drawn_geoms(first.recorded.model)
+    described = {
+        **_of_run(arrays, first),
+        "legend": list(legend_entries([first], scale).items()),
+        "geoms": [_of_geom(arrays, geom) for geom in geoms],
+        "trials": [_of_trial(arrays, overlays_of(row), geoms) for row in rows],
+    }
+    page = packaged("lqrsim.view").joinpath("html_file.html").read_text(encoding="utf-8")
+    page = page.replace("{{data}}", arrays.text(described)).replace("{{title}}", html.escape(described["title"]))
+    with replacing(path) as unfinished:
+        unfinished.write_text(page, encoding="utf-8")
+    return path
+
+
+def _rows(rollout: Rollout, trial: int | Sequence[int] | None) -> list[Any]:
+    """The rows that are shown."""
+    if trial is None:
+        states, frames = (np.any(np.isfinite(part).all(axis=2), axis=1) for part in (rollout.states, rollout.frames))
+        rows = np.flatnonzero(states & frames).tolist()
+        if not rows:
+            raise InputError("rollout: got no trial with a finite state, want one that can be drawn")
+        return rows
+    if not isinstance(trial, Sequence) or isinstance(trial, str):
+        return [trial]
+    rows = check_items("trial", trial, object, f"1 to {rollout.trials} of them", at_most=rollout.trials)
+    if not rows:
+        raise InputError(f"trial: got none, want 1 to {rollout.trials} of them")
+    return list(rows)
+
+
+class _Arrays:
+    """The arrays of a page, one after the other."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def exact(self, values: npt.ArrayLike, kind: str) -> dict[str, Any]:
+        """Append an array as this kind of numbers: float32, uint8, uint16 or uint32. Returns its place."""
+        array = np.asarray(values).astype(np.dtype(kind).newbyteorder("<"))
+        place = {"at": self._size, "kind": kind, "shape": array.shape}
+        self._parts.append(array.tobytes() + bytes(-array.nbytes % 4))  # browsers want numbers aligned
+        self._size += len(self._parts[-1])
+        return place
+
+    def rounded(self, values: Array) -> dict[str, Any]:
+        """Append a table (k, c) in 16 bits of the range of each column.
+
+        What is kept are differences of rows, column by column, which compress best.
+        """
+        table = values.reshape(len(values), math.prod(values.shape[1:]))
+        low, high = table.min(axis=0, initial=np.inf), table.max(axis=0, initial=-np.inf)
+        low, step = (low, (high - low) / LEVELS) if len(table) else (np.zeros(len(low)), np.zeros(len(low)))
+        levels = np.round((table - low) / np.where(step > 0, step, 1)).astype(np.uint16)
+        changes = np.diff(levels, axis=0, prepend=np.zeros_like(levels[:1]))  # modulo 2^16, as their sums are
+        return self.exact(changes.T, "uint16") | {"shape": table.shape, "low": low.tolist(), "step": step.tolist()}
+
+    def text(self, described: dict[str, Any]) -> str:
+        """The length of the JSON as a number of 32 bits, the JSON, and the arrays; compressed, in base64."""
+        words = json.dumps(described, separators=(",", ":"), allow_nan=False).encode("ascii")
+        words += b" " * (-len(words) % 4)
+        whole = b"".join([len(words).to_bytes(4, "little"), words, *self._parts])
+        return b64encode(gzip.compress(whole, mtime=0)).decode("ascii")
+
+
+def _of_run(arrays: _Arrays, overlays: Overlays) -> dict[str, Any]:
+    """What all trials share."""
+    recorded, show = overlays.recorded, overlays.show
+    run, lift = recorded.rollout, np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
+    page: dict[str, Any] = {
+        "title": recorded.name,
+        "about": "; ".join(run.disturbances) or "undisturbed",
+        "end": recorded.end,
+        "step": run.plan.dt,
+        "extent": float(recorded.model.stat.extent),
+        "middle": np.mean(recorded.planned(run.times), axis=0).tolist(),
+        "views": [_view(recorded, aspect) for aspect in ASPECTS],
+        "errors": _bytes(error_colours(np.linspace(0, 1, SHADES))),
+        "tubes": [],
+        "moving": [],
+    }
+    for tube, colour, height in overlays.tubes():
+        centres, sizes, rotations = tube.in_world
+        page["tubes"].append(
+            {
+                "colour": [*colour, tube.opacity],
+                "places": arrays.rounded(centres + height * lift),
+                "sizes": arrays.exact(sizes, "float32"),
+                "turns": arrays.exact([_quaternion(rotation) for rotation in rotations], "float32"),
+            }
+        )
+    for body in overlays.moving:
+        vectors = {"size": body.size, "place": body.begin, "velocity": body.velocity}
+        page["moving"].append(
+            {"kind": body.kind, "colour": MOVING, "turn": _quaternion(body.rotation).tolist()}
+            | {name: vector.tolist() for name, vector in vectors.items()}
+        )
+    if "plan" in show:
+        points = arrays.rounded(overlays.plan + 2 * lift)
+        page["plan"] = {"points": points, "colour": _bytes([PLAN_RGB])[0], "width": 2 * overlays.plan_width}
+    if "ghost" in show:
+        centres = np.array([recorded.planned_balls(float(time))[0] for time in run.times])
+        if recorded.planar:
+            centres[..., 2] = recorded.floor + 3 * LIFT
+        page["ghost"] = {
+            "kind": "cylinder" if recorded.planar else "sphere",
+            "colour": [*PLAN_RGB, GHOST_OPACITY[recorded.planar]],
+            "sizes": [[float(radius), LIFT, 0.0] for radius in recorded.planned_balls(0.0)[1]],
+            "places": arrays.rounded(centres),
+        }
+    if "forces" in show:
+        page["arrow"] = {"size": overlays.arrow, "colour": [*FORCE, 1.0]}
+    return page
+
+
+def _of_geom(arrays: _Arrays, geom: DrawnGeom) -> dict[str, Any]:
+    """A geom's shape."""
+    shape = {"kind": geom.kind, "size": geom.size.tolist(), "colour": geom.colour.tolist(), "moves": geom.moves}
+    if geom.triangles is None:
+        return shape
+    vertices, faces = geom.triangles
+    return shape | {"vertices": arrays.rounded(vertices), "faces": arrays.exact(faces, "uint32")}
+
+
+def _of_trial(arrays: _Arrays, overlays: Overlays, geoms: Sequence[DrawnGeom]) -> dict[str, Any]:
+    """A trial: bodies and lines over time, and geoms in their bodies, or in the world if they do not move."""
+    recorded, row, model = overlays.recorded, overlays.recorded.trial, overlays.recorded.model
+    run, data = recorded.rollout, mujoco.MjData(model)
+    lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
+    moving = [int(model.geom_bodyid[geom.number]) for geom in geoms if geom.moves]
+    bodies, poses = np.unique(moving).astype(int), []
+    for time in recorded.frame_times:
+        recorded.pose(data, float(time))
+        poses.append(np.hstack([data.xpos[bodies], data.xquat[bodies]]))
+    places = [
+        [*model.geom_pos[geom.number], *model.geom_quat[geom.number]]
+        if geom.moves
+        else [*data.geom_xpos[geom.number], *_quaternion(data.geom_xmat[geom.number])]
+        for geom in geoms
+    ]
+    ending = recorded.ending(np.inf)
+    said = f"{ending} at {run.ended[row]:.1f} s" if ending else run.outcome[row]
+    trial: dict[str, Any] = {
+        "name": f"trial {run.first_trial + row}: {said}".replace("_", " "),
+        "outcome": run.outcome[row],
+        "ended": float(run.ended[row]) if ending else None,
+        "readings": [" · ".join(readings(recorded, overlays, float(time))) for time in run.times],
+        "robot": arrays.rounded(recorded.driven(run.times)),
+        "times": arrays.exact(recorded.frame_times, "float32"),
+        "poses": arrays.rounded(_without_jumps(np.array(poses))),
+        "places": arrays.exact(places, "float32"),
+        "bodies": [int(np.searchsorted(bodies, model.geom_bodyid[geom.number])) for geom in geoms],
+    }
+    if "trace" in overlays.show:
+        errors = 0.5 * (overlays.errors[1:] + overlays.errors[:-1])
+        trial["trace"] = {
+            "times": arrays.exact(overlays.knots, "float32"),
+            "points": arrays.rounded(overlays.trace + lift),
+            "colours": arrays.exact(_bytes(error_colours(errors / overlays.scale.error)), "uint8"),
+            "width": 2 * overlays.trace_width,
+        }
+    if "forces" in overlays.show:
+        trial["forces"] = arrays.rounded(recorded.force)
+    if "measured" in overlays.show:
+        trial["measured"] = {
+            "times": arrays.exact(recorded.times, "float32"),
+            "points": arrays.rounded(overlays.measured + 3 * lift),
+            "colour": _bytes([MEASURED])[0],
+            "width": 2 * overlays.width,
+            "seconds": DOTS * run.plan.dt,
+        }
+    return trial
+
+
+def _view(recorded: RecordedTrial, aspect: float) -> dict[str, Any]:
+    """The overview in a picture of this aspect ratio, with the vertical field of view in radians."""
+    scene = mujoco.MjvScene(recorded.model, maxgeom=1)
+    camera_view("overview", recorded, aspect).place(scene, mujoco.MjData(recorded.model), 0.0)
+    camera = scene.camera[0]
+    vectors = {"eye": camera.pos, "forward": camera.forward, "up": camera.up}
+    field = 2 * float(np.arctan2(camera.frustum_top, camera.frustum_near))
+    return {"aspect": aspect, "field": field} | {name: vector.tolist() for name, vector in vectors.items()}
+
+
+def _without_jumps(poses: Array) -> Array:
+    """Positions and quaternions (k, bodies, 7) with each quaternion on the side of the one before."""
+    turns = poses[:, :, 3:]
+    signs = np.where(np.sum(turns[1:] * turns[:-1], axis=2) < 0, -1.0, 1.0)
+    turns[1:] *= np.cumprod(signs, axis=0)[:, :, None]
+    return poses
+
+
+def _quaternion(rotation: Array) -> Array:
+    """The quaternion (4,) of a rotation, scalar first."""
+    found = np.empty(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation).ravel())
+    return found
+
+
+def _bytes(colours: npt.ArrayLike) -> list[list[int]]:
+    """Red, green and blue (k, 3) in bytes, of colours (k, 3 or 4) from numbers between 0 and 1."""
+    return np.round(255 * np.asarray(colours)[:, :3]).astype(int).tolist()
