@@ -1,14 +1,12 @@
 """An MJCF as a record, read and compiled once, that robots, dynamics, plants and pictures share."""
 
-import contextlib
 import itertools
 import math
 import os
 import re
-import threading
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,6 +18,7 @@ from lqrsim import rotations
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.scenes import mjcf_text
 from lqrsim.scenes.mjcf_text import DEEPEST, UNNAMED, mujoco
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 
 _KINDS = {
@@ -459,32 +458,6 @@ def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool
     return not _mocap_poses(other, key) and all(
         len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
     )
-
-
-_quiet, _count, _before = threading.Lock(), 0, None
-
-
-@contextlib.contextmanager
-def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
-    otherwise.
-
-    Several threads may be in this context. The last to leave restores the state before the first.
-    """
-    global _count, _before
-    with _quiet:
-        if _count == 0:
-            _before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-            quiet.logto_file = quiet.logto_console = False
-            quiet.set()
-        _count += 1
-    try:
-        yield
-    finally:
-        with _quiet:
-            _count -= 1
-            if _count == 0 and _before is not None:
-                _before.set()
 
 
 @unlogged()
