@@ -282,6 +282,19 @@ def test_a_base_of_a_mesh_is_no_obstacle(arm: Path) -> None:
         assert ls.MjcfRobot(file).scene.world.names == ()
 
 
+def test_shapes_that_mujoco_refuses_are_left_out(arm: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """One in a plane has no hull, though it can be drawn; a box of nothing is for neither. Prefixes need no meaning."""
+    arm.with_name("flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", encoding="utf-8")
+    flat = '<{0}><geometry drake:kind="flat"><mesh filename="flat.obj"/><drake:convex/></geometry></{0}>'
+    nothing = '<visual><geometry><box size="0 0 0"/></geometry></visual>'
+    shapes = "".join([flat.format("visual"), flat.format("collision"), nothing])
+    model = ls.MjcfRobot(changed(arm, ('<link name="hand">', f'<link name="hand">{shapes}'))).scene.model
+    assert model.geom("hand_visual").group == 1
+    assert model.ngeom == 4
+    (said,) = [one.message for one in caplog.records]
+    assert "2 shapes are left out, such as hand_collision: Error: mesh 'flat' has coplanar vertices" in said
+
+
 def test_the_extension_of_mujoco_has_the_last_word(arm: Path) -> None:
     """An inertia that no body can have is refused by MuJoCo, unless the file says that it is to be mended."""
     odd = ('<mass value="0.5"/><inertia ixx="0.01"', '<mass value="0.5"/><inertia ixx="0.3"')
@@ -325,6 +338,8 @@ def test_links_that_overlap_at_zero_pass_through_each_other(arm: Path, caplog: p
         ([("</robot>", "")], r"URDF: got arm.urdf, which is not XML \(.*\), want a URDF"),
         ([("<robot name", "<mujoco name"), ("</robot>", "</mujoco>")], "with <mujoco> at its root, want <robot>"),
         ([('<link name="flange"/>', '<link name="hand"/>')], "which MuJoCo refuses: .*repeated URDF name"),
+        ([('<joint name="twin"', '<joint name="grip"')], "which MuJoCo refuses: .*repeated name 'grip' in joint"),
+        ([('<mass value="0.5"/>', '<mass value="inf"/>')], "scene arm: got .*"),
         ([('type="continuous"', 'type="hinged"')], "which MuJoCo refuses: .*invalid joint type"),
         ([('velocity="4"', 'velocity="fast"')], "arm.urdf: got 'fast' for the velocity of elbow, want a number"),
         ([('<mass value="0.5"/>', '<mass value="0"/>'), ('<mass value="0.25"/>', '<mass value="0"/>')],
@@ -416,6 +431,11 @@ def test_an_mjcf_includes_what_a_urdf_becomes(arm: Path) -> None:
         encoding="utf-8",
     )
     robot = ls.MjcfRobot(scene, body="base")
+    scene.with_name("wrong.xml").write_text('<mujoco><include file="arm.urdf"/></mujoco>', encoding="utf-8")
+    with pytest.raises(
+        InputError, match=r"^scene: got arm\.urdf, which is a URDF, want a name that ends in \.urdf; to be"
+    ):
+        ls.load_scene(scene.with_name("wrong.xml"))
     assert "post" in robot.scene.world.names
     assert robot.mjcf.joints[1].limits == (-2.0, 1.5)
     assert robot.scene.model.body("ball").mass[0] == pytest.approx(1000 * 4 / 3 * np.pi * 1e-3, rel=1e-12)

@@ -82,6 +82,9 @@ def _flatten(path: Path) -> str:
             raise InputError(f"scene: got {file.name}, which is not XML ({error}), want an MJCF file") from None
         except OSError as error:
             raise InputError(f"scene: got {file.name}, which cannot be read ({error.strerror}), want a file") from None
+        if root.tag == "robot":
+            become = "to be included it wants to be an MJCF, load_scene(...).xml"
+            raise InputError(f"scene: got {file.name}, which is a URDF, want a name that ends in .urdf; {become}")
         expand(root, file.parent)
         return root
 

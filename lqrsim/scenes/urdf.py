@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
+from xml.parsers import expat
 
 import numpy as np
 import numpy.typing as npt
@@ -56,11 +57,18 @@ def read_urdf(
         one.attrib = {key: value for key, value in one.attrib.items() if key not in _PATHS}
         mjcf.append(one)
     _add(mjcf, "compiler", {"angle": "radian"})
-    _add_parts(mjcf, spec)
+    with np.errstate(all="ignore"):  # masses that are not finite are refused where the model is used
+        _add_parts(mjcf, spec)
     _check_joints(root, spec, path.name)
     _add_actuators(mjcf, spec, path.name, servos, efforts)
     _add_speed_limits(mjcf, root, path.name)
-    _exclude_overlaps(mjcf, path.name)
+    with unlogged():
+        model, refused = _compiled(mjcf)
+        if refused:
+            _remove_refused_shapes(mjcf, path.name)
+            model, _ = _compiled(mjcf)
+        if model is not None:  # else what is wrong is said where the model is used
+            _exclude_overlaps(mjcf, model, path.name)
     return path.stem, _text(mjcf)
 
 
@@ -73,15 +81,19 @@ def _parsed(path: Path) -> ElementTree.Element:
     """The root of the file. Raises InputError if it is no URDF, or MuJoCo's reader would crash."""
     if not is_urdf(path):
         raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want the path of a {SUFFIX} file")
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    # Without namespaces, as MuJoCo and ROS: prefixes such as `drake:` are often not declared.
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+        parser.Parse(path.read_bytes(), True)
+        root = builder.close()
+    except expat.ExpatError as error:
         raise InputError(f"URDF: got {path.name}, which is not XML ({error}), want a URDF") from None
     except (OSError, ValueError) as error:
         raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want a file that can be read ({error})") from None
     if root.tag != "robot":
         raise InputError(f"URDF: got {path.name} with <{root.tag}> at its root, want <robot>")
-    if any("xacro" in one.tag for one in root.iter()):
+    if any(one.tag.startswith("xacro:") for one in root.iter()):
         raise InputError(f"URDF: got {path.name} with macros, want what `xacro {path.name}` prints")
     if (links := len(root.findall("link"))) > DEEPEST:
         raise InputError(f"URDF: got {path.name} with {links:,} links, want {DEEPEST} at most")
@@ -94,7 +106,7 @@ def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, s
     for link, kind in itertools.product(root.iterfind("link"), ("visual", "collision")):
         for geometry in link.findall(kind):
             geometry.attrib.pop("name", None)  # they get names later, as most have none, and some the same one
-            for mesh in geometry.iterfind("geometry/mesh"):
+            if (mesh := geometry.find("geometry/mesh")) is not None:
                 name = mesh.get("filename", "")
                 files = [one for place in _places(name, path.parent.resolve(), settings) for one in _readable(place)]
                 found = next((str(one) for one in files if os.path.isfile(one)), None)
@@ -140,6 +152,7 @@ def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> 
     try:
         with unlogged():
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+            _ = [body.joints for body in spec.bodies]  # MuJoCo says here whether two have the same name
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"URDF: got {name}, which MuJoCo refuses: {' '.join(str(error).split())}") from None
     taken = {geom.name for geom in spec.geoms}
@@ -307,20 +320,45 @@ def _add_speed_limits(mjcf: ElementTree.Element, root: ElementTree.Element, name
             _add(section, "numeric", {"name": f"{joint.get('name')}{SPEED_LIMIT}"}, data=speed)
 
 
-def _exclude_overlaps(mjcf: ElementTree.Element, name: str) -> None:
+def _compiled(mjcf: ElementTree.Element) -> tuple[mujoco.MjModel | None, str]:
+    """The model, or None and what MuJoCo has against it."""
+    try:
+        return mujoco.MjModel.from_xml_string(_text(mjcf)), ""
+    except (ValueError, mujoco.FatalError) as error:
+        return None, " ".join(str(error).split())
+
+
+def _remove_refused_shapes(mjcf: ElementTree.Element, name: str) -> None:
+    """Take out the geoms that MuJoCo refuses, such as boxes and meshes without a volume, with a warning."""
+    meshes = {one.get("name"): one for one in mjcf.iterfind("asset/mesh")}
+    lost, used = dict[str, str](), set[str | None]()
+    shapes = [(body, geom) for body in mjcf.iter("body") for geom in body.findall("geom")]
+    for body, geom in shapes:
+        alone, mesh = ElementTree.Element("mujoco"), geom.get("mesh")
+        _add(alone, "asset").extend([meshes[mesh]] if mesh else [])
+        _add(alone, "worldbody").append(geom)
+        if refused := _compiled(alone)[1]:
+            body.remove(geom)
+            lost[geom.get("name", "")] = refused
+        else:
+            used.add(mesh)
+    for assets, (mesh, element) in itertools.product(mjcf.iterfind("asset"), meshes.items()):
+        if mesh not in used:
+            assets.remove(element)
+    if lost:
+        (first, why), *_ = lost.items()
+        _log.warning("%s: %d shapes are left out, such as %s: %s", name, len(lost), first, why)
+
+
+def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: str) -> None:
     """Let links that touch at zero, or at the joints' limits next to it, pass through each other.
 
     A URDF cannot say which links may collide. Hulls of links that are two joints apart often overlap in any position.
     """
-    with unlogged():
-        try:
-            model = mujoco.MjModel.from_xml_string(_text(mjcf))
-        except (ValueError, mujoco.FatalError):
-            return  # what is wrong is said where the model is used
-        data, limited = mujoco.MjData(model), np.flatnonzero(model.jnt_limited)
-        places = model.jnt_qposadr[limited]
-        data.qpos[places] = np.clip(data.qpos[places], *model.jnt_range[limited].T)
-        mujoco.mj_fwdPosition(model, data)
+    data, limited = mujoco.MjData(model), np.flatnonzero(model.jnt_limited)
+    places = model.jnt_qposadr[limited]
+    data.qpos[places] = np.clip(data.qpos[places], *model.jnt_range[limited].T)
+    mujoco.mj_fwdPosition(model, data)
     bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
     pairs = dict.fromkeys((model.body(one).name, model.body(other).name) for one, other in bodies.tolist())
     section = _add(mjcf, "contact")
