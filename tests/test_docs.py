@@ -53,6 +53,17 @@ def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert kept.constraints[0].bounds == {"slider": (-3.0, 3.0)}
 
 
+def test_a_robot_from_a_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("urdf_robots.md")
+    assert names["solution"].success
+    assert names["rollout"].outcome == ("reached",)
+    assert names["rollout"].tracking_error.max() < 1e-6  # the plan is what MuJoCo did
+    assert names["robot"].joint_limits.bounds["elbow_velocity"] == (-3.0, 3.0)
+    assert [one.forces for one in names["servoed"].mjcf.actuators] == [(-30.0, 30.0), (-10.0, 10.0)]
+    assert names["cell"].scene.world.names == ("post",)
+
+
 def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("tabulate", reason="needs the `sysid` extra")
     monkeypatch.chdir(tmp_path)

@@ -14,7 +14,7 @@ from actuated import Rest, draw
 
 import lqrsim as ls
 from lqrsim.errors import InputError
-from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import scene_from_xml
 
 STAYS = 1e-4  # rad or m within which a held robot stays for 2 s

@@ -266,7 +266,8 @@ def test_an_attached_model_without_names_gets_some(unnamed, tmp_path):
     ("text", "message"),
     [
         ("<mujoco><worldbody></mujoco>", r"^scene: got mine.xml, which is not XML \(mismatched tag: line 1, col"),
-        ("<robot/>", "^scene: got mine.xml with <robot> at its root, want <mujoco>$"),
+        ("<sdf/>", "^scene: got mine.xml with <sdf> at its root, want <mujoco>$"),
+        ("<robot/>", r"^scene: got mine.xml, which is a URDF, want a name that ends in \.urdf; to be included it"),
         (
             "<mujoco><worldbody><geom typ='box'/></worldbody></mujoco>",
             "^scene mine: got an MJCF that MuJoCo refuses: XML Error: Schema violation: unrecognized attribute: 'typ'",

@@ -60,7 +60,8 @@ class Solve:
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """A name from `lqrsim list`; your own function that returns a Scenario, file.py:name or module:name; or an MJCF
-    file, file.xml. Settings follow after commas: quadrotor,query=3 or "cartpole.xml,start={'pole': 3.14},steps=200"."""
+    or URDF file, file.xml. Settings follow after commas: quadrotor,query=3 or
+    "cartpole.xml,start={'pole': 3.14},steps=200"."""
     out: Folder = None
     """Folder for solution.npz. By default runs/ and the name of the scenario."""
     solver: Literal["smooth", "ilqr"] = "smooth"

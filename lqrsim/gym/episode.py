@@ -29,7 +29,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.scenarios.solutions import given, remarks, solve
-from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant

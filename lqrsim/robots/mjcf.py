@@ -83,7 +83,7 @@ class MjcfRobot(Robot):
     on is no obstacle for that link: they touch in every position of the joints. All other contacts are MuJoCo's.
 
     Args:
-      file: the name of a packaged scene, the path of an MJCF, or a Scene.
+      file: the name of a packaged scene, the path of an MJCF or of a URDF, or a Scene; see `load_scene`.
       body: name of the body on which disturbances act, and whose position is the robot's. By default the first moving
         body that has mass, its own mass or the mass of bodies fixed to it.
       position: the 2 or 3 states that are the body's position in the world, in metres; by default found by MuJoCo's
@@ -512,7 +512,7 @@ class MjcfRobot(Robot):
         return "\n".join(lines)
 
     def _known_forces(self) -> dict[str, list[str]]:
-        """Limits of forces and dry friction, with what a plan does about them."""
+        """Limits of forces and speeds, and dry friction, with what a plan does about them."""
         kept, clipped = self._forces
         return {
             "force limits, constraints of plans": [
@@ -520,6 +520,11 @@ class MjcfRobot(Robot):
             ],
             "force limits, clipped in plans as in runs": [name.partition(" ")[2] for name in clipped],
             "dry friction, in plans and runs": self._dry(),
+            "limits of speed, kept only by robot.joint_limits": [
+                f"{one.name} {one.speed:.4g} {'m' if one.kind == 'slide' else 'rad'}/s"
+                for one in self.mjcf.joints
+                if np.isfinite(one.speed)
+            ],
         }
 
     def _mounts(self) -> list[str]:
@@ -553,13 +558,18 @@ class MjcfRobot(Robot):
 
     @property
     def joint_limits(self) -> StateBounds:
-        """The joints' ranges as constraints for a problem. In MuJoCo, joint limits are springs that push back.
+        """The joints' ranges as constraints for a problem, and their largest speeds, where they are stated.
+
+        In MuJoCo, limits of joints are springs that push back. It knows none of speeds, which are in a URDF, or in the
+        <custom> section of an MJCF: `<numeric name="JOINT_velocity_limit" data="2"/>`.
 
         Raises:
           InputError: no joint has limits.
         """
-        names = self.dynamics.state_coordinates.names
-        return StateBounds({names[one.dof]: one.limits for one in self.mjcf.joints if one.limits is not None})
+        names, nv = self.dynamics.state_coordinates.names, self.mjcf.model.nv
+        places = {names[one.dof]: one.limits for one in self.mjcf.joints if one.limits is not None}
+        speeds = {names[nv + one.dof]: (-one.speed, one.speed) for one in self.mjcf.joints if np.isfinite(one.speed)}
+        return StateBounds(places | speeds)
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.

@@ -23,7 +23,7 @@ from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.contact_modes import ContactModes
 from lqrsim.scenes.mjcf_approach import Approaches
-from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel, unlogged
+from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
 from lqrsim.scenes.mjcf_physics import (
     RK4,
     MjcfPhysics,
@@ -33,6 +33,7 @@ from lqrsim.scenes.mjcf_physics import (
     touches,
     untouched_body,
 )
+from lqrsim.scenes.mujoco_log import unlogged
 
 # Forces that may act on the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")

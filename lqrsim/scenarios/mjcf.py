@@ -12,6 +12,8 @@ from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenes.scene import load_scene
+from lqrsim.scenes.urdf import Base, Servos
 
 _log = logging.getLogger("lqrsim")
 
@@ -33,11 +35,14 @@ def mjcf(
     obstacles: bool | Sequence[str] = True,
     clearance: float | None = None,
     parameters: Mapping[str, float] | None = None,
+    base: Base | None = None,
+    servos: Servos | None = None,
+    efforts: Mapping[str, float] | None = None,
 ) -> Scenario:
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
 
     Args:
-      path: path of the MJCF.
+      path: path of the MJCF, or of a URDF.
       start: the name of a keyframe, or states by name, {"pole": 3.14}, possibly with a keyframe, {"keyframe": "home",
         "pole": 3.14}. Other states are at rest, as in the MJCF. Mocap bodies are where the keyframe has them.
       goal: the goal, in the same form. Without a start and a goal, the robot is to stay at rest, and a warning says
@@ -54,13 +59,18 @@ def mjcf(
       obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       clearance: least distance to obstacles in metres, as in `MjcfRobot.problem`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
+      base: of a URDF, as in `load_scene`: "fixed" or "free".
+      servos: of a URDF, as in `load_scene`: {"shoulder": (200.0, 10.0)}.
+      efforts: of a URDF, as in `load_scene`: {"shoulder": 20.0}.
 
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
     keyframe = start.get("keyframe") if isinstance(start, Mapping) else start
     mocap = keyframe if isinstance(keyframe, str) and not keyframe.lstrip().startswith("{") else None
-    robot = MjcfRobot(path, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
+    is_stated = any(one is not None for one in (base, servos, efforts))
+    file = load_scene(path, base=base, servos=servos, efforts=efforts) if is_stated else path
+    robot = MjcfRobot(file, body=body, floors=floors, turns_about=turns_about, obstacles=obstacles, mocap=mocap)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
     if given:
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")

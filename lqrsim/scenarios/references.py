@@ -6,7 +6,7 @@ A scenario is the name of a registered scenario, a user's function, or an MJCF, 
   quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
   my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario; it may import files beside it
   my_package.robots:hallway     a function in a module of yours
-  my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
+  my_robot.xml,start={'x': 1}   any MJCF or URDF, with the settings of `lqrsim.scenarios.mjcf`
 
 A set of disturbances is `scenario`, for the disturbances of the scenario's demo, or the name of a preset. NAME:Kind is
 one kind of disturbance in a set.
@@ -96,7 +96,7 @@ def names_code(reference: str) -> bool:
 
 
 def _is_mjcf(target: str) -> bool:
-    return target.lower().endswith(".xml")
+    return target.lower().endswith((".xml", ".urdf"))
 
 
 def from_anywhere(reference: str) -> str:
@@ -127,7 +127,7 @@ def _registered_function(name: str) -> Callable[..., object]:
     try:
         return getattr(scenarios, check_name("scenario", name, scenarios.names()))
     except InputError as error:
-        raise InputError(f"{error}; or the path of an .xml file, or FILE.py:FUNCTION") from None
+        raise InputError(f"{error}; or the path of an .xml or .urdf file, or FILE.py:FUNCTION") from None
 
 
 def _own_function(target: str) -> Callable[..., object]:

@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_model import MjcfModel, unlogged
+from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_obstacles import touching_pairs
+from lqrsim.scenes.mujoco_log import unlogged
 
 # Fractions of the time at which the robot touches the body, and at which the body is at its goal: without time
 # left to return, and with it.

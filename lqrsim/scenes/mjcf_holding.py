@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mjcf_kinematics import Equalities
-from lqrsim.scenes.mjcf_model import MjcfModel, Side, control_ranges, input_names, ranges, unlogged
+from lqrsim.scenes.mjcf_model import MjcfModel, Side, control_ranges, input_names, ranges
+from lqrsim.scenes.mujoco_log import unlogged
 
 _HELD = 1e-6  # largest missing force, relative to the largest force that acts, of a robot that counts as held
 _STEPS, _HALVES, _NUDGE = 60, 12, 1e-6  # limits of steps and halvings; relative size of difference quotients

@@ -1,14 +1,12 @@
 """An MJCF as a record, read and compiled once, that robots, dynamics, plants and pictures share."""
 
-import contextlib
 import itertools
 import math
 import os
 import re
-import threading
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -19,7 +17,9 @@ import numpy.typing as npt
 from lqrsim import rotations
 from lqrsim.errors import Array, InputError, check_name
 from lqrsim.scenes import mjcf_text
-from lqrsim.scenes.mjcf_text import DEEPEST, UNNAMED, mujoco
+from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, UNNAMED, mujoco
+from lqrsim.scenes.mujoco_log import unlogged
+from lqrsim.scenes.urdf import is_urdf, read_urdf
 from lqrsim.scenes.world import World
 
 _KINDS = {
@@ -54,6 +54,8 @@ class Joint:
       name: name of the joint. kind: free, ball, slide or hinge.
       qpos, dofs: its indices in qpos and in qvel. limits: limits of a slide or hinge, in m or rad, or None.
       forces: limits of the sum that actuators exert on it, in N or N m, with gravity compensation if that is theirs.
+      speed: largest speed of a slide or hinge, in m/s or rad/s, infinite if none is stated. MuJoCo does not know it: it
+        is the number `<numeric name="NAME_velocity_limit">` in the <custom> section.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Joint:
     dofs: slice
     limits: Side | None
     forces: Side
+    speed: float
 
     @property
     def dof(self) -> int:
@@ -133,8 +136,8 @@ class MjcfModel:
 
     @classmethod
     def of_file(cls, name_or_path: str | os.PathLike[str]) -> "MjcfModel":
-        """That of a packaged scene, or of a file. Raises InputError if there is none, or no MJCF in it."""
-        return cls(*mjcf_text.read_mjcf(name_or_path))
+        """That of a packaged scene, an MJCF or a URDF. Raises InputError if there is none, or something else in it."""
+        return cls(*read_urdf(name_or_path)) if is_urdf(name_or_path) else cls(*mjcf_text.read_mjcf(name_or_path))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The text: another process compiles it."""
@@ -355,7 +358,13 @@ def _joint(model: mujoco.MjModel, number: int) -> Joint:
         name=_joint_name(model, number), kind=kind, qpos=qpos, dofs=dofs,
         limits=_side(limited, model.jnt_range[number]) if limited else None,
         forces=_side(model.jnt_actfrclimited[number], model.jnt_actfrcrange[number]),
+        speed=_speed_limit(model, _joint_name(model, number)) if kind in ("slide", "hinge") else math.inf,
     )  # fmt: skip
+
+
+def _speed_limit(model: mujoco.MjModel, joint: str) -> float:
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{joint}{SPEED_LIMIT}")
+    return math.inf if number < 0 else float(model.numeric(number).data[0])
 
 
 def _joint_name(model: mujoco.MjModel, number: int) -> str:
@@ -461,32 +470,6 @@ def _same_forces(model: mujoco.MjModel, key: int, other: mujoco.MjModel) -> bool
     return not _mocap_poses(other, key) and all(
         len(a) == len(b) and np.allclose(a, b, rtol=1e-6, atol=1e-9) for a, b in pairs
     )
-
-
-_quiet, _count, _before = threading.Lock(), 0, None
-
-
-@contextlib.contextmanager
-def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console, because its warnings are reported or recorded
-    otherwise.
-
-    Several threads may be in this context. The last to leave restores the state before the first.
-    """
-    global _count, _before
-    with _quiet:
-        if _count == 0:
-            _before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-            quiet.logto_file = quiet.logto_console = False
-            quiet.set()
-        _count += 1
-    try:
-        yield
-    finally:
-        with _quiet:
-            _count -= 1
-            if _count == 0 and _before is not None:
-                _before.set()
 
 
 @unlogged()

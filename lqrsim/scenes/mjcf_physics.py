@@ -14,7 +14,8 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
 from lqrsim.rotations import AXES
-from lqrsim.scenes.mjcf_model import MjcfModel, unlogged
+from lqrsim.scenes.mjcf_model import MjcfModel
+from lqrsim.scenes.mujoco_log import unlogged
 
 RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _CONVERGED = 1e-14  # the constraint solver's tolerance: its error is divided by the step of a difference quotient

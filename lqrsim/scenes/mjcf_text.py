@@ -34,6 +34,7 @@ MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 DEEPEST = 490  # largest depth of elements; MuJoCo's reader refuses slightly more
 UNNAMED = "unnamed_"  # prefix of the names of bodies, joints, geoms and actuators without a name in the MJCF
+SPEED_LIMIT = "_velocity_limit"  # <numeric name="JOINT_velocity_limit"> is the joint's largest speed in rad/s or m/s
 WHOLE = "mass"  # name of the mass of all moving bodies together
 _OF_JOINTS = ("damping", "stiffness", "armature", "frictionloss")
 _MEDIUM = ("density", "viscosity")
@@ -48,13 +49,13 @@ def names() -> list[str]:
 
 def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
     """The name and the whole text of an MJCF, with includes resolved. Raises InputError as `load_scene`."""
-    path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
+    path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml or .urdf file")
     if path.suffix.lower() != ".xml":
         packaged = names()
         try:
             path = MODELS / f"{check_name('scene', os.fspath(name_or_path), packaged)}.xml"
         except InputError as error:
-            raise InputError(f"{error}; or the path of an .xml file") from None
+            raise InputError(f"{error}; or the path of an .xml or .urdf file") from None
     elif not os.path.isfile(path):
         packaged = ", ".join(names())
         near = difflib.get_close_matches(path.name, [one.name for one in path.parent.glob("*.xml")], n=1)
@@ -81,6 +82,9 @@ def _flatten(path: Path) -> str:
             raise InputError(f"scene: got {file.name}, which is not XML ({error}), want an MJCF file") from None
         except OSError as error:
             raise InputError(f"scene: got {file.name}, which cannot be read ({error.strerror}), want a file") from None
+        if root.tag == "robot":
+            become = "to be included it wants to be an MJCF, load_scene(...).xml"
+            raise InputError(f"scene: got {file.name}, which is a URDF, want a name that ends in .urdf; {become}")
         expand(root, file.parent)
         return root
 

@@ -17,7 +17,7 @@ not in the way of that robot.
 
 import math
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +26,7 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, excerpt, keep
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mjcf_text import mujoco  # which says what is wrong if MuJoCo cannot be imported
+from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
 from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 
 _FLAGS = mujoco.mjtDisableBit
@@ -78,21 +79,42 @@ class Scene:
             raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {len(self.geoms)}, one per geom")
 
 
-def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True) -> Scene:
-    """A packaged scene by name, or any MJCF by path. It may include the packaged robots, e.g. `create.xml`, by name.
+def load_scene(
+    name_or_path: str | os.PathLike[str],
+    *,
+    obstacles: Choice = True,
+    base: Base | None = None,
+    servos: Servos | None = None,
+    efforts: Mapping[str, float] | None = None,
+) -> Scene:
+    """A packaged scene by name, or any MJCF or URDF by path.
+
+    An MJCF may include the packaged robots, e.g. `create.xml`, by name. A URDF becomes an MJCF, `scene.xml`, in which
+    each joint with an effort in its <limit> has a motor, named as the joint. Its largest speeds are kept by
+    `MjcfRobot.joint_limits`. Fixed links stay, and the link that carries them has their masses. Warnings name what is
+    missing, such as efforts and meshes, and the links that touch at zero, which never collide.
 
     Args:
-      name_or_path: a name in models/, or the path of an MJCF file.
+      name_or_path: a name in models/, or the path of a file. The meshes of a URDF are .stl, .obj or .msh files, there
+        or of the same name beside it; packages are in a folder above it, in ROS_PACKAGE_PATH or in AMENT_PREFIX_PATH.
       obstacles: the geoms fixed to the world that are obstacles: all that can collide; none, with False; names of
         geoms, or of bodies for all of their geoms; or a function that says whether a geom, as from
         `model.geom(number)`, is an obstacle. In runs the robot passes through geoms that are left out, except ground
         and what it stands on; an `MjcfRobot` does not, because its plans have their contacts.
+      base: of a URDF: whether its root link is "fixed" to the world, by default, or "free".
+      servos: of a URDF: stiffness and damping of servos in the place of motors, in N m/rad and N m s/rad, or in N/m and
+        N s/m; by joint, {"shoulder": (200.0, 10.0)}, or for all that have an effort, (200.0, 10.0).
+      efforts: of a URDF: largest torques in N m, or forces in N, by joint, in the place of the file's; 0 for no motor.
 
     Raises:
-      InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
-        is of a type without a distance.
+      InputError: no such scene or file; it does not parse or compile; there is no geom or joint of such a name; an
+        obstacle is of a type without a distance; or a free base with several root links, or one that a joint moves.
     """
-    return _with_choice(MjcfModel.of_file(name_or_path), obstacles)
+    of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts}
+    stated = {name: value for name, value in of_urdf.items() if value is not None}
+    mjcf = MjcfModel(*read_urdf(name_or_path, **stated)) if stated else MjcfModel.of_file(name_or_path)
+    # What moves in a URDF is an MjcfRobot, which has MuJoCo's distances.
+    return _with_choice(mjcf, obstacles, (*KINDS, *OTHER_KINDS) if is_urdf(name_or_path) else KINDS)
 
 
 def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
@@ -100,9 +122,9 @@ def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
     return _with_choice(MjcfModel(name, xml), obstacles)
 
 
-def _with_choice(mjcf: MjcfModel, obstacles: Choice) -> Scene:
+def _with_choice(mjcf: MjcfModel, obstacles: Choice, kinds: Collection[str] = KINDS) -> Scene:
     geoms = chosen_geoms(mjcf.model, obstacles, obstacle_geoms(mjcf.model), f"scene {mjcf.name}")
-    return scene_of(mjcf, geoms)
+    return scene_of(mjcf, geoms, kinds)
 
 
 def scene_of(mjcf: MjcfModel, geoms: Sequence[int], kinds: Collection[str] = KINDS) -> Scene:

@@ -17,7 +17,7 @@ from lqrsim.errors import Array, InputError, check_array, check_kind, excerpt, f
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import MOVED, MovingObstacles, Rollout
-from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance

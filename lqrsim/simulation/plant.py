@@ -19,8 +19,9 @@ from lqrsim.problem.collision_shape import shape_in
 from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import mjcf_kinematics
-from lqrsim.scenes.mjcf_model import compiled, unlogged
+from lqrsim.scenes.mjcf_model import compiled
 from lqrsim.scenes.mjcf_obstacles import Pairs, mounting_pairs, touchable, touching_pairs
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
 from lqrsim.simulation import plant_validation

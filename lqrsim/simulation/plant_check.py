@@ -16,7 +16,7 @@ from lqrsim.results.coordinates import Limits, check_same_system, spaces_of
 from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.plan import Plan
 from lqrsim.robots.base import Robot
-from lqrsim.scenes.mjcf_model import unlogged
+from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.scene import Scene
 from lqrsim.simulation.mujoco_physics import UNSTABLE
 from lqrsim.simulation.plant import Plant

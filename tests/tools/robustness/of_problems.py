@@ -69,6 +69,9 @@ def ilqr_stated(**stated: Any) -> ls.Solution:
 CART = """<mujoco><worldbody><body name="cart"><joint name="slider" type="slide" axis="1 0 0" range="-1 1"
   limited="true"/><geom size="0.1"/></body></worldbody><actuator><motor name="push" joint="slider"/></actuator>
   <keyframe><key name="left" qpos="-0.5"/></keyframe></mujoco>"""
+HEAVY = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+POLE = f"""<robot name="pole"><link name="cart">{HEAVY}</link><link name="pole">{HEAVY}</link>
+  <joint name="pole" type="continuous"><parent link="cart"/><child link="pole"/></joint></robot>"""
 FOLDED = """
 <mujoco>
   <worldbody><body name="a"><joint name="a"/><geom size="0.1"/>
@@ -105,6 +108,8 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     links = place.folder / "folded.xml"
     links.write_text(FOLDED, encoding="utf-8")
     folded = ls.MjcfRobot(links)
+    urdf = place.folder / "pole.urdf"
+    urdf.write_text(POLE, encoding="utf-8")
     noise = ls.Noise(shaken, size=1, parameters={"share": 0.1}, level="plain")
     known: dict[str, ls.Robot] = {
         "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive(),
@@ -276,6 +281,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "World.distance": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
         "World.nearest": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
         "load_scene": ({"name_or_path": "arena"}, 0.3),
+        "load_scene of a URDF": ({
+            "call": ls.load_scene, "name_or_path": urdf, "base": "free", "servos": {"pole": (20.0, 1.0)},
+            "efforts": {"pole": 5.0},
+        }, 0.3),
         "Scene": ({
             field.name: getattr(place.scenario.scene, field.name) for field in dataclasses.fields(place.scenario.scene)
         },),

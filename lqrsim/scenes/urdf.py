@@ -1,0 +1,394 @@
+"""A URDF as an MJCF: MuJoCo reads it, and what a URDF does not say is decided here.
+
+A URDF has no actuators and does not say whether its base floats; its meshes are in ROS packages; its fixed links may
+have inertias that MuJoCo refuses. What MuJoCo has read is written here, because its own writer has six digits.
+"""
+
+import itertools
+import logging
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+from xml.parsers import expat
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
+from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, mujoco
+from lqrsim.scenes.mujoco_log import unlogged
+
+Base = Literal["fixed", "free"]
+Servo = Sequence[float]  # stiffness and damping
+Servos = Servo | Mapping[str, Servo]
+
+SUFFIX = ".urdf"
+_COUPLED = {"revolute", "continuous", "prismatic"}  # types of joints with one coordinate
+_SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1, "mesh": 0}  # how many numbers the size of a geom has
+_MESHES = (".stl", ".obj", ".msh")  # files that MuJoCo reads
+_HIDDEN = 3  # group of the collision geoms of links that have visual ones; pictures show groups below
+_PATHS = ("meshdir", "texturedir", "assetdir", "strippath")  # settings about paths, which are resolved here
+_LISTED = 6  # largest number of names in a line
+_log = logging.getLogger("lqrsim")
+
+
+def read_urdf(
+    file: str | os.PathLike[str],
+    *,
+    base: Base = "fixed",
+    servos: Servos | None = None,
+    efforts: Mapping[str, float] | None = None,
+) -> tuple[str, str]:
+    """The name of a URDF, and the MJCF that it becomes. Arguments and errors are those of `load_scene`."""
+    path = check_path("URDF", file, f"the path of a {SUFFIX} file")
+    root = _parsed(path)
+    check_name(f"{path.name}: base", base, ("fixed", "free"))
+    settings = root.findall("mujoco/*")  # MuJoCo's extension: elements of an MJCF
+    compiler = {key: value for one in settings if one.tag == "compiler" for key, value in one.attrib.items()}
+    _find_meshes(root, path, compiler)
+    spec = _read(root, path.name, {key: value for key, value in compiler.items() if key not in _PATHS})
+    if base == "free":
+        _free_base(spec, path.name)
+    mjcf = ElementTree.Element("mujoco", {"model": spec.modelname})
+    _add(mjcf, "option", {"integrator": "implicitfast"})  # which is stable for damping, also that of servos
+    for one in settings:
+        one.attrib = {key: value for key, value in one.attrib.items() if key not in _PATHS}
+        mjcf.append(one)
+    _add(mjcf, "compiler", {"angle": "radian"})
+    with np.errstate(all="ignore"):  # masses that are not finite are refused where the model is used
+        _add_parts(mjcf, spec)
+    _check_joints(root, spec, path.name)
+    _add_actuators(mjcf, spec, path.name, servos, efforts)
+    _add_speed_limits(mjcf, root, path.name)
+    with unlogged():
+        model, refused = _compiled(mjcf)
+        if refused:
+            _remove_refused_shapes(mjcf, path.name)
+            model, _ = _compiled(mjcf)
+        if model is not None:  # else what is wrong is said where the model is used
+            _exclude_overlaps(mjcf, model, path.name)
+    return path.stem, _text(mjcf)
+
+
+def is_urdf(path: object) -> bool:
+    """Whether it is the path of a URDF."""
+    return os.fspath(path).lower().endswith(SUFFIX) if isinstance(path, str | Path) else False
+
+
+def _parsed(path: Path) -> ElementTree.Element:
+    """The root of the file. Raises InputError if it is no URDF, or MuJoCo's reader would crash."""
+    if not is_urdf(path):
+        raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want the path of a {SUFFIX} file")
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    # Without namespaces, as MuJoCo and ROS: prefixes such as `drake:` are often not declared.
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    try:
+        parser.Parse(path.read_bytes(), True)
+        root = builder.close()
+    except expat.ExpatError as error:
+        raise InputError(f"URDF: got {path.name}, which is not XML ({error}), want a URDF") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"URDF: got {excerpt(os.fspath(path))}, want a file that can be read ({error})") from None
+    if root.tag != "robot":
+        raise InputError(f"URDF: got {path.name} with <{root.tag}> at its root, want <robot>")
+    if any(one.tag.startswith("xacro:") for one in root.iter()):
+        raise InputError(f"URDF: got {path.name} with macros, want what `xacro {path.name}` prints")
+    if (links := len(root.findall("link"))) > DEEPEST:
+        raise InputError(f"URDF: got {path.name} with {links:,} links, want {DEEPEST} at most")
+    return root
+
+
+def _find_meshes(root: ElementTree.Element, path: Path, settings: Mapping[str, str]) -> None:
+    """Write the full paths of meshes, and take out the geometries of which MuJoCo has no file, with a warning."""
+    lost = dict[str, list[str]]()
+    for link, kind in itertools.product(root.iterfind("link"), ("visual", "collision")):
+        for geometry in link.findall(kind):
+            geometry.attrib.pop("name", None)  # they get names later, as most have none, and some the same one
+            if (mesh := geometry.find("geometry/mesh")) is not None:
+                name = mesh.get("filename", "")
+                files = [one for place in _places(name, path.parent.resolve(), settings) for one in _readable(place)]
+                found = next((str(one) for one in files if os.path.isfile(one)), None)
+                mesh.set("filename", found or "")
+                if found is None:
+                    link.remove(geometry)
+                    lost.setdefault(kind, []).append(name)
+    for kind, names in lost.items():
+        _log.warning(
+            "%s: %d %s meshes are left out, such as %s: want .stl, .obj or .msh files, there or of the same name beside"
+            " it; ROS_PACKAGE_PATH may name the folders of packages", path.name, len(names), kind, names[0],
+        )  # fmt: skip
+
+
+def _places(name: str, folder: Path, settings: Mapping[str, str]) -> Iterator[Path]:
+    """Where a mesh may be. A package is in a folder of its name, above the URDF or in a path of ROS."""
+    scheme, separator, rest = name.rpartition("://")
+    if not separator or scheme == "file":
+        stripped = Path(rest).name if settings.get("strippath") == "true" else rest
+        yield folder / settings.get("meshdir", settings.get("assetdir", "")) / stripped
+        return
+    for parent in (folder, *folder.parents):
+        yield parent / rest.lstrip("/")
+    package, _, inside = rest.lstrip("/").partition("/")
+    for entry in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
+        yield Path(entry) / package / inside
+        if Path(entry).name == package:
+            yield Path(entry) / inside
+    for entry in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        yield Path(entry) / "share" / package / inside
+
+
+def _readable(place: Path) -> list[Path]:
+    """The file if MuJoCo reads its kind, else those of the same name that it reads."""
+    return [place] if place.suffix.lower() in _MESHES else [place.with_suffix(kind) for kind in _MESHES if place.name]
+
+
+def _read(root: ElementTree.Element, name: str, compiler: Mapping[str, str]) -> mujoco.MjSpec:
+    """What MuJoCo reads, with all links and with all their geoms, each of which has a name."""
+    for own in root.findall("mujoco"):
+        root.remove(own)
+    _add(_add(root, "mujoco"), "compiler", {**compiler, "fusestatic": "false", "discardvisual": "false"})
+    try:
+        with unlogged():
+            spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+            _ = [body.joints for body in spec.bodies]  # MuJoCo says here whether two have the same name
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"URDF: got {name}, which MuJoCo refuses: {' '.join(str(error).split())}") from None
+    taken = {geom.name for geom in spec.geoms}
+    dense = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    for geom in spec.geoms:
+        geom.density = geom.density if dense else 0.0  # a link without <inertial> has no mass
+        if not geom.name:
+            first = f"{geom.parent.name}_{'collision' if geom.contype else 'visual'}"
+            names = itertools.chain([first], (f"{first}_{number}" for number in itertools.count(1)))
+            geom.name = next(one for one in names if one not in taken)
+            taken.add(geom.name)
+    return spec
+
+
+def _free_base(spec: mujoco.MjSpec, name: str) -> None:
+    """Let the root link float. Raises InputError if there are several, or it moves by a joint of its own."""
+    roots = spec.worldbody.bodies
+    if len(roots) != 1 or roots[0].joints:
+        got = f"'free', with {_listed([one.name or '' for one in roots])} at the root"
+        raise InputError(f"{name}: base: got {got}, want one link there, without a joint")
+    roots[0].add_freejoint()
+
+
+def _add_parts(mjcf: ElementTree.Element, spec: mujoco.MjSpec) -> None:
+    """Add all meshes, bodies with their joints and geoms, and what couples joints."""
+    assets = _add(mjcf, "asset")
+    for mesh in spec.meshes:
+        # Meshes have no mass here, and a flat one has no volume.
+        _add(assets, "mesh", {"name": mesh.name, "file": mesh.file, "inertia": "shell"}, scale=mesh.scale)
+    _add_body(_add(mjcf, "worldbody"), spec.worldbody)
+    ties = _add(mjcf, "equality")
+    for one in spec.equalities:
+        _add(ties, "joint", {"joint1": one.name1, "joint2": one.name2}, polycoef=one.data[:5])
+
+
+def _check_joints(root: ElementTree.Element, spec: mujoco.MjSpec, name: str) -> None:
+    """Raise InputError for limits in the wrong order, and warn of limits and couplings that MuJoCo does not take."""
+    for one in spec.joints:
+        if one.range[0] > one.range[1]:
+            got = f"got limits from {one.range[0]:g} to {one.range[1]:g} for {one.name}"
+            raise InputError(f"{name}: {got}, want lower below upper")
+    coupled, names = (
+        {one.name1 for one in spec.equalities},
+        [one.get("name", "") for one in root.iterfind("joint[mimic]")],
+    )
+    if loose := [one for one in names if one not in coupled]:
+        _log.warning("%s: no joint is followed by %s: want a <mimic> of one that turns or slides", name, _listed(loose))
+    bounded = {one.get("name") for one in root.iterfind("joint") if one.get("type") in ("revolute", "prismatic")}
+    if endless := [one.name or "" for one in spec.joints if one.name in bounded and not _is_limited(one)]:
+        _log.warning("%s: no limits for %s: want a lower and an upper that differ", name, _listed(endless))
+
+
+def _add_body(element: ElementTree.Element, body: mujoco.MjsBody) -> None:
+    """Add what a body has: its inertia, with those of the bodies fixed to it, if it moves; joints, geoms and bodies."""
+    if body.joints:
+        moments = _moments(body)
+        if (mass := moments[3, 3]) != 0:
+            centre = moments[:3, 3] / mass
+            second = moments[:3, :3] - mass * np.outer(centre, centre)
+            inertia = np.trace(second) * np.eye(3) - second
+            full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            _add(element, "inertial", pos=centre, mass=mass, fullinertia=full)
+    for joint in body.joints:
+        if (kind := _kind(joint)) == "free":
+            _add(element, "freejoint", {"name": joint.name} if joint.name else {})
+            continue
+        numbers = {"damping": joint.damping, "frictionloss": joint.frictionloss}
+        numbers |= {"axis": joint.axis} if kind != "ball" else {}
+        numbers |= {"range": joint.range} if _is_limited(joint) else {}
+        _add(element, "joint", {"name": joint.name, "type": kind}, **numbers)
+    drawn = any(not geom.contype for geom in body.geoms)
+    for geom in body.geoms:
+        collides, kind = bool(geom.contype), _kind(geom)
+        own = {"name": geom.name, "type": kind, "group": str(_HIDDEN if collides and drawn else geom.group)}
+        own |= {"mesh": geom.meshname} if geom.meshname else {}
+        own |= {} if collides else {"contype": "0", "conaffinity": "0"}
+        numbers = {"size": geom.size[: _SIZES[kind]]} if _SIZES[kind] else {}
+        _add(element, "geom", own, **numbers, pos=geom.pos, quat=geom.quat, rgba=geom.rgba, density=geom.density)
+    for child in body.bodies:
+        _add_body(_add(element, "body", {"name": child.name}, pos=child.pos, quat=child.quat), child)
+
+
+def _moments(body: mujoco.MjsBody) -> Array:
+    """The second and first moments of mass and the mass, (4, 4), of a body and the bodies fixed to it, in its frame.
+
+    A URDF may give fixed links inertias that no body can have, as sensors do; only the sum matters.
+    """
+    moments = np.zeros((4, 4))
+    if body.explicitinertial:
+        stated = body.fullinertia if np.any(body.fullinertia[1:]) else np.zeros(6)  # MuJoCo marks zeros by a NaN
+        xx, yy, zz, xy, xz, yz = stated
+        inertia, frame = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), _frame(body.ipos, body.iquat)
+        moments[:3, :3], moments[3, 3] = np.trace(inertia) / 2 * np.eye(3) - inertia, body.mass
+        moments = frame @ moments @ frame.T
+    for child in body.bodies:
+        if not child.joints:
+            frame = _frame(child.pos, child.quat)
+            moments += frame @ _moments(child) @ frame.T
+    return moments
+
+
+def _frame(position: Array, quaternion: Array) -> Array:
+    """The frame at a position as a homogeneous matrix, (4, 4)."""
+    turn, frame = np.zeros(9), np.eye(4)
+    mujoco.mju_quat2Mat(turn, quaternion)
+    frame[:3, :3], frame[:3, 3] = turn.reshape(3, 3), position
+    return frame
+
+
+def _add_actuators(
+    mjcf: ElementTree.Element,
+    spec: mujoco.MjSpec,
+    name: str,
+    servos: Servos | None,
+    efforts: Mapping[str, float] | None,
+) -> None:
+    """Add a motor or a servo for each joint with an effort that does not follow another; a warning names the others."""
+    followers = {one.name1 for one in spec.equalities}
+    joints = {one.name: one for one in spec.joints if _kind(one) in ("slide", "hinge") and one.name not in followers}
+    given = check_kind(f"{name}: efforts", efforts or {}, Mapping, "numbers by joint: {'shoulder': 20.0}")
+    for joint, effort in given.items():
+        check_name(f"{name}: efforts", joint, joints)
+        check_number(f"{name}: efforts of {joint}", effort, at_least=0.0)
+    limits = {joint: float(given.get(joint, one.actfrcrange[1])) for joint, one in joints.items()}
+    if not isinstance(servos, Mapping):
+        servos = {} if servos is None else dict.fromkeys((one for one in joints if limits[one] > 0), servos)
+    gains = {check_name(f"{name}: servos", joint, joints): _gains(name, joint, one) for joint, one in servos.items()}
+    section = _add(mjcf, "actuator")
+    for joint, one in joints.items():
+        own, effort = {"name": joint, "joint": joint}, limits[joint]
+        force = [-effort, effort] if 0 < effort < np.inf else None
+        if joint in gains:
+            stiffness, damping = gains[joint]
+            numbers = {"ctrlrange": one.range} if _is_limited(one) else {}
+            numbers |= {"forcerange": force} if force else {}
+            _add(section, "position", own, kp=stiffness, kv=damping, **numbers)
+        elif effort > 0:
+            _add(section, "motor", own, **({"ctrlrange": force} if force else {}))
+    if bare := [joint for joint in joints if not limits[joint] > 0 and joint not in (*gains, *given)]:
+        _log.warning(
+            "%s: no motor for %s: want an effort in <limit>, or efforts={%r: 10.0}, with 0.0 if there is none",
+            name, _listed(bare), bare[0],
+        )  # fmt: skip
+
+
+def _gains(name: str, joint: str, servo: object) -> list[float]:
+    """The stiffness and the damping of a servo."""
+    field, want = f"{name}: servos of {joint}", "two numbers, the stiffness and the damping"
+    if len(gains := check_items(field, servo, object, want)) != 2:
+        raise InputError(f"{field}: got {excerpt(servo)}, want {want}")
+    return [check_number(field, gain, at_least=0.0) for gain in gains]
+
+
+def _add_speed_limits(mjcf: ElementTree.Element, root: ElementTree.Element, name: str) -> None:
+    """Add the largest speeds of joints, for which MuJoCo has no place, as numbers of the user's."""
+    section = _add(mjcf, "custom")
+    for joint in root.iterfind("joint"):
+        text = next((one.get("velocity", "") for one in joint.iterfind("limit")), "") or "0"
+        try:
+            speed = float(text)
+        except ValueError:
+            got = f"got {excerpt(text)} for the velocity of {joint.get('name')}"
+            raise InputError(f"{name}: {got}, want a number of rad/s or m/s") from None
+        if joint.get("type") in _COUPLED and 0 < speed < np.inf:
+            _add(section, "numeric", {"name": f"{joint.get('name')}{SPEED_LIMIT}"}, data=speed)
+
+
+def _compiled(mjcf: ElementTree.Element) -> tuple[mujoco.MjModel | None, str]:
+    """The model, or None and what MuJoCo has against it."""
+    try:
+        return mujoco.MjModel.from_xml_string(_text(mjcf)), ""
+    except (ValueError, mujoco.FatalError) as error:
+        return None, " ".join(str(error).split())
+
+
+def _remove_refused_shapes(mjcf: ElementTree.Element, name: str) -> None:
+    """Take out the geoms that MuJoCo refuses, such as boxes and meshes without a volume, with a warning."""
+    meshes = {one.get("name"): one for one in mjcf.iterfind("asset/mesh")}
+    lost, used = dict[str, str](), set[str | None]()
+    shapes = [(body, geom) for body in mjcf.iter("body") for geom in body.findall("geom")]
+    for body, geom in shapes:
+        alone, mesh = ElementTree.Element("mujoco"), geom.get("mesh")
+        _add(alone, "asset").extend([meshes[mesh]] if mesh else [])
+        _add(alone, "worldbody").append(geom)
+        if refused := _compiled(alone)[1]:
+            body.remove(geom)
+            lost[geom.get("name", "")] = refused
+        else:
+            used.add(mesh)
+    for assets, (mesh, element) in itertools.product(mjcf.iterfind("asset"), meshes.items()):
+        if mesh not in used:
+            assets.remove(element)
+    if lost:
+        (first, why), *_ = lost.items()
+        _log.warning("%s: %d shapes are left out, such as %s: %s", name, len(lost), first, why)
+
+
+def _exclude_overlaps(mjcf: ElementTree.Element, model: mujoco.MjModel, name: str) -> None:
+    """Let links that touch at zero, or at the joints' limits next to it, pass through each other.
+
+    A URDF cannot say which links may collide. Hulls of links that are two joints apart often overlap in any position.
+    """
+    data, limited = mujoco.MjData(model), np.flatnonzero(model.jnt_limited)
+    places = model.jnt_qposadr[limited]
+    data.qpos[places] = np.clip(data.qpos[places], *model.jnt_range[limited].T)
+    mujoco.mj_fwdPosition(model, data)
+    bodies = model.geom_bodyid[data.contact.geom] if data.ncon else np.zeros((0, 2), dtype=np.intp)
+    pairs = dict.fromkeys((model.body(one).name, model.body(other).name) for one, other in bodies.tolist())
+    section = _add(mjcf, "contact")
+    for one, other in pairs:
+        _add(section, "exclude", {"body1": one, "body2": other})
+    if touching := [f"{one} and {other}" for one, other in pairs]:
+        _log.warning("%s: links that touch at zero never collide: %s", name, _listed(touching))
+
+
+def _text(mjcf: ElementTree.Element) -> str:
+    return ElementTree.tostring(mjcf, encoding="unicode") + "\n"
+
+
+def _kind(element: mujoco.MjsJoint | mujoco.MjsGeom) -> str:
+    return element.type.name.rpartition("_")[2].lower()
+
+
+def _is_limited(joint: mujoco.MjsJoint) -> bool:
+    """Whether it has limits. MuJoCo takes two equal ones, as of a joint without any in the URDF, for none."""
+    return joint.limited != mujoco.mjtLimited.mjLIMITED_FALSE and joint.range[0] != joint.range[1]
+
+
+def _add(
+    parent: ElementTree.Element, tag: str, own: Mapping[str, str] | None = None, **numbers: npt.ArrayLike
+) -> ElementTree.Element:
+    """A new element, whose numbers read back exactly."""
+    texts = {key: " ".join(repr(float(one)) for one in np.ravel(given)) for key, given in numbers.items()}
+    return ElementTree.SubElement(parent, tag, {**(own or {}), **texts})
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names in a line; only the first ones if there are many."""
+    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
