@@ -10,21 +10,23 @@ times     How long a re-plan takes: both robots, with the obstacle's cost, with 
 changes   A goal that jumps, and a pillar that appears where the plan leads.
 delay     What a delay of one control period costs, predicted or ignored.
 estimate  Output feedback with new plans, made with what is estimated, against the same without.
+reach     Arms from MJCFs that are pushed on their way, with a plan every 100 ms.
 peers     Other people's solvers on the same work, run by run in turn: how long a re-plan takes, what the loop costs.
 """
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from replan import changes, common, delay, estimate, peers, times
+from replan import changes, common, delay, estimate, peers, reach, times
 from runner import Result, Section, measure, opening, report_of, run
 
-Name = Literal["times", "changes", "delay", "estimate", "peers"]
+Name = Literal["times", "changes", "delay", "estimate", "reach", "peers"]
 SECTIONS = {
     "times": Section(times, "How long re-plans take"),
     "changes": Section(changes, "What changes on the way"),
     "delay": Section(delay, "What a delay costs"),
     "estimate": Section(estimate, "Planning again with estimates"),
+    "reach": Section(reach, "Arms that are pushed"),
     "peers": Section(peers, "Against other solvers"),
 }
 

@@ -1238,7 +1238,7 @@ class TestPlanMethods:
         point = InteriorPoint(stages, plan, price=price)
         stages.state(margin=1e-9)
         known = np.abs(stages.numbers.ravel()) if informed else np.zeros(stages.live.size)
-        begun = PlanBeginning(plan, known, informed, 1.0, 0.02)
+        begun = PlanBeginning(plan, known, informed, 1.0, 0.02, 0.0)
         work, memory = stages.interior
         work = work._replace(filter=np.zeros((20, 2)))
         log = np.zeros(20, MEASURES)
@@ -1248,6 +1248,7 @@ class TestPlanMethods:
             rest = with_rows((begun, stages.about, work, memory, log))
             return replay(kernel, SIZES, "interior_point", task, first, last, 1e-6, 1e-6, *rest)
 
+        run(interior_point.SURVEY, 0, 0)
         run(interior_point.BEGIN, 0, 0)
         assert memory["elastic"][0] == np.isfinite(price)
         for rung in (3.0, 0.0):  # with regularised models, and without
@@ -1263,6 +1264,9 @@ class TestPlanMethods:
         replay(kernel, SIZES, "predict", 1e-9, *state)
         memory["parameter"] = 0.1
         replay(kernel, SIZES, "off_centre", *state)
+        memory["age"], stages.about.keeps[0] = 1.0, 1.0
+        replay(kernel, SIZES, "renew", *state)
+        assert memory["age"][0] == stages.about.keeps[0] == 0
         replay(kernel, SIZES, "asked", *state[:2])
         run(interior_point.SETTLE, 0, 0)
         memory["solved"] = 1.0

@@ -1,6 +1,7 @@
 """Problems and settings that all questions share."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -24,6 +25,8 @@ class Config(FolderSettings):
     """Of each law, in the sections about outcomes."""
     deadline: float = 0.012
     """Seconds that a solve may take, in the section about times."""
+    arms: tuple[Path, ...] = ()
+    """MJCFs of arms, for the section about reaching; by default one of six hinges."""
     seed: int = 0
     """Of the disturbances."""
 

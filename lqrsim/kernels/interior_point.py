@@ -12,6 +12,10 @@ row lies between a lower and an upper bound, and `d = s - p` has two slacks. The
 barrier parameter, and so is the product of p and upper - y. For an inequality, the lower bound is 0. Without an upper
 bound there is no p. An upper bound is the price of a violation, in cost per unit: the constraint is then elastic. An
 equality without a price has no slacks, and is regularised.
+
+If MuJoCo linearises, that takes most of an iteration. Where the plan hardly moves, as when a robot plans again, the
+derivatives of the dynamics may serve for several steps; the gaps that steps leave are always MuJoCo's own. They are
+computed anew if a step with old ones has to be shortened, and before a plan counts as converged.
 """
 
 from math import copysign, inf, isfinite, isnan, log, nan
@@ -98,9 +102,9 @@ WITHIN, AROUND = 0.9, 10.0  # known multipliers: fraction of a bound, and factor
 CENTRED = 0.5  # fraction of an affine step above which Mehrotra's corrections of products are used
 NEGLIGIBLE = 1e-7  # multiplier that counts as zero in the Hessians, times its row's size and relative to the cost
 
-# Tasks of `interior_point`: to choose slacks and multipliers at a plan; to take steps without a barrier from there; to
-# iterate; and to cross over, because no iteration follows.
-BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3
+# Tasks of `interior_point`: to find typical sizes at a plan; to choose slacks and multipliers there; to take steps
+# without a barrier from there; to iterate; and to cross over, because no iteration follows.
+SURVEY, BEGIN, SETTLE, ITERATE, CLOSE = 0, 1, 2, 3, 4
 
 
 @compact
@@ -110,8 +114,8 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
     All code that a solve can need is compiled together, before it begins.
 
     Args:
-      task: one of BEGIN, SETTLE, ITERATE and CLOSE. tolerance: tolerance of stationarity, gaps and complementarity.
-      violation: tolerance of the constraints, in their units.
+      task: one of SURVEY, BEGIN, SETTLE, ITERATE and CLOSE.
+      tolerance: tolerance of stationarity, gaps and complementarity. violation: of constraints, in their units.
       begun: PlanBeginning. stages: PlanStages. work: InteriorArrays. memory: (1,) row of INTERIOR.
       log: rows of MEASURES, written.
 
@@ -119,6 +123,9 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
       The number of iterations so far; and CONVERGED if the crossover succeeded, STALLED if nothing helps any more,
       otherwise RUNNING. `memory.solved` says whether the measures were within tolerance.
     """
+    if task == SURVEY:
+        find_sizes(begun, stages, work, memory[0])
+        return 0, RUNNING
     if task == BEGIN:
         begin(begun, stages, work, memory[0])
         return 0, RUNNING
@@ -128,16 +135,23 @@ def interior_point(task, first, last, tolerance, violation, begun, stages, work,
 
 
 @compact
-def begin(begun, stages, work, mem):
-    """Begin from a plan: compute typical sizes, slacks, multipliers and measures."""
-    rows, now, steps, limits = stages.rows, work.now, stages.steps, stages.model.limits
+def find_sizes(begun, stages, work, mem):
+    """Take a plan, with its controls a little inside their limits; compute typical sizes and the models there."""
+    now, steps, limits = work.now, stages.steps, stages.model.limits
     copy_plan(steps, begun.plan, now.plan)
     for i in range(M):
         low, high = limits.low[i], limits.high[i]
         edge = EDGE * (high - low) if high - low < inf else 0.0
         for t in range(steps):
             now.plan.controls[t, i] = min(max(now.plan.controls[t, i], low + edge), high - edge)
+    stages.keeps[0] = 0.0
     mem.typical = survey(stages, now.plan)
+
+
+@compact
+def begin(begun, stages, work, mem):
+    """Begin from that plan: compute slacks, multipliers and measures."""
+    rows, now, steps = stages.rows, work.now, stages.steps
     mem.cost = trial(stages, now.plan, now.arrived)
     read_rows(stages, now.plan, now.numbers)
     # A cost near zero, as when standing still, says nothing about the scale of the problem.
@@ -153,7 +167,7 @@ def begin(begun, stages, work, mem):
     mem.barrier, mem.parameter = begun.barrier, begun.barrier * mem.scale / max(mem.pairs, 1.0)
     mem.highest, mem.part, mem.soft, mem.target, mem.since = mem.parameter, 1.0, 1.0, nan, float(CROSSINGS)
     mem.rung, mem.forced, mem.filtered, mem.failed, mem.solved, mem.short = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    mem.unchanged, mem.level = 0.0, inf
+    mem.unchanged, mem.level, mem.age, mem.oldest = 0.0, inf, 0.0, begun.oldest
     for at in range(rows.size * (steps + 1)):
         now.slacks.slack[at], now.slacks.excess[at], rows.force[at] = 0.0, 0.0, 0.0
         if rows.live[at] != 0:
@@ -235,6 +249,9 @@ def iterations(first, last, closing, tolerance, violation, stages, work, mem, lo
         mem.target = tolerance
     while True:
         inside = within(tolerance, violation, mem)
+        if inside and mem.age > 0 and (ended or central(tolerance, mem)):
+            renew(stages, work, mem)
+            inside = within(tolerance, violation, mem)
         mem.solved = 1.0 if inside or (mem.solved != 0 and stages.learns == 0) else 0.0
         if stages.learns == 1 and inside and (ended or central(tolerance, mem)):
             return done, CONVERGED
@@ -310,6 +327,9 @@ def iterate(done, tolerance, stages, work, mem):
             return False
         find_step(least, free, stages, work, mem)
         part = search(True, stages, work, mem)
+        if part < min(LONG, mem.whole) and mem.age > 0:
+            renew(stages, work, mem)
+            continue
         # Far away, linearised equalities may be absurd; softened equalities demand only a part.
         if part >= STUCK or asked(stages, work) < ABSURD * mem.scale or mem.soft >= SOFTEST:
             break
@@ -581,7 +601,8 @@ def search(corrected, stages, work, mem):
     """Backtrack along the step until the filter accepts; the first trial also with a second-order correction.
 
     The correction reduces the residuals after the whole step, which remain because rows and dynamics are not linear.
-    Only if `corrected` are there corrections.
+    Only if `corrected` are there corrections. Where derivatives are kept, none follow an accepted step: another step
+    costs as little.
 
     Returns:
       The fraction of the step that leads to the point in `work.tried`, or -1.
@@ -590,10 +611,11 @@ def search(corrected, stages, work, mem):
     mem.slope, mem.violated = slope_of_merit(stages, work, mem), off(now, stages)
     mem.merit = merit_of(now, mem.cost, stages, mem)
     part, first = longest(boundary(mem), now.slacks, step.slacks, stages), True
+    mem.whole = part
     while part > SHORTEST:
         mem.tried = go(part, now, step.changes, step.slacks, work.tried, stages)
         if isfinite(mem.tried) and acceptable(part, work.tried, mem.tried, stages, work, mem):
-            if corrected and part >= LONG:
+            if corrected and part >= LONG and mem.oldest == 0:
                 close_residuals(part, stages, work, mem)
             return part
         if first and isfinite(mem.tried) and corrected and correct(part, stages, work, mem):
@@ -709,11 +731,13 @@ def take(part, stages, work, mem):
     for t in range(stages.steps + 1):
         for i in range(N):
             work.costates[t, i] += part * (step.costates[t, i] - work.costates[t, i])
-    before, new = mem.stationarity, work.tried.plan
-    if stages.learns == 1:
+    before, new, learns = mem.stationarity, work.tried.plan, stages.learns == 1 and mem.oldest == 0
+    mem.age = mem.age + 1 if mem.age < mem.oldest else 0.0
+    stages.keeps[0] = 1.0 if mem.age > 0 else 0.0
+    if learns:
         remember(stages, work.now.plan, new, work.costates, work.moves, work.turns)
     go_to(work.tried, mem.tried, NEGLIGIBLE * mem.scale, stages, work, mem)
-    if stages.learns == 1:
+    if learns:
         learn(stages, work.costates, work.moves, work.turns, part >= LONG and mem.stationarity > CRAWL * before)
 
 
@@ -850,13 +874,24 @@ def go_to(point, cost, least, stages, work, mem):
     """Go to a point of this cost; its multipliers up to `least` count as zero in the models."""
     copy_point(point, work.now, stages)
     mem.cost = cost
+    for t in range(stages.steps):
+        copy(point.arrived[t], N, stages.models.arrived[t])
     look(stages, work.now.plan, work.costates, least)
+    take_measures(stages, work, mem)
+
+
+@compact
+def renew(stages, work, mem):
+    """Compute the derivatives of the dynamics anew, about the iterate."""
+    stages.keeps[0], mem.age = 0.0, 0.0
+    look(stages, work.now.plan, work.costates, NEGLIGIBLE * mem.scale)
     take_measures(stages, work, mem)
 
 
 @compact
 def go_back(stages, work, mem):
     """Go back to the point that was kept."""
+    stages.keeps[0], mem.age = 0.0, 0.0
     copy(work.kept_force, stages.rows.size * (stages.steps + 1), stages.rows.force)
     for t in range(stages.steps + 1):
         copy(work.kept_costates[t], N, work.costates[t])

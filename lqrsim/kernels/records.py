@@ -229,8 +229,8 @@ class StageRows(NamedTuple):
     """The rows of all constraints, then those of the control limits, `size` at each step.
 
     Attributes:
-      limits: (size, 3) for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and
-        its value.
+      limits: (size, 5) for rows that are limits of a control: the control, 1 for a lower or -1 for an upper limit, and
+        its value. For rows of constraints: the distance between their bounds, and whether they are linear.
       first: (C,) the first row of each constraint. support: (size, W) 0 where a row does not depend on that entry.
       acts, live: ((T+1) size,) 1 for rows that can act, and for those that do at the plan, else 0.
       held: ((T+1) size,) what rows do in an active set; see `active_set.py`.
@@ -261,6 +261,7 @@ class PlanStages(NamedTuple):
       steps: T. soft: 1 if there is an initial cost. free: (N,) 0 for the states that the start fixes, else 1.
       reach: (N,) distances from the start to the goal. state_size, control_size: (N,) and (M,) typical sizes.
       projected: (1,) 1 if the projected Hessians are those of the last plan.
+      keeps: (1,) 1 if models of a plan keep the derivatives of the dynamics that are there.
       learns: 1 if the dynamics have no second derivatives. slow: (1,) 1 if the Hessians have what is learned of them.
       values: a vector for each constraint.
       policy, to_go, changes: see `direction` of `stages.py`.
@@ -273,6 +274,7 @@ class PlanStages(NamedTuple):
     state_size: Arrays
     control_size: Arrays
     projected: Arrays
+    keeps: Arrays
     learns: int
     slow: Arrays
     model: ProblemModel
@@ -342,6 +344,7 @@ class PlanBeginning(NamedTuple):
       plan: within the limits of its controls. known: ((T+1) size,) multipliers. informed: whether these are known.
       barrier: the first barrier parameter of each row, as a fraction of the cost divided by the number of rows.
       room: the least first slack, relative to a row's size.
+      oldest: the largest number of steps for which derivatives of the dynamics serve after the step that they are for.
     """
 
     plan: Motion
@@ -349,6 +352,7 @@ class PlanBeginning(NamedTuple):
     informed: bool
     barrier: float
     room: float
+    oldest: float
 
 
 class InteriorArrays(NamedTuple):
@@ -798,12 +802,14 @@ MEMORY = _row(
 # trial. solved: 1 once the measures are within tolerance. target: the tolerance towards which the barrier falls. since:
 # number of iterations since the last attempt to cross over. short: number of short steps in a row. before: cost at the
 # first of these. unchanged, level: number of iterations in a row in which the constraints were kept and the cost was
-# that of the first, `level`. kept, kept_scale: cost and scale of the point to go back to.
+# that of the first, `level`. kept, kept_scale: cost and scale of the point to go back to. whole: the largest fraction
+# of the last step with which slacks stay positive. age: number of steps since the dynamics were linearised; oldest: its
+# largest value.
 INTERIOR = _row(
     "cost", "stationarity", "violation", "gap", "complementarity", "miss", "product", "scale", "typical", "parameter",
     "highest", "barrier", "pairs", "elastic", "rung", "share", "soft", "part", "forced", "filtered", "failed",
     "farthest", "farthest_gap", "violated", "merit", "slope", "tried", "solved", "target", "since", "short", "before",
-    "unchanged", "level", "kept", "kept_scale",
+    "unchanged", "level", "kept", "kept_scale", "whole", "age", "oldest",
 )  # fmt: skip
 
 # The state of an active set between calls. cost, stationarity, violation, gap, complementarity, scale, typical: as

@@ -44,7 +44,7 @@ SLOWEST = 1e-6  # least effect of a control without limits, relative to the stat
 # the projected Hessians gives the models a minimum.
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)
 
-CONTROL, SIGN, SIDE, RANGE = 0, 1, 2, 3  # columns of `StageRows.limits`
+CONTROL, SIGN, SIDE, RANGE, STRAIGHT = 0, 1, 2, 3, 4  # columns of `StageRows.limits`
 INEQUALITY, LIMIT, EQUALITY = 0.0, 1.0, 2.0  # kinds of rows
 
 
@@ -86,7 +86,8 @@ def stage_models(t, stages, plan, costates, least):
     x, u = plan.states[t], plan.controls[min(t, stages.steps - 1)]
     if t < stages.steps:
         total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
-        step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+        if stages.keeps[0] == 0:
+            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
     else:
         total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
     subtract_curvatures(x, u, t, stages, least, out.hessian[t])
@@ -160,7 +161,8 @@ def subtract_curvatures(x, u, t, stages, least, hessian):
             continue
         for row in range(int(constraints.multipliers[k][ROWS])):
             at = rows.size * t + int(rows.first[k]) + row
-            if abs(rows.force[at]) * rows.sizes[at] > least:
+            straight = rows.limits[int(rows.first[k]) + row, STRAIGHT] != 0
+            if not straight and abs(rows.force[at]) * rows.sizes[at] > least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
 

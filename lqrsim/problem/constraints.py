@@ -55,6 +55,9 @@ class ConstraintTerm(Term):
       convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
       ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others; it is the most
         that counts as a typical change of the value.
+      linear: whether the values are linear in state and control, so that no solver looks for their curvature.
+      yields: whether the robot keeps an inequality by itself, as one that clips forces. A re-plan may then violate it,
+        at a price: after a push, no plan may satisfy it.
     """
 
     rows: int
@@ -65,6 +68,8 @@ class ConstraintTerm(Term):
     shared: int = 0
     convex: bool = False
     ranges: Array | None = None
+    linear: bool = False
+    yields: bool = False
 
     @property
     def _defines(self) -> Mapping[str, int]:
@@ -79,7 +84,7 @@ class ConstraintTerm(Term):
     def __post_init__(self) -> None:
         keep(self, rows=check_count("ConstraintTerm: rows", self.rows, at_least=0))
         check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
-        for name in ("uses_control", "equality", "final_only", "convex"):
+        for name in ("uses_control", "equality", "final_only", "convex", "linear", "yields"):
             keep(self, **{name: check_flag(f"ConstraintTerm: {name}", getattr(self, name))})
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")

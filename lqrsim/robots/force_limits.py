@@ -97,7 +97,8 @@ class ForceLimits(Constraint):
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
-            uses_control=True, convex=True, ranges=np.tile(ranges, 2),
+            uses_control=True, convex=True, ranges=np.tile(ranges, 2), linear=True,
+            yields=True,
         )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import CONVERGED, RUNNING
-from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, SETTLE
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, ENDS, ITERATE, SETTLE, SURVEY
 from lqrsim.kernels.records import MEASURES, Motion, PlanBeginning
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState
@@ -76,16 +76,18 @@ class InteriorPoint:
       barrier: initial barrier parameter of each row, as a fraction of the cost divided by the number of rows.
       room: the least initial slack: relative to a row's size, or to a control's range.
       price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
-        hold. Or a price for each row, (R,).
+        hold. Or a price for each row, (R,); or a function of the typical sizes that returns these.
       multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
+      oldest: number of further steps for which derivatives of the dynamics may serve. Nothing is then learned of their
+        curvature.
 
     Attributes:
       sizes: typical sizes. iterations: number of iterations so far.
     """
 
     def __init__(
-        self, stages: Stages, plan: Motion, *, barrier: float = 1.0, room: float = 0.02, price: float | Array = np.inf,
-        multipliers: tuple[Array, ...] = (),
+        self, stages: Stages, plan: Motion, *, barrier: float = 1.0, room: float = 0.02,
+        price: float | Array | Callable[[Sizes], Array] = np.inf, multipliers: tuple[Array, ...] = (), oldest: int = 0,
     ) -> None:  # fmt: skip
         self.stages, self.iterations = stages, 0
         problem = stages.problem
@@ -93,16 +95,17 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             begun.states[0, fixed] = np.asarray(problem.start)[fixed]
-        stages.state(price=price)
         known = in_c_order(stages.of_constraints(multipliers)).reshape(-1)
         self._begun = PlanBeginning(
-            Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier), float(room)
+            Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier), float(room), float(oldest)
         )
         self._arrays, self._memory = stages.interior
         self._log = np.zeros(0, MEASURES)
         self._tolerances = np.nan, np.nan
-        self._call(BEGIN, 0)
+        self._call(SURVEY, 0)
         self.sizes = stages.sized(float(self._memory["typical"][0]))
+        stages.state(price=price(self.sizes) if callable(price) else price)
+        self._call(BEGIN, 0)
 
     @property
     def plan(self) -> Motion:

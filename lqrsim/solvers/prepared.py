@@ -26,10 +26,13 @@ from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import InteriorPoint, Measures
 from lqrsim.solvers.interior_run import LITTLE, copied
+from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.restoration import restore
 from lqrsim.solvers.settings import FINE, SmootherSettings, check_problem
+from lqrsim.solvers.yielding import Yielding, can_yield
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
+COARSE = 1e-2  # the same where constraints give way, of plans of which a small part is carried out
 # Durations of the interior point's first iteration, and of a search farther from the plan, for which there must be
 # time; relative to the time for the models about a plan.
 BEGINNING, ELSEWHERE = 15.0, 200.0
@@ -43,18 +46,21 @@ def prepare(
     constraint_tolerance: float | None = None,
     max_iterations: int = 300,
     finish: str | None = "newton",
+    threads: int | None = None,
 ) -> "PreparedSolver":
     """Compile everything that problems of this structure need, so that nothing is compiled while a robot runs.
 
     Args:
       problem: one of the problems; others may have other states, goals, obstacles and parameters.
       tolerance: as in `smooth`; with constraints it bounds the Lagrangian's slope in each control, multiplied by the
-        control's range and relative to the cost; by default 1e-6.
+        control's range and relative to the cost; by default 1e-6, and 1e-2 with limits of forces.
       gap_tolerance: as in `smooth`.
       constraint_tolerance: the largest violation of equalities, by default 1e-6; inequalities are kept. With noise,
         the margin of inequalities, by default 1e-3.
       max_iterations: as in `smooth`.
       finish: as in `smooth`; with None, the augmented Lagrangian method keeps the constraints.
+      threads: number of threads that compute derivatives of an MJCF's steps; by default the number of processors. The
+        results are the same.
 
     Raises:
       InputError: an argument is not as described.
@@ -63,9 +69,12 @@ def prepare(
         tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    if tolerance is None and getattr(problem, "constraints", ()) and settings.final(problem) == FINE:
-        settings = replace(settings, tolerance=SLOPES)
-    return PreparedSolver(problem, settings)
+    if tolerance is None and getattr(problem, "constraints", ()) and settings.second_order(problem):
+        if can_yield(problem):
+            settings = replace(settings, tolerance=COARSE)
+        elif settings.final(problem) == FINE:
+            settings = replace(settings, tolerance=SLOPES)
+    return PreparedSolver(problem, settings, check_threads(threads))
 
 
 class PreparedSolver:
@@ -74,14 +83,15 @@ class PreparedSolver:
     Attributes:
       problem: the problem that is solved by default.
       settings: the options given to `prepare`.
+      threads: number of threads that compute derivatives of an MJCF's steps.
     """
 
-    def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
+    def __init__(self, problem: Problem, settings: SmootherSettings, threads: int = 1) -> None:
         check_problem(problem)
         if problem.duration is not None:
             raise InputError("problem: got a free duration, want a fixed one for solves in real time")
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
-        self.problem, self.settings = problem, settings
+        self.problem, self.settings, self.threads = problem, settings, threads
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
@@ -105,8 +115,11 @@ class PreparedSolver:
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and run.second_order:
-            stages, plan = run.stages, Motion(*run.work.best)
-            _Neighbour(run, plan, _Best(run)).find()
+            stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
+            if can_yield(self.problem):
+                Yielding(run, plan).find(best.plan, best.cost)
+                return
+            _Neighbour(run, plan, best).find()
             # Another solve may need code that this solve did not need.
             InteriorPoint(stages, plan).run(
                 tolerance=run.final, violation=run.settings.violation_tolerance(self.problem), most=1
@@ -165,8 +178,15 @@ class PreparedSolver:
             problem, self.settings, resolve(start, problem), np.asarray(state, dtype=np.float64), budget
         )
         best = _Best(run)
-        with problem.dynamics.solving(1):
-            if problem.constraints and run.second_order:
+        with problem.dynamics.solving(self.threads):
+            if run.second_order and can_yield(problem):
+                point = Yielding(run, _plan_of(start, best), self._closing)
+                found, ended = point.find(best.plan, best.cost), point.ended
+                if found is None:
+                    found = replace(_unchanged(best), status=point.unsolved)
+                else:
+                    best.adopt(found)
+            elif problem.constraints and run.second_order:
                 neighbour = _Neighbour(run, _plan_of(start, best), best, self._closing)
                 found, ended = neighbour.find(), neighbour.laps.ended
                 if neighbour.may_be_far:
@@ -384,9 +404,13 @@ class _Best:
         cheaper = self._better(self.cost, self.violation, found.cost, found.violation)
         as_good = found.success and (self.violation > self._none or not cheaper)
         if as_good or self._beaten_by(found.cost, found.violation):
-            there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())
-            self._keep(found.cost, found.violation, there)
-            self.multipliers = found.multipliers
+            self.adopt(found)
+
+    def adopt(self, found: RunResult) -> None:
+        """Adopt a result."""
+        there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())
+        self._keep(found.cost, found.violation, there)
+        self.multipliers = found.multipliers
 
     def _beaten_by(self, cost: float, violation: float) -> bool:
         return self._better(cost, violation, self.cost, self.violation)

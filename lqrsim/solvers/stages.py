@@ -40,7 +40,7 @@ from lqrsim.kernels.records import (
     StageRows,
     StructuredArray,
 )
-from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, RANGE, SIDE, SIGN
+from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, RANGE, SIDE, SIGN, STRAIGHT
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 
@@ -85,10 +85,10 @@ class Stages:
             zeros((steps + 1, n + m, n + m)),
         )  # fmt: skip
         self.about = PlanStages(
-            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), 0, zeros(1), unread,
+            steps, 0, zeros(n), zeros(n), np.ones(n), np.ones(m), zeros(1), zeros(1), 0, zeros(1), unread,
             tuple(zeros((steps + 1) * count) for count in counts),
             StageRows(
-                rows, np.full((rows, 4), np.inf), np.cumsum([0, *counts])[:-1].astype(np.float64),
+                rows, np.full((rows, 5), np.inf), np.cumsum([0, *counts])[:-1].astype(np.float64),
                 zeros((rows, n + m)),
                 *(one.reshape(-1) for one in (*of_rows[:-1], self.numbers, self.force)),
             ),
@@ -123,7 +123,7 @@ class Stages:
         self.about = self.about._replace(
             steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.discrete), model=model
         )
-        self.about.slow[...] = 0.0
+        self.about.slow[...], self.about.keeps[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         if problem.goal is not None and problem.start is not None:
             self.about.reach[...] = np.abs(np.nan_to_num(problem.goal - problem.start))
@@ -132,6 +132,7 @@ class Stages:
         self._sizes[...], self._prices[...] = 1.0, np.inf
         for k, term in enumerate(terms):
             self.about.rows.limits[self.owners == k, RANGE] = np.inf if term.ranges is None else term.ranges
+            self.about.rows.limits[self.owners == k, STRAIGHT] = term.linear
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
             self.about.rows.limits[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
@@ -173,7 +174,7 @@ class Stages:
         """Compile what a solve needs of the stages, with the interior point, together."""
         about, plan = self.about, self.about.changes
         arrays, memory = self.interior
-        begun = PlanBeginning(plan, about.rows.force, False, 0.0, 0.0)
+        begun = PlanBeginning(plan, about.rows.force, False, 0.0, 0.0, 0.0)
         costates, slopes = about.to_go.gradient, plan.controls
         self._module.prepare(
             interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, MEASURES)),
