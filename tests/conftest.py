@@ -11,7 +11,7 @@ import lqrsim as ls
 # (tests/helpers/sampling.py) and always the same, and the predictions of runs have fewer trials, unless a test says how
 # many. The long run draws others each time, also on servers, and prints how to draw a failing one again.
 hypothesis.settings.register_profile("whole", deadline=None, derandomize=False, print_blob=True)
-hypothesis.settings.register_profile("short", deadline=None, derandomize=True, database=None, max_examples=25)
+hypothesis.settings.register_profile("short", deadline=None, derandomize=True, database=None, max_examples=20)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -35,8 +35,8 @@ def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
 # In this order the first three files do not compile the same code at the same time.
 LONGEST = (
     "kernels", "campaign", "failure_commands", "render", "parking", "process", "docs", "verify", "offset_free",
-    "robustness_api", "demo", "mjcf_distances", "stated", "given_solutions", "whole_problems", "viewer", "smoother",
-    "site",
+    "robustness_api", "whole_problems", "mjcf_robot", "demo", "experiments", "approaches", "stated", "given_solutions",
+    "viewer", "smoother", "site",
 )  # fmt: skip
 
 

@@ -294,6 +294,7 @@ def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     np.testing.assert_allclose(gradient[:n], slopes, rtol=0, atol=1e-6 * (1 + np.abs(gradient).max()))
 
 
+@pytest.mark.long
 def test_a_gripper_reaches_a_pose_past_a_post(tmp_path: Path) -> None:
     """To 1 mm and 1 degree, by MuJoCo's own kinematics, and clear of the post."""
     file = arm_file(tmp_path)

@@ -26,7 +26,7 @@ def test_nothing_false_is_said() -> None:
     assert "CONVERGED" in {one.status for one in found if one.verdict == "right"}
 
 
-@pytest.mark.parametrize("number", [1, *rarely(5)])
+@pytest.mark.parametrize("number", rarely(1, 5))
 def test_a_goal_that_is_reached_exactly_may_have_any_weight(number: int) -> None:
     """The final cost is the same for all plans that end there, so weights from 1 to 5000 lead to one plan."""
     task = cases.draw(number).task

@@ -7,7 +7,7 @@ from hypothesis import settings
 
 
 def examples(count: int) -> int:
-    """So many; where long tests are left out, a quarter of them, but not fewer than three."""
+    """So many; where long tests are left out, a fifth of them, but not fewer than three."""
     return max(min(count, 3), -(-count * settings().max_examples // 100))  # of hypothesis' own 100
 
 
