@@ -58,6 +58,7 @@ from .simulation.closed_loop import simulate as simulate
 from .simulation.plant import Plant as Plant
 from .simulation.plant_check import check_plant as check_plant
 from .simulation.uncertainty_of import uncertainty_of as uncertainty_of
+from .solvers.gradients import gradients as gradients
 from .solvers.ilqr import ilqr as ilqr
 from .solvers.ilqr import ilqr_many as ilqr_many
 from .solvers.initial_guess import InitialPrior as InitialPrior

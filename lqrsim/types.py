@@ -19,6 +19,7 @@ from lqrsim.results.plan import Replan
 from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertificate, Curvature, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
+from lqrsim.solvers.gradients import Gradients
 from lqrsim.solvers.prepared import PreparedSolver
 from lqrsim.verify.verdict import Verification
 
@@ -35,6 +36,7 @@ __all__ = [
     "DerivativeCheck",
     "ExportedC",
     "Funnel",
+    "Gradients",
     "Iteration",
     "LiveReplanner",
     "Moments",

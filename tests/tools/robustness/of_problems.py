@@ -335,6 +335,15 @@ def solving(place: Place) -> dict[str, tuple[Any, ...]]:
         "smooth_many": ({"problems": [place.problem, place.second], **both, "progress": print_nothing}, 2.0),
         "ilqr": ({"problem": place.problem, **tests, "callback": print_nothing, "noise": None, "risk": None}, 2.0),
         "ilqr_many": ({"problems": [place.problem], "threads": 1, **tests, "progress": print_nothing}, 2.0),
+        "gradients": (
+            {
+                "make": lambda p: place.problem.from_state([p[0], -2.5, np.pi]),
+                "at": [0.0],
+                "plan": True,
+                "scale": [1.0],
+                "solution": ls.smooth(place.problem.from_state([0.0, -2.5, np.pi]), starts=1),
+            },
+        ),
         "sample_costs": ({"problem": noisy, "solution": place.solution, "trials": 2, "seed": 0},),
         "largest_risk": ({"problem": noisy, "solution": place.solution}, 0.2),
         "smooth_lq": ({"stage": stages, "initial": end, "final": end, "form": "dual", "dt": 0.1},),
@@ -388,6 +397,7 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
     built: dict[str, Any] = {
         "AffinePolicy": policy, "Trajectory": plan, "Quadratic": go, "Moments": come, "TotalCost": total,
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
+        "Gradients": ls.types.Gradients(np.ones(1), np.zeros(1), (), np.zeros((5, 3, 1)), np.zeros((4, 2, 1))),
         "Multipliers": ls.types.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
         "Certificate": solution.certificate,
         "ContactCertificate": ls.types.ContactCertificate(
