@@ -20,6 +20,7 @@ from lqrsim.results.solution_parts import Candidate, Certificate, ContactCertifi
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck
 from lqrsim.solvers.prepared import PreparedSolver
+from lqrsim.stress.data_table import DataTable
 from lqrsim.verify.verdict import Verification
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "Coordinates",
     "CostTerm",
     "Curvature",
+    "DataTable",
     "DerivativeCheck",
     "ExportedC",
     "Funnel",

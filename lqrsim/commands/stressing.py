@@ -163,16 +163,16 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a stress test as one HTML page.
+    """Write the report of a stress test as one HTML page, or its success rates as a table for a paper.
 
     The page has tables, curves and videos of the worst trials, and needs no network and no other file. It can be
-    written before the stress test has ended, and then says so.
+    written before the stress test has ended, and then says so. The table is CSV, LaTeX (booktabs) or Markdown.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """A folder from `lqrsim stress`."""
-    out: Annotated[Path | None, optional("FILE.html")] = None
-    """The page. By default report.html in that folder."""
+    out: Annotated[Path | None, optional("FILE")] = None
+    """The page, .html, or the table: .csv, .tex or .md. By default report.html in that folder."""
     videos: int = 4
     """Number of the worst trials to repeat and render."""
     scenario: OwnScenario = None
@@ -181,17 +181,22 @@ class Report:
     def run(self) -> int:
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
-        from lqrsim.reports.page import report
+        from lqrsim.stress.data_table import ENDINGS
         from lqrsim.stress.results import Results
 
-        page = self.out or self.folder / "report.html"
-        if page.suffix != ".html":
-            raise InputError(f"--out: got {page}, want a name that ends in .html")
-        console.check_output("--out", page.parent, page.name)
+        path = self.out or self.folder / "report.html"
+        if path.suffix not in (".html", *ENDINGS):
+            raise InputError(f"--out: got {path}, want a name that ends in .html, {', '.join(ENDINGS)}")
+        console.check_output("--out", path.parent, path.name)
         results = Results(self.folder, scenario=self.scenario)
-        with console.progress("reporting", "part") as progress:
-            report(results, page, videos=self.videos, progress=progress)
-        console.wrote(page)
+        if path.suffix in ENDINGS:
+            results.rates().save(path)
+        else:
+            from lqrsim.reports.page import report
+
+            with console.progress("reporting", "part") as progress:
+                report(results, path, videos=self.videos, progress=progress)
+        console.wrote(path)
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
         return 0
