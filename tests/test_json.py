@@ -181,6 +181,14 @@ def test_usage_errors_are_an_object_too(arguments: str, says: str, capsys: pytes
     assert captured.err == f"lqrsim: error: {found['error']}\n"
 
 
+@pytest.mark.parametrize("command", ["certify", "verify"])
+def test_a_missing_file_is_named_without_escape_codes(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "nothing\x1b[2J.mp4"]) == 2
+    error = capsys.readouterr().err
+    assert "nothing?[2J.mp4, want a file that exists" in error
+    assert error.removesuffix("\n").isprintable()
+
+
 REQUIRED = {"bridge": ["--commands", "1"], "export": ["--c", "1"], "replay": ["--cell", "1", "--trial", "1"]}
 CHOSEN = {"--overlays": "plan", "--policies": "smooth"}  # lists whose help does not show the choices
 
